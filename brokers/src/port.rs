@@ -1,0 +1,375 @@
+//! What BlazeFlow and the SDK know of a message system.
+//!
+//! ```text
+//! publish:    Publisher::publish ──► bounded queue of the adapter ──► server
+//! subscribe:  server ──► adapter ──► SubscriptionSender ──► bounded ring ──► Subscription::receive (batches)
+//! ```
+//!
+//! Publishing never waits: an adapter that cannot keep up drops the oldest of its queue and counts it. A subscription is
+//! a ring that drops its oldest when its reader is slow; the reader learns how many it missed.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Instant;
+
+use async_trait::async_trait;
+use blaze_domain::WriterId;
+use blaze_domain::names::ChannelName;
+use blaze_proto::{Frame, FrameError};
+use bytes::Bytes;
+use parking_lot::Mutex;
+use tokio::sync::{Notify, watch};
+
+/// Which message system an adapter speaks to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum BrokerKind {
+    /// Within one process.
+    Memory,
+    /// Redis or Valkey publish and subscribe.
+    Redis,
+    /// Kafka.
+    Kafka,
+    /// DDS layer scope.
+    Dds,
+    /// ROS 2 over DDS.
+    Ros2,
+}
+
+impl BrokerKind {
+    /// The word in admin JSON and routes.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Memory => "memory",
+            Self::Redis => "redis",
+            Self::Kafka => "kafka",
+            Self::Dds => "dds",
+            Self::Ros2 => "ros2",
+        }
+    }
+}
+
+impl fmt::Display for BrokerKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// Whether the server answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Health {
+    /// Not yet connected.
+    Connecting,
+    /// It answers.
+    Up,
+    /// It did answer and does not any more.
+    Down,
+    /// Closed by us; final.
+    Closed,
+}
+
+/// What an adapter says of its server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BrokerStatus {
+    /// Whether the server answers.
+    pub health: Health,
+    /// For people: server and version, or the last error.
+    pub detail: String,
+    /// When `health` last changed.
+    pub since: Instant,
+}
+
+/// Why a broker refused.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum BrokerError {
+    /// The broker was closed by us.
+    #[error("the broker is closed")]
+    Closed,
+    /// The server does not answer.
+    #[error("the broker is away: {0}")]
+    Away(String),
+    /// The broker cannot express the channel's name.
+    #[error("channel {channel}: {reason}")]
+    Name {
+        /// The channel.
+        channel: String,
+        /// Why not.
+        reason: String,
+    },
+    /// More channels than the adapter holds.
+    #[error("more than {0} channels")]
+    TooManyChannels(usize),
+}
+
+/// One message as an adapter found it.
+#[derive(Debug, Clone)]
+pub enum Content {
+    /// A message with a header.
+    Frame(Frame),
+    /// A payload without a header, and the identity that its place on the server gives it, if that is stable.
+    Bare {
+        /// The payload as it is.
+        payload: Bytes,
+        /// Writer and sequence, where the server has a stable position (Kafka); otherwise the flow numbers it.
+        identity: Option<(WriterId, u64)>,
+    },
+    /// It begins with `BLZ1` and is no frame.
+    Malformed {
+        /// What is wrong with it.
+        error: FrameError,
+        /// Its size.
+        bytes: usize,
+    },
+}
+
+impl Content {
+    /// What the bytes of one message are, on a broker that keeps frames as one value.
+    #[must_use]
+    pub fn from_bytes(bytes: Bytes) -> Self {
+        if !blaze_proto::frame::claims_to_be_a_frame(&bytes) {
+            return Self::Bare {
+                payload: bytes,
+                identity: None,
+            };
+        }
+        let size = bytes.len();
+        match Frame::parse(bytes) {
+            Ok(frame) => Self::Frame(frame),
+            Err(error) => Self::Malformed { error, bytes: size },
+        }
+    }
+
+    /// Bytes that it holds in memory.
+    #[must_use]
+    pub fn size(&self) -> usize {
+        match self {
+            Self::Frame(frame) => frame.wire_len(),
+            Self::Bare { payload, .. } => payload.len(),
+            Self::Malformed { bytes, .. } => *bytes,
+        }
+    }
+}
+
+/// A message and when the adapter took it from the server.
+#[derive(Debug, Clone)]
+pub struct Received {
+    /// The message.
+    pub content: Content,
+    /// When it was taken (monotonic clock).
+    pub at: Instant,
+    /// Microseconds that it lay on the server before, where the server tells (Kafka append time).
+    pub broker_age_us: u64,
+}
+
+/// What a publisher is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PublisherOptions {
+    /// Samples to keep per writer for late joiners; 0 = volatile.
+    pub depth: u32,
+    /// Repair what is lost, where the broker can.
+    pub reliable: bool,
+    /// Messages may be large: a connection of their own, where that matters.
+    pub large: bool,
+}
+
+/// Bounds and kind of a subscription.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SubscribeOptions {
+    /// Most messages that wait for the reader; the oldest give way.
+    pub max_messages: usize,
+    /// Most bytes that wait for the reader; the oldest give way, but one message always fits.
+    pub max_bytes: usize,
+    /// Messages may be large: a connection of their own, where that matters.
+    pub large: bool,
+    /// Begin with what the broker keeps for late joiners (transient_local).
+    pub with_kept: bool,
+}
+
+impl Default for SubscribeOptions {
+    fn default() -> Self {
+        Self {
+            max_messages: 4096,
+            max_bytes: 64 * 1024 * 1024,
+            large: false,
+            with_kept: false,
+        }
+    }
+}
+
+/// What became of a message that was handed to a publisher.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PublishOutcome {
+    /// Taken; the adapter delivers it.
+    Taken,
+    /// The broker is away or closed: dropped.
+    Dropped,
+    /// Larger than the broker carries: dropped.
+    TooLarge,
+}
+
+/// Writes one channel. Never waits.
+pub trait Publisher: Send + Sync {
+    /// Hands over a message with its header. Hops and age are written as the frame has them.
+    fn publish(&self, frame: &Frame) -> PublishOutcome;
+
+    /// Hands over a payload as it is: for reserved channels and bare ones.
+    fn publish_bare(&self, payload: &Bytes) -> PublishOutcome;
+
+    /// Messages that were taken and then dropped, because the server was slow or away.
+    fn dropped_later(&self) -> u64;
+}
+
+/// A message system, seen from one process. Dropping it closes it.
+#[async_trait]
+pub trait Broker: Send + Sync + 'static {
+    /// Which message system it is.
+    fn kind(&self) -> BrokerKind;
+
+    /// Whether the server answers, and its changes.
+    fn status(&self) -> watch::Receiver<BrokerStatus>;
+
+    /// A writer for a channel.
+    ///
+    /// # Errors
+    /// [`BrokerError`] when the channel cannot be written at all; a server that is away is no error.
+    fn publisher(&self, channel: &ChannelName, options: PublisherOptions) -> Result<Arc<dyn Publisher>, BrokerError>;
+
+    /// Reads a channel from now on; what is published after this call returns is received, in order per writer, also
+    /// after the connection was lost and came back. What was published meanwhile may be missing.
+    ///
+    /// # Errors
+    /// [`BrokerError`] when it cannot be subscribed now.
+    async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError>;
+
+    /// Delivers what was taken, as far as the server takes it within a second, then closes all subscriptions.
+    async fn close(&self);
+}
+
+struct Ring {
+    queue: Mutex<RingState>,
+    readable: Notify,
+    dropped: AtomicU64,
+    options: SubscribeOptions,
+}
+
+#[derive(Default)]
+struct RingState {
+    messages: VecDeque<Received>,
+    bytes: usize,
+    closed: bool,
+}
+
+/// The adapter's end of a subscription.
+#[derive(Clone)]
+pub struct SubscriptionSender {
+    ring: Arc<Ring>,
+}
+
+/// The reader's end of a subscription. Dropping it unsubscribes.
+pub struct Subscription {
+    ring: Arc<Ring>,
+}
+
+/// Both ends of a subscription.
+#[must_use]
+pub fn subscription(options: SubscribeOptions) -> (SubscriptionSender, Subscription) {
+    let ring = Arc::new(Ring {
+        queue: Mutex::default(),
+        readable: Notify::new(),
+        dropped: AtomicU64::new(0),
+        options,
+    });
+    (
+        SubscriptionSender {
+            ring: Arc::clone(&ring),
+        },
+        Subscription { ring },
+    )
+}
+
+impl SubscriptionSender {
+    /// Hands a message to the reader. Returns whether the subscription still lives.
+    pub fn send(&self, message: Received) -> bool {
+        let size = message.content.size();
+        let mut lost = 0;
+        {
+            let mut state = self.ring.queue.lock();
+            if state.closed {
+                return false;
+            }
+            while !state.messages.is_empty()
+                && (state.messages.len() >= self.ring.options.max_messages
+                    || state.bytes + size > self.ring.options.max_bytes)
+            {
+                if let Some(oldest) = state.messages.pop_front() {
+                    state.bytes -= oldest.content.size();
+                    lost += 1;
+                }
+            }
+            state.bytes += size;
+            state.messages.push_back(message);
+        }
+        if lost > 0 {
+            self.ring.dropped.fetch_add(lost, Ordering::Relaxed);
+        }
+        self.ring.readable.notify_one();
+        true
+    }
+
+    /// Whether the reader has gone.
+    #[must_use]
+    pub fn is_closed(&self) -> bool {
+        self.ring.queue.lock().closed
+    }
+
+    /// Ends the subscription; the reader still gets what waits.
+    pub fn close(&self) {
+        self.ring.queue.lock().closed = true;
+        self.ring.readable.notify_one();
+    }
+}
+
+impl Subscription {
+    /// Waits for messages and takes up to `limit` of them into `batch`. Returns how many; 0 = the subscription ended.
+    /// Cancelling it loses nothing.
+    pub async fn receive(&mut self, batch: &mut Vec<Received>, limit: usize) -> usize {
+        loop {
+            {
+                let mut state = self.ring.queue.lock();
+                let count = state.messages.len().min(limit);
+                if count > 0 {
+                    let mut bytes = 0;
+                    batch.extend(
+                        state
+                            .messages
+                            .drain(..count)
+                            .inspect(|message| bytes += message.content.size()),
+                    );
+                    state.bytes -= bytes;
+                    return count;
+                }
+                if state.closed {
+                    return 0;
+                }
+            }
+            self.ring.readable.notified().await;
+        }
+    }
+
+    /// Messages dropped because this reader was slow, since the last call.
+    #[must_use]
+    pub fn take_dropped(&self) -> u64 {
+        self.ring.dropped.swap(0, Ordering::Relaxed)
+    }
+}
+
+impl Drop for Subscription {
+    fn drop(&mut self) {
+        let mut state = self.ring.queue.lock();
+        state.closed = true;
+        state.messages.clear();
+        state.bytes = 0;
+    }
+}

@@ -1,0 +1,4 @@
+//! BlazeFlow: connects whoever publishes a topic with whoever asks for it.
+
+pub mod link;
+pub mod world;

@@ -1,0 +1,3 @@
+//! The inter scope: flow to flow.
+
+pub mod transport;

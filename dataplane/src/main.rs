@@ -1,0 +1,2 @@
+//! BlazeFlow.
+fn main() {}

@@ -1,0 +1,185 @@
+//! What one flow knows of all flows: the input of the planner.
+//!
+//! The registry builds it from local leases and from what other flows announced; the planner only reads it.
+
+use std::collections::BTreeMap;
+
+use blaze_domain::{Durability, FlowId, LayerKind, LayerName, Priority, Reliability, TopicName};
+
+/// All flows that one flow knows, itself included.
+#[derive(Debug, Clone, PartialEq)]
+pub struct World {
+    /// The flow whose view this is; it has an entry in `flows`.
+    pub me: FlowId,
+    /// Every known flow, dead ones until they are forgotten.
+    pub flows: BTreeMap<FlowId, FlowView>,
+}
+
+/// One flow as another sees it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FlowView {
+    /// Kind of its layer.
+    pub kind: LayerKind,
+    /// Its life: larger is newer.
+    pub epoch: u64,
+    /// What it says of itself.
+    pub state: FlowState,
+    /// Whether it can be reached.
+    pub reach: Reach,
+    /// Whether it has a node scope.
+    pub node_scope: bool,
+    /// The layer broker that it uses: flows of one layer with equal values share it. `None`: it has none.
+    pub layer_scope: Option<LayerScopeId>,
+    /// What its local services advertise and request.
+    pub topics: BTreeMap<TopicName, TopicEntry>,
+}
+
+/// Identity of a layer broker; two flows of one layer with the same value reach each other over it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct LayerScopeId(pub u64);
+
+/// What a flow says of itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum FlowState {
+    /// It has not yet read its leases and listened for peers.
+    Starting,
+    /// It carries topics.
+    Ready,
+    /// It is going away: it takes in nothing more.
+    Draining,
+}
+
+/// Whether a flow can be reached.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Reach {
+    /// It says Hello and answers.
+    Up,
+    /// It has not answered for a moment: keep its routes, write nothing.
+    Suspect,
+    /// No sign of life: routes end.
+    Down,
+}
+
+/// One topic of one flow, its services merged per scope.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct TopicEntry {
+    /// Services on the flow's node scope.
+    pub node: ScopeEntry,
+    /// Services on the layer scope (every flow that shares the layer broker has the same).
+    pub layer: ScopeEntry,
+}
+
+/// What the services of one scope advertise and request of one topic.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ScopeEntry {
+    /// Merged advertisements, if any.
+    pub advertise: Option<Advertise>,
+    /// Merged requests, if any.
+    pub request: Option<Request>,
+}
+
+/// Advertisements of one topic in one scope, merged: sum of rates, largest size, strongest quality of service.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Advertise {
+    /// Sum of the writers' rates; `None` where one of them gives none.
+    pub rate_hz: Option<f64>,
+    /// Largest payload in bytes, if all give it.
+    pub max_bytes: Option<u64>,
+    /// Media type of the payload, `application/octet-stream` unless given.
+    pub encoding: String,
+    /// ROS type, or empty.
+    pub type_name: String,
+    /// RIHS01 hash of the type, or empty.
+    pub type_hash: String,
+    /// Reliable if any is.
+    pub reliability: Reliability,
+    /// Transient local if any is.
+    pub durability: Durability,
+    /// Samples kept per writer.
+    pub depth: u32,
+    /// Highest class given; `None` = not said.
+    pub priority: Option<Priority>,
+    /// Longest lifespan in milliseconds; 0 = none.
+    pub lifespan_ms: u32,
+    /// Services behind it, for `from` filters; sorted.
+    pub sources: Vec<Source>,
+    /// `sources` leaves some out, so a filter by service may match one that is not listed.
+    pub more_sources: bool,
+}
+
+/// A service that advertises.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Source {
+    /// Its node; empty where a service of the layer names none.
+    pub node: String,
+    /// Its name.
+    pub service: String,
+}
+
+/// Requests of one topic in one scope, merged: highest rate, longest lifespan, highest class.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Request {
+    /// Highest `max_rate_hz`; `None` where one of them sets no limit.
+    pub max_rate_hz: Option<f64>,
+    /// Longest lifespan in milliseconds; 0 = none.
+    pub lifespan_ms: u32,
+    /// Reliable if any is.
+    pub reliability: Reliability,
+    /// Transient local if any is.
+    pub durability: Durability,
+    /// Samples kept per writer.
+    pub depth: u32,
+    /// Highest class that is asked for; `None` = as published.
+    pub priority: Option<Priority>,
+    /// Origins that are asked for, sorted; empty = any.
+    pub from: Vec<OriginFilter>,
+    /// ROS type that is expected, or empty.
+    pub type_name: String,
+    /// RIHS01 hash that is expected, or empty.
+    pub type_hash: String,
+    /// A service of this scope wants payloads with a header.
+    pub framed: bool,
+    /// A service of this scope wants bare payloads.
+    pub bare: bool,
+}
+
+/// Only messages of that origin; an absent part matches everything.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Default)]
+pub struct OriginFilter {
+    /// Layer of the publisher.
+    pub layer: Option<String>,
+    /// Node of the publisher.
+    pub node: Option<String>,
+    /// Service of the publisher.
+    pub service: Option<String>,
+}
+
+impl OriginFilter {
+    /// Whether an origin passes.
+    #[must_use]
+    pub fn matches(&self, layer: &str, node: &str, service: &str) -> bool {
+        let part = |wanted: &Option<String>, found: &str| wanted.as_deref().is_none_or(|wanted| wanted == found);
+        part(&self.layer, layer) && part(&self.node, node) && part(&self.service, service)
+    }
+}
+
+impl TopicEntry {
+    /// Whether nobody advertises or requests the topic here.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+impl World {
+    /// The own flow.
+    #[must_use]
+    pub fn own(&self) -> Option<&FlowView> {
+        self.flows.get(&self.me)
+    }
+
+    /// The flows of one layer, by node.
+    pub fn flows_of<'a>(&'a self, layer: &'a LayerName) -> impl Iterator<Item = (&'a FlowId, &'a FlowView)> {
+        self.flows.iter().filter(move |(id, _)| id.layer == *layer)
+    }
+}

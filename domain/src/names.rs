@@ -1,0 +1,292 @@
+//! Names of layers, nodes, services, instances and topics.
+//!
+//! A value of one of these types has passed the rules of the contract, so that no later code checks again.
+
+use std::fmt;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+/// Longest layer, node, service or instance name, in bytes.
+pub const MAX_NAME_BYTES: usize = 63;
+/// Longest topic name, in bytes.
+pub const MAX_TOPIC_BYTES: usize = 200;
+
+/// Why a text is not a name.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum NameError {
+    /// The text is empty.
+    #[error("is empty")]
+    Empty,
+    /// The text is longer than the limit.
+    #[error("has {bytes} bytes, at most {limit} are allowed")]
+    TooLong {
+        /// Bytes given.
+        bytes: usize,
+        /// Bytes allowed.
+        limit: usize,
+    },
+    /// A character that the rules do not allow.
+    #[error("holds {found:?}; allowed are {allowed}")]
+    Character {
+        /// The first character that is not allowed.
+        found: char,
+        /// What is allowed, in words.
+        allowed: &'static str,
+    },
+    /// A name must start and end with a letter or digit.
+    #[error("must start and end with a letter or digit")]
+    Ends,
+    /// A topic has an empty segment: a leading, trailing or double slash.
+    #[error("has an empty segment: no leading, trailing or double slash")]
+    EmptySegment,
+    /// The topic belongs to BlazeAIoT itself.
+    #[error("is reserved: names below blaze/ belong to BlazeAIoT")]
+    Reserved,
+}
+
+fn check_name(text: &str) -> Result<(), NameError> {
+    if text.is_empty() {
+        return Err(NameError::Empty);
+    }
+    if text.len() > MAX_NAME_BYTES {
+        return Err(NameError::TooLong {
+            bytes: text.len(),
+            limit: MAX_NAME_BYTES,
+        });
+    }
+    if let Some(found) = text.chars().find(|c| !matches!(c, 'a'..='z' | '0'..='9' | '-')) {
+        return Err(NameError::Character {
+            found,
+            allowed: "a-z, 0-9 and -",
+        });
+    }
+    if text.starts_with('-') || text.ends_with('-') {
+        return Err(NameError::Ends);
+    }
+    Ok(())
+}
+
+fn check_topic_form(text: &str) -> Result<(), NameError> {
+    if text.is_empty() {
+        return Err(NameError::Empty);
+    }
+    if text.len() > MAX_TOPIC_BYTES {
+        return Err(NameError::TooLong {
+            bytes: text.len(),
+            limit: MAX_TOPIC_BYTES,
+        });
+    }
+    if let Some(found) = text
+        .chars()
+        .find(|c| !matches!(c, 'A'..='Z' | 'a'..='z' | '0'..='9' | '_' | '-' | '/'))
+    {
+        return Err(NameError::Character {
+            found,
+            allowed: "A-Z, a-z, 0-9, _, - and / between segments",
+        });
+    }
+    if text.split('/').any(str::is_empty) {
+        return Err(NameError::EmptySegment);
+    }
+    Ok(())
+}
+
+fn check_topic(text: &str) -> Result<(), NameError> {
+    check_topic_form(text)?;
+    if text == "blaze" || text.starts_with("blaze/") {
+        return Err(NameError::Reserved);
+    }
+    Ok(())
+}
+
+fn check_channel(text: &str) -> Result<(), NameError> {
+    // `blaze/bare/<topic>` is a channel of its own and may be longer than the topic that it carries.
+    match text.strip_prefix("blaze/bare/") {
+        Some(topic) => check_topic_form(topic),
+        None => check_topic_form(text),
+    }
+}
+
+macro_rules! name {
+    ($(#[$doc:meta])* $type:ident, $check:path) => {
+        $(#[$doc])*
+        #[derive(Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+        pub struct $type(Arc<str>);
+
+        impl $type {
+            /// The name as text.
+            #[must_use]
+            pub fn as_str(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl FromStr for $type {
+            type Err = NameError;
+            fn from_str(text: &str) -> Result<Self, NameError> {
+                $check(text)?;
+                Ok(Self(Arc::from(text)))
+            }
+        }
+
+        impl fmt::Display for $type {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(&self.0)
+            }
+        }
+
+        impl fmt::Debug for $type {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                fmt::Debug::fmt(&self.0, f)
+            }
+        }
+
+        impl AsRef<str> for $type {
+            fn as_ref(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl std::borrow::Borrow<str> for $type {
+            fn borrow(&self) -> &str {
+                &self.0
+            }
+        }
+
+        impl Serialize for $type {
+            fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+                serializer.serialize_str(&self.0)
+            }
+        }
+
+        impl<'de> Deserialize<'de> for $type {
+            fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+                let text = std::borrow::Cow::<'de, str>::deserialize(deserializer)?;
+                text.parse().map_err(|error| serde::de::Error::custom(format!("{text:?} {error}")))
+            }
+        }
+    };
+}
+
+name!(
+    /// Name of a layer: 1 to 63 of `a-z 0-9 -`, starting and ending with a letter or digit.
+    LayerName, check_name
+);
+name!(
+    /// Name of a node, unique in the whole system; form as [`LayerName`].
+    NodeName, check_name
+);
+name!(
+    /// Name of a service; form as [`LayerName`].
+    ServiceName, check_name
+);
+name!(
+    /// Name of an instance of a service; form as [`LayerName`]; the first one is `0`.
+    InstanceName, check_name
+);
+name!(
+    /// Name of a user topic: segments of `A-Z a-z 0-9 _ -` joined by `/`, no leading slash, at most 200 bytes, not below
+    /// `blaze/`.
+    TopicName, check_topic
+);
+name!(
+    /// Name of a channel of a broker: a user topic, or one of BlazeAIoT's own below `blaze/` (control, events, replies).
+    ChannelName, check_channel
+);
+
+impl InstanceName {
+    /// The instance that is meant when none is named: `0`.
+    #[must_use]
+    pub fn first() -> Self {
+        Self(Arc::from("0"))
+    }
+}
+
+impl From<&TopicName> for ChannelName {
+    fn from(topic: &TopicName) -> Self {
+        Self(Arc::clone(&topic.0))
+    }
+}
+
+impl ChannelName {
+    /// Where services send their control messages.
+    #[must_use]
+    pub fn control() -> Self {
+        Self(Arc::from("blaze/flow/control"))
+    }
+
+    /// Where flows tell what happened: started, refused, expired, up, down.
+    #[must_use]
+    pub fn events() -> Self {
+        Self(Arc::from("blaze/flow/events"))
+    }
+
+    /// Where a topic is served to clients that want payloads without a header.
+    #[must_use]
+    pub fn bare(topic: &TopicName) -> Self {
+        Self(Arc::from(format!("blaze/bare/{topic}")))
+    }
+
+    /// Whether the channel is one of BlazeAIoT's own: its payloads are never framed and never bridged.
+    #[must_use]
+    pub fn is_reserved(&self) -> bool {
+        self.0.starts_with("blaze/")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_follow_the_contract() {
+        for good in ["edge", "robot-1", "0", &"a".repeat(63)] {
+            assert!(good.parse::<NodeName>().is_ok(), "{good}");
+        }
+        for (bad, why) in [
+            ("", NameError::Empty),
+            ("-a", NameError::Ends),
+            ("a-", NameError::Ends),
+            (
+                "Robot",
+                NameError::Character {
+                    found: 'R',
+                    allowed: "a-z, 0-9 and -",
+                },
+            ),
+            (&"a".repeat(64), NameError::TooLong { bytes: 64, limit: 63 }),
+        ] {
+            assert_eq!(bad.parse::<NodeName>().unwrap_err(), why, "{bad}");
+        }
+    }
+
+    #[test]
+    fn topics_follow_the_contract() {
+        for good in ["imu/data", "A_b-9/x", &"t".repeat(200)] {
+            assert!(good.parse::<TopicName>().is_ok(), "{good}");
+        }
+        for (bad, why) in [
+            ("/imu", NameError::EmptySegment),
+            ("imu/", NameError::EmptySegment),
+            ("a//b", NameError::EmptySegment),
+            ("blaze/flow/control", NameError::Reserved),
+            ("blaze", NameError::Reserved),
+            (&"t".repeat(201), NameError::TooLong { bytes: 201, limit: 200 }),
+        ] {
+            assert_eq!(bad.parse::<TopicName>().unwrap_err(), why, "{bad}");
+        }
+        assert!("a b".parse::<TopicName>().is_err());
+    }
+
+    #[test]
+    fn channels_may_be_reserved() {
+        let control: ChannelName = "blaze/flow/control".parse().unwrap();
+        assert_eq!(control, ChannelName::control());
+        assert!(control.is_reserved());
+        let longest: TopicName = "t".repeat(200).parse().unwrap();
+        let bare = ChannelName::bare(&longest);
+        assert_eq!(bare.as_str().parse::<ChannelName>().unwrap(), bare);
+    }
+}
