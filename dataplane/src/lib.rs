@@ -1,4 +1,6 @@
 //! BlazeFlow: connects whoever publishes a topic with whoever asks for it.
 
+pub mod lane;
+pub mod limit;
 pub mod link;
 pub mod world;

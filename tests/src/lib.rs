@@ -1,1 +1,1 @@
-//! Placeholder.
+//! What end-to-end tests stand on.

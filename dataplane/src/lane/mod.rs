@@ -1,0 +1,7 @@
+//! The path of a message through one flow.
+
+pub mod core;
+pub mod measure;
+pub mod path;
+pub mod stats;
+pub mod window;

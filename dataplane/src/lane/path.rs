@@ -1,0 +1,173 @@
+//! One topic in one flow: its bridges and what is known of its messages.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use blaze_brokers::Publisher;
+use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WriterId};
+
+use super::measure::RateMeter;
+use super::stats::{BridgeStats, Drops};
+use crate::limit::bucket::TokenBucket;
+use crate::plan::{LaneSpec, Target};
+
+/// A topic, interned: its place in the data plane.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct TopicId(pub u32);
+
+/// A lane of the link, interned.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct LaneId(pub u32);
+
+/// What local advertisements say of a topic: the ground for headers of bare messages and for its class.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct TopicInfo {
+    /// Media type as advertised.
+    pub encoding: String,
+    /// The only advertising service and its instance; empty where there are several or none.
+    pub service: String,
+    /// Instance of that service.
+    pub instance: String,
+    /// Class as advertised.
+    pub priority: Option<Priority>,
+    /// Largest payload as advertised.
+    pub max_bytes: Option<u64>,
+    /// Advertised rate in Hz, summed over the writers that give one.
+    pub rate_hz: Option<f64>,
+    /// Advertised as reliable.
+    pub reliable: bool,
+    /// Samples kept per writer.
+    pub depth: u32,
+    /// Lifespan in milliseconds; 0 = none.
+    pub lifespan_ms: u32,
+}
+
+/// Where a bridge writes.
+pub enum Sink {
+    /// A local broker.
+    Publish {
+        /// Writer of the channel.
+        publisher: Arc<dyn Publisher>,
+        /// Payloads only.
+        bare: bool,
+    },
+    /// The link to another flow.
+    Lane {
+        /// The lane's number in the engine.
+        lane: LaneId,
+        /// Its class today.
+        class: Priority,
+    },
+}
+
+/// Whether a bridge takes messages in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Phase {
+    /// It does.
+    Up {
+        /// Since when.
+        since: Instant,
+    },
+    /// Its pair has vanished: it empties its queue.
+    Draining {
+        /// Until then at most.
+        until: Instant,
+    },
+    /// Its counters alone remain.
+    Ended,
+}
+
+/// One bridge of one topic.
+pub struct BridgeState {
+    /// Where it reads.
+    pub from: Scope,
+    /// Where it writes, as planned.
+    pub target: Target,
+    /// Rate, lifespan, reliability and filters.
+    pub lane: LaneSpec,
+    /// Whether it takes messages in.
+    pub phase: Phase,
+    /// Thins to `max_rate_hz`.
+    pub bucket: Option<TokenBucket>,
+    /// Where it writes.
+    pub sink: Sink,
+    /// Counters.
+    pub stats: BridgeStats,
+    /// Written per second.
+    pub out_rate: RateMeter,
+}
+
+impl BridgeState {
+    /// `inter/<layer>`, `layer` or `node`: the label `to` of metrics.
+    #[must_use]
+    pub fn to_label(&self) -> String {
+        match &self.target {
+            Target::Node { .. } => "node".to_owned(),
+            Target::Layer => "layer".to_owned(),
+            Target::Inter { layer, .. } => format!("inter/{layer}"),
+        }
+    }
+
+    /// Layer and receiver of a bridge to the inter scope.
+    #[must_use]
+    pub fn receiver(&self) -> Option<(&LayerName, &FlowId)> {
+        match &self.target {
+            Target::Inter { layer, receiver } => Some((layer, receiver)),
+            Target::Node { .. } | Target::Layer => None,
+        }
+    }
+}
+
+/// One topic.
+pub struct TopicPath {
+    /// Its name.
+    pub name: TopicName,
+    /// What local advertisements say of it.
+    pub info: TopicInfo,
+    /// Its bridges, ended ones included: they come back with their counters.
+    pub bridges: Vec<BridgeState>,
+    /// Largest payload seen, in bytes.
+    pub largest_bytes: u64,
+    /// What came from local scopes.
+    pub in_rate: RateMeter,
+    /// Dropped before any bridge: echoes, duplicates, what could not be read.
+    pub ingress_drops: Drops,
+    /// Identity that the flow gives to bare messages, per source scope.
+    pub bare: BTreeMap<Scope, (WriterId, u64)>,
+}
+
+impl TopicPath {
+    /// A topic without bridges.
+    #[must_use]
+    pub fn new(name: TopicName, now: Instant) -> Self {
+        Self {
+            name,
+            info: TopicInfo::default(),
+            bridges: Vec::new(),
+            largest_bytes: 0,
+            in_rate: RateMeter::new(now),
+            ingress_drops: Drops::default(),
+            bare: BTreeMap::new(),
+        }
+    }
+
+    /// Size that decides the class: the largest seen, else as advertised.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        if self.largest_bytes > 0 { self.largest_bytes } else { self.info.max_bytes.unwrap_or(0) }
+    }
+
+    /// Class of a lane: bulk if the topic is large, else as the lane says, else state.
+    #[must_use]
+    pub fn class(&self, lane: &LaneSpec, large_bytes: u64) -> Priority {
+        let large = self.largest_bytes.max(self.info.max_bytes.unwrap_or(0)) > large_bytes;
+        if large { Priority::Bulk } else { lane.priority.unwrap_or(Priority::State) }
+    }
+
+    /// Whether a bridge takes messages in from that scope.
+    #[must_use]
+    pub fn reads(&self, scope: Scope) -> bool {
+        self.bridges.iter().any(|bridge| bridge.from == scope && matches!(bridge.phase, Phase::Up { .. }))
+    }
+}

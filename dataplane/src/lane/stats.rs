@@ -1,0 +1,76 @@
+//! Counters of one bridge. For each of them `in = out + Σ dropped + queued` holds at any time.
+
+use blaze_domain::DropReason;
+
+use super::measure::LatencyHistogram;
+
+/// Messages and bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Count {
+    /// Messages.
+    pub messages: u64,
+    /// Payload bytes.
+    pub bytes: u64,
+}
+
+impl Count {
+    /// Adds one message.
+    pub fn add(&mut self, bytes: u64) {
+        self.add_many(1, bytes);
+    }
+
+    /// Adds several messages.
+    pub fn add_many(&mut self, messages: u64, bytes: u64) {
+        self.messages += messages;
+        self.bytes += bytes;
+    }
+}
+
+/// Dropped messages by reason.
+#[derive(Debug, Clone, Default)]
+pub struct Drops([u64; DropReason::ALL.len()]);
+
+impl Drops {
+    /// Counts dropped messages.
+    pub fn add(&mut self, reason: DropReason, messages: u64) {
+        self.0[reason as usize] += messages;
+    }
+
+    /// How many were dropped for a reason.
+    #[must_use]
+    pub fn get(&self, reason: DropReason) -> u64 {
+        self.0[reason as usize]
+    }
+
+    /// All reasons that occurred, with their counts.
+    pub fn iter(&self) -> impl Iterator<Item = (DropReason, u64)> + '_ {
+        DropReason::ALL.iter().map(|reason| (*reason, self.get(*reason))).filter(|(_, count)| *count > 0)
+    }
+
+    /// All of them.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        self.0.iter().sum()
+    }
+}
+
+/// What went through one bridge since it was first made.
+#[derive(Debug, Clone, Default)]
+pub struct BridgeStats {
+    /// Taken in.
+    pub taken: Count,
+    /// Written to the destination; on the link of reliable or chunked messages: acknowledged.
+    pub out: Count,
+    /// Dropped, by reason.
+    pub dropped: Drops,
+    /// Age of the messages when they were written.
+    pub latency: LatencyHistogram,
+}
+
+impl BridgeStats {
+    /// Messages that are inside: taken in, neither written nor dropped.
+    #[must_use]
+    pub fn queued(&self) -> u64 {
+        self.taken.messages.saturating_sub(self.out.messages).saturating_sub(self.dropped.total())
+    }
+}
