@@ -1,0 +1,344 @@
+//! The control side of one flow: leases in, plans out.
+//!
+//! ```text
+//! control messages of services ─┐
+//! Hello, Delta, Snapshot of flows ─┼─► registry ─► changed topics ─► (50 ms of quiet, 250 ms at most) ─► planner ─► plans
+//! peers up, suspect, down ─────────┘                                                             └─► events, answers
+//! ```
+//!
+//! Without input or output: what it wants done comes out of [`ControlCore::poll`]. Production carries it out with tasks and
+//! brokers, the simulated network with plain calls.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::time::{Duration, Instant};
+
+use blaze_domain::names::ChannelName;
+use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
+use blaze_proto::link::link_control::Body;
+use bytes::Bytes;
+
+use crate::lane::path::TopicInfo;
+use crate::link::engine::LinkEvent;
+use crate::plan::rendezvous;
+use crate::plan::{PlanRules, TopicPlan, plan_topic};
+use crate::registry::{ControlOutcome, Event, EventKind, Registry, RegistryConfig};
+use crate::world::{FlowState, FlowView, LayerScopeId, Reach, World};
+
+/// A changed topic is planned after this much quiet …
+pub const QUIET: Duration = Duration::from_millis(50);
+/// … and at the latest this long after its first change.
+pub const LATEST: Duration = Duration::from_millis(250);
+/// A flow listens for peers this long before it is ready.
+pub const LISTEN: Duration = Duration::from_millis(1500);
+/// All topics are planned anew that often, changed or not.
+pub const RECONCILE: Duration = Duration::from_secs(5);
+
+/// What the control core wants done.
+#[derive(Debug)]
+pub enum Output {
+    /// Put JSON on a reserved channel of a scope.
+    Publish {
+        /// Node or layer.
+        scope: Scope,
+        /// The channel.
+        channel: ChannelName,
+        /// The JSON.
+        body: Bytes,
+    },
+    /// Send a registry message to a flow.
+    Link {
+        /// The flow.
+        to: FlowId,
+        /// The message.
+        body: Body,
+    },
+    /// Make the bridges of a topic equal to this plan.
+    Plan {
+        /// The topic.
+        topic: TopicName,
+        /// Its bridges.
+        plan: TopicPlan,
+        /// What local advertisements say.
+        info: Box<TopicInfo>,
+    },
+    /// Say this version and digest in Hello.
+    Announce {
+        /// Version of the registry.
+        version: u64,
+        /// Its digest.
+        digest: u64,
+    },
+    /// Say this state in Hello.
+    State(FlowState),
+}
+
+/// What a control core is told at its start.
+#[derive(Debug, Clone)]
+pub struct ControlConfig {
+    /// The flow.
+    pub me: FlowId,
+    /// Kind of its layer.
+    pub kind: LayerKind,
+    /// Its epoch.
+    pub epoch: u64,
+    /// Whether it has a node scope.
+    pub node_scope: bool,
+    /// Its layer broker.
+    pub layer_scope: Option<LayerScopeId>,
+    /// Whether it has an inter scope, so that it must listen for peers before it is ready.
+    pub inter_scope: bool,
+    /// Rules of the node file.
+    pub rules: PlanRules,
+}
+
+struct Dirty {
+    first: Instant,
+    last: Instant,
+}
+
+/// Leases, other flows, plans.
+pub struct ControlCore {
+    config: ControlConfig,
+    registry: Registry,
+    plans: BTreeMap<TopicName, TopicPlan>,
+    dirty: BTreeMap<TopicName, Dirty>,
+    outputs: VecDeque<Output>,
+    state: FlowState,
+    started: Instant,
+    reconciled: Instant,
+    announced: (u64, u64),
+    /// Control payloads or parts of them that were refused.
+    pub refused: u64,
+}
+
+impl ControlCore {
+    /// A control core in state `starting`.
+    #[must_use]
+    pub fn new(config: ControlConfig, now: Instant) -> Self {
+        let registry = Registry::new(RegistryConfig {
+            me: config.me.clone(),
+            kind: config.kind,
+            epoch: config.epoch,
+            node_scope: config.node_scope,
+            layer_scope: config.layer_scope,
+            max_leases: 10_000,
+            started: now,
+        });
+        let mut core = Self {
+            config,
+            registry,
+            plans: BTreeMap::new(),
+            dirty: BTreeMap::new(),
+            outputs: VecDeque::new(),
+            state: FlowState::Starting,
+            started: now,
+            reconciled: now,
+            announced: (0, 0),
+            refused: 0,
+        };
+        core.registry.set_state(FlowState::Starting);
+        core
+    }
+
+    /// Leases and what other flows announced.
+    #[must_use]
+    pub fn registry(&self) -> &Registry {
+        &self.registry
+    }
+
+    /// What this flow knows of all flows.
+    #[must_use]
+    pub fn world(&self) -> &World {
+        self.registry.world()
+    }
+
+    /// The plans in force, by topic.
+    #[must_use]
+    pub fn plans(&self) -> &BTreeMap<TopicName, TopicPlan> {
+        &self.plans
+    }
+
+    /// What the flow says of itself.
+    #[must_use]
+    pub fn state(&self) -> FlowState {
+        self.state
+    }
+
+    /// Tells all services that the flow has started, so that they send their leases again.
+    pub fn announce_start(&mut self, wall_ms: u64) {
+        let event = Event::new(EventKind::FlowStarted, &self.config.me, None, None, wall_ms);
+        self.tell(&event);
+    }
+
+    /// Changes the rules; every topic is planned anew.
+    pub fn set_rules(&mut self, now: Instant, rules: PlanRules) {
+        self.config.rules = rules;
+        self.touch_all(now);
+    }
+
+    /// Takes in nothing more: every bridge drains.
+    pub fn start_draining(&mut self, now: Instant) {
+        self.set_state(now, FlowState::Draining);
+        self.plan_due(now + LATEST, 0);
+    }
+
+    /// Takes a payload of the control channel of a scope.
+    pub fn control(&mut self, now: Instant, wall_ms: u64, scope: Scope, payload: &[u8]) {
+        let ControlOutcome { answers, events, changed, faults } = self.registry.control(now, wall_ms, scope, payload);
+        self.refused += faults;
+        for answer in answers {
+            let Some(channel) = answer.reply_to else { continue };
+            if !self.answers_on(scope, answer.id.as_deref()) {
+                continue;
+            }
+            self.outputs.push_back(Output::Publish { scope, channel, body: Bytes::from(answer.body.to_string()) });
+        }
+        for event in events {
+            self.tell(&event);
+        }
+        self.touch(now, changed);
+    }
+
+    /// Takes what the link says of other flows.
+    pub fn link_event(&mut self, now: Instant, event: LinkEvent) {
+        let changed = match event {
+            LinkEvent::Hello { from, hello } => self.registry.on_hello(now, &from, &hello),
+            LinkEvent::Control { from, body } => self.registry.on_control(now, &from, body),
+            LinkEvent::PeerUp { flow, .. } | LinkEvent::PeerRecovered { flow } => {
+                self.registry.set_reach(now, &flow, Reach::Up)
+            }
+            LinkEvent::PeerSuspect { flow } => self.registry.set_reach(now, &flow, Reach::Suspect),
+            LinkEvent::PeerDown { flow, .. } => self.registry.set_reach(now, &flow, Reach::Down),
+            LinkEvent::PeerForgotten { flow } => self.registry.forget(&flow),
+            _ => BTreeSet::new(),
+        };
+        self.touch(now, changed);
+    }
+
+    /// Does what is due. To be called every few ten milliseconds.
+    pub fn tick(&mut self, now: Instant, wall_ms: u64) {
+        let listened = !self.config.inter_scope || now.saturating_duration_since(self.started) >= LISTEN;
+        if self.state == FlowState::Starting && listened {
+            self.set_state(now, FlowState::Ready);
+        }
+        let expired = self.registry.expire(now, wall_ms);
+        for event in expired.events {
+            self.tell(&event);
+        }
+        self.touch(now, expired.changed);
+        if now.saturating_duration_since(self.reconciled) >= RECONCILE {
+            self.reconciled = now;
+            self.touch_all(now);
+        }
+        self.plan_due(now, wall_ms);
+        for (to, body) in self.registry.poll(now) {
+            self.outputs.push_back(Output::Link { to, body });
+        }
+        let announced = self.registry.announced();
+        if announced != self.announced {
+            self.announced = announced;
+            self.outputs.push_back(Output::Announce { version: announced.0, digest: announced.1 });
+        }
+    }
+
+    /// The next thing to do.
+    pub fn poll(&mut self) -> Option<Output> {
+        self.outputs.pop_front()
+    }
+
+    fn set_state(&mut self, now: Instant, state: FlowState) {
+        self.state = state;
+        self.registry.set_state(state);
+        self.outputs.push_back(Output::State(state));
+        self.touch_all(now);
+    }
+
+    fn touch(&mut self, now: Instant, topics: BTreeSet<TopicName>) {
+        for topic in topics {
+            self.dirty.entry(topic).and_modify(|dirty| dirty.last = now).or_insert(Dirty { first: now, last: now });
+        }
+    }
+
+    fn touch_all(&mut self, now: Instant) {
+        let mut topics: BTreeSet<TopicName> = self.plans.keys().cloned().collect();
+        for flow in self.registry.world().flows.values() {
+            topics.extend(flow.topics.keys().cloned());
+        }
+        self.touch(now, topics);
+    }
+
+    fn plan_due(&mut self, now: Instant, wall_ms: u64) {
+        let due = |dirty: &Dirty| {
+            now.saturating_duration_since(dirty.last) >= QUIET || now.saturating_duration_since(dirty.first) >= LATEST
+        };
+        let topics: Vec<TopicName> =
+            self.dirty.iter().filter(|(_, dirty)| due(dirty)).map(|(topic, _)| topic.clone()).collect();
+        for topic in topics {
+            self.dirty.remove(&topic);
+            self.plan(&topic, wall_ms);
+        }
+    }
+
+    fn plan(&mut self, topic: &TopicName, wall_ms: u64) {
+        let previous = self.plans.get(topic);
+        let world = self.registry.world();
+        let plan = plan_topic(world, topic, &self.config.rules, previous);
+        let had_route = previous.is_some_and(|plan| !plan.bridges.is_empty());
+        let has_route = !plan.bridges.is_empty();
+        let info = Box::new(local_info(world.own(), topic));
+        let unused = plan.bridges.is_empty() && world.flows.values().all(|flow| !flow.topics.contains_key(topic));
+        if unused {
+            self.plans.remove(topic);
+        } else {
+            self.plans.insert(topic.clone(), plan.clone());
+        }
+        self.outputs.push_back(Output::Plan { topic: topic.clone(), plan, info });
+        if had_route != has_route {
+            let kind = if has_route { EventKind::RouteUp } else { EventKind::RouteDown };
+            let event = Event::new(kind, &self.config.me, Some(topic), None, wall_ms);
+            self.tell(&event);
+        }
+    }
+
+    /// Of several flows that hear one control message on a shared layer broker, one answers.
+    fn answers_on(&self, scope: Scope, id: Option<&str>) -> bool {
+        if scope == Scope::Node {
+            return true;
+        }
+        let sharing = self.world().flows.iter().filter(|(flow, view)| {
+            flow.layer == self.config.me.layer
+                && view.layer_scope.is_some()
+                && view.layer_scope == self.config.layer_scope
+                && view.reach == Reach::Up
+        });
+        rendezvous::choose(id.unwrap_or_default(), sharing.map(|(flow, _)| flow)) == Some(&self.config.me)
+    }
+
+    fn tell(&mut self, event: &Event) {
+        let body = Bytes::from(event.to_json());
+        let scopes = [(Scope::Node, self.config.node_scope), (Scope::Layer, self.config.layer_scope.is_some())];
+        for (scope, _) in scopes.into_iter().filter(|(_, there)| *there) {
+            self.outputs.push_back(Output::Publish { scope, channel: ChannelName::events(), body: body.clone() });
+        }
+    }
+}
+
+/// What the local advertisements of a topic say.
+fn local_info(own: Option<&FlowView>, topic: &TopicName) -> TopicInfo {
+    let Some(entry) = own.and_then(|own| own.topics.get(topic)) else { return TopicInfo::default() };
+    let advertised: Vec<_> = [&entry.node.advertise, &entry.layer.advertise].into_iter().flatten().collect();
+    let Some(first) = advertised.first() else { return TopicInfo::default() };
+    let sources: BTreeSet<_> = advertised.iter().flat_map(|advertise| &advertise.sources).collect();
+    let only = (sources.len() == 1 && !advertised.iter().any(|a| a.more_sources)).then(|| sources.first()).flatten();
+    TopicInfo {
+        encoding: first.encoding.clone(),
+        service: only.map(|source| source.service.clone()).unwrap_or_default(),
+        instance: String::new(),
+        priority: advertised.iter().filter_map(|a| a.priority).min(),
+        max_bytes: advertised.iter().filter_map(|a| a.max_bytes).max(),
+        rate_hz: advertised.iter().map(|a| a.rate_hz).sum::<Option<f64>>(),
+        reliable: advertised.iter().any(|a| a.reliability == blaze_domain::Reliability::Reliable),
+        depth: advertised.iter().map(|a| a.depth).max().unwrap_or(0),
+        lifespan_ms: advertised.iter().map(|a| a.lifespan_ms).max().unwrap_or(0),
+    }
+}

@@ -1,0 +1,215 @@
+//! The message path and the link of one flow behind one lock.
+//!
+//! Source tasks, the transport's reader threads and the pacer take the lock once per batch or datagram and never while
+//! they wait. What the link has to say to the control core is put into a bounded inbox.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use blaze_brokers::Received;
+use blaze_domain::{DropReason, Scope};
+use parking_lot::{Condvar, Mutex};
+use tokio::sync::Notify;
+
+use crate::lane::core::{DataCore, LaneLink, Submit};
+use crate::lane::path::{LaneId, TopicId};
+use crate::link::engine::{Engine, LinkEvent, Transmit};
+use crate::link::transport::TransportEvent;
+
+/// Link events that wait for the control core; Hellos and registry messages beyond it are dropped and repaired by the
+/// next digest.
+const MAX_NEWS: usize = 10_000;
+
+/// Nanoseconds since 1970.
+#[must_use]
+pub fn wall_ns() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// Message path and link, without a lock: what the simulated network drives too.
+pub struct PlaneState {
+    /// Topics, bridges, duplicate windows.
+    pub core: DataCore,
+    /// The inter scope; absent where the node has none.
+    pub engine: Option<Engine>,
+}
+
+/// A flow without an inter scope: nothing can be sent.
+struct NoLink;
+
+impl LaneLink for NoLink {
+    fn submit(&mut self, _now: Instant, _message: Submit<'_>) -> Result<(), DropReason> {
+        Err(DropReason::LinkDown)
+    }
+    fn queued(&self, _lane: LaneId) -> u64 {
+        0
+    }
+    fn drop_lane(&mut self, _lane: LaneId) {}
+}
+
+impl PlaneState {
+    /// Takes a batch from a local scope.
+    pub fn ingest(&mut self, now: Instant, wall_ns: u64, topic: TopicId, from: Scope, batch: &mut Vec<Received>) {
+        match &mut self.engine {
+            Some(engine) => self.core.ingest(now, wall_ns, topic, from, batch, engine),
+            None => self.core.ingest(now, wall_ns, topic, from, batch, &mut NoLink),
+        }
+    }
+
+    /// Carries out what the link has decided; what concerns the control core goes to `news`.
+    pub fn pump(&mut self, now: Instant, mut news: impl FnMut(LinkEvent)) {
+        let Some(engine) = &mut self.engine else { return };
+        while let Some(event) = engine.poll_event() {
+            match event {
+                LinkEvent::Deliver { frame, .. } => self.core.deliver(now, frame, engine),
+                LinkEvent::LaneOut { lane, messages, bytes, age, .. } => {
+                    self.core.lane_out(now, lane, messages, bytes, crate::lane::measure::micros(age));
+                }
+                LinkEvent::LaneDropped { lane, reason, messages, .. } => self.core.lane_dropped(lane, reason, messages),
+                LinkEvent::ReceiverDropped { topic, reason, messages } => {
+                    self.core.receiver_dropped(&topic, reason, messages);
+                }
+                other => news(other),
+            }
+        }
+    }
+
+    /// Does what is due, and returns when it wants to be called again.
+    pub fn run_timers(&mut self, now: Instant) -> Option<Instant> {
+        let Some(engine) = &mut self.engine else {
+            return self.core.drain(now, &mut NoLink);
+        };
+        if engine.next_timeout().is_some_and(|due| due <= now) {
+            engine.handle_timeout(now);
+        }
+        let drained = self.core.drain(now, engine);
+        match (drained, engine.next_timeout()) {
+            (Some(a), Some(b)) => Some(a.min(b)),
+            (a, b) => a.or(b),
+        }
+    }
+}
+
+/// Message path and link of one flow.
+pub struct Plane {
+    state: Mutex<PlaneState>,
+    /// The pacer waits here while it has nothing to send.
+    work: Condvar,
+    news: Mutex<VecDeque<LinkEvent>>,
+    news_dropped: AtomicU64,
+    news_waits: Notify,
+}
+
+impl Plane {
+    /// Puts a message path and a link behind their lock.
+    #[must_use]
+    pub fn new(core: DataCore, engine: Option<Engine>) -> Arc<Self> {
+        Arc::new(Self {
+            state: Mutex::new(PlaneState { core, engine }),
+            work: Condvar::new(),
+            news: Mutex::default(),
+            news_dropped: AtomicU64::new(0),
+            news_waits: Notify::new(),
+        })
+    }
+
+    /// Does something under the lock, carries out what the link then wants, and wakes the pacer.
+    pub fn with<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> R {
+        let mut events = Vec::new();
+        let result = {
+            let mut state = self.state.lock();
+            let result = action(&mut state);
+            state.pump(Instant::now(), |event| events.push(event));
+            result
+        };
+        self.work.notify_one();
+        self.tell(events);
+        result
+    }
+
+    /// Looks at the state without changing what the link does.
+    pub fn read<R>(&self, look: impl FnOnce(&mut PlaneState) -> R) -> R {
+        look(&mut self.state.lock())
+    }
+
+    /// Takes a batch from a local scope.
+    pub fn ingest(&self, topic: TopicId, from: Scope, batch: &mut Vec<Received>) {
+        self.with(|state| state.ingest(Instant::now(), wall_ns(), topic, from, batch));
+    }
+
+    /// Takes what the transport found.
+    pub fn transport_event(&self, event: TransportEvent) {
+        self.with(|state| {
+            let Some(engine) = &mut state.engine else { return };
+            let now = Instant::now();
+            match event {
+                TransportEvent::Discovered(endpoint) => engine.peer_discovered(now, endpoint),
+                TransportEvent::Lost(endpoint) => engine.peer_lost(now, &endpoint),
+                TransportEvent::Received { class, datagram } => engine.receive(now, datagram, class),
+                TransportEvent::Rebuilt { epoch } => engine.restart(now, epoch),
+            }
+        });
+    }
+
+    /// The next datagram to send, or how long there is nothing to do (at most `idle`). Waits that long.
+    pub fn next_transmit(&self, idle: Duration) -> Option<Transmit> {
+        let mut events = Vec::new();
+        let transmit = {
+            let mut state = self.state.lock();
+            let now = Instant::now();
+            let due = state.run_timers(now);
+            state.pump(now, |event| events.push(event));
+            let transmit = state.engine.as_mut().and_then(|engine| engine.poll_transmit(now));
+            state.pump(now, |event| events.push(event));
+            if transmit.is_none() && events.is_empty() {
+                let until = due.map_or(now + idle, |due| due.min(now + idle));
+                self.work.wait_until(&mut state, until);
+            }
+            transmit
+        };
+        self.tell(events);
+        transmit
+    }
+
+    /// Wakes the pacer.
+    pub fn wake(&self) {
+        self.work.notify_all();
+    }
+
+    /// What the link has to say to the control core since the last call.
+    pub fn take_news(&self) -> Vec<LinkEvent> {
+        self.news.lock().drain(..).collect()
+    }
+
+    /// Waits until there is something for [`Plane::take_news`].
+    pub async fn news(&self) {
+        self.news_waits.notified().await;
+    }
+
+    /// Link events that were dropped because the control core was slow.
+    #[must_use]
+    pub fn news_dropped(&self) -> u64 {
+        self.news_dropped.load(Ordering::Relaxed)
+    }
+
+    fn tell(&self, events: Vec<LinkEvent>) {
+        if events.is_empty() {
+            return;
+        }
+        let mut news = self.news.lock();
+        for event in events {
+            // Who is there and who is not must not be lost; what peers repeat may be.
+            let repeated = matches!(event, LinkEvent::Hello { .. } | LinkEvent::Control { .. });
+            if repeated && news.len() >= MAX_NEWS {
+                self.news_dropped.fetch_add(1, Ordering::Relaxed);
+                continue;
+            }
+            news.push_back(event);
+        }
+        drop(news);
+        self.news_waits.notify_one();
+    }
+}
