@@ -3,4 +3,5 @@
 pub mod lane;
 pub mod limit;
 pub mod link;
+pub mod plan;
 pub mod world;

@@ -1,0 +1,284 @@
+//! Which bridges one flow makes for one topic: a pure function of the world that it knows.
+//!
+//! ```text
+//! World ──► TopicView (who publishes, who requests, who shares a layer broker)
+//!             │  pairs: origin filters and types agree
+//!             ├─► receivers and owners (rendezvous hashing, one per pair of publisher and group)
+//!             └─► bridges, each with the lane that its requesters ask for; what is blocked, and why
+//! ```
+//!
+//! A *group* is the flows that reach each other over one layer broker; a flow without one is a group of its own. Each
+//! message crosses the inter scope once per other group that wants it, to one receiver, which writes its node scope for
+//! its own requesters and its layer scope for everybody else's. What crossed the inter scope never leaves a layer again.
+
+mod lane;
+mod rendezvous;
+mod rules;
+mod view;
+
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+
+use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WhyCode};
+
+pub use rules::{PlanRules, TopicRule};
+pub(crate) use view::{Publisher, Requester, TopicView};
+
+use crate::world::{FlowState, OriginFilter, World};
+use lane::LaneBuilder;
+
+/// What one flow does for one topic.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct TopicPlan {
+    /// Bridges in the order of source and target; no two have both in common.
+    pub bridges: Vec<Bridge>,
+    /// Requesters that get nothing, or not everything, and why; sorted, one entry per requester and code.
+    pub blocked: Vec<Blocked>,
+}
+
+/// One way of a topic through the flow.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bridge {
+    /// Scope that it reads.
+    pub from: Scope,
+    /// Where it writes.
+    pub to: Target,
+    /// How it carries messages.
+    pub lane: LaneSpec,
+}
+
+/// Where a bridge writes.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Target {
+    /// Node scope of the flow.
+    Node {
+        /// Payloads without a header, on a channel of their own.
+        bare: bool,
+    },
+    /// Layer scope of the flow.
+    Layer,
+    /// Another flow over the inter scope.
+    Inter {
+        /// Layer of the receiver.
+        layer: LayerName,
+        /// The flow that takes it in for its group.
+        receiver: FlowId,
+    },
+}
+
+/// What the requesters behind a bridge ask of it, within what is offered.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LaneSpec {
+    /// Highest rate that any requester takes, in messages per second; `None` = as published.
+    pub max_rate_hz: Option<f64>,
+    /// The smaller of the publishers' and the longest requester's lifespan, in milliseconds; 0 = infinite.
+    pub lifespan_ms: u32,
+    /// Lost messages are sent again.
+    pub reliable: bool,
+    /// Late joiners get the last `depth` messages of each writer.
+    pub durable: bool,
+    /// Messages kept per writer, at least 1.
+    pub depth: u32,
+    /// Class on the inter scope; `None` = nobody said: bulk if large, else state.
+    pub priority: Option<Priority>,
+    /// Origins that the requesters ask for, sorted; empty = any. Nothing else is carried.
+    pub from: Vec<OriginFilter>,
+    /// More is asked than offered; it flows as offered.
+    pub degraded: Option<WhyCode>,
+}
+
+impl LaneSpec {
+    /// Whether a message of that origin is carried.
+    #[must_use]
+    pub fn carries(&self, layer: &str, node: &str, service: &str) -> bool {
+        self.from.is_empty() || self.from.iter().any(|filter| filter.matches(layer, node, service))
+    }
+}
+
+/// Who is not served.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Destination {
+    /// Services on the node scope of a flow.
+    Flow(FlowId),
+    /// Services on the layer scope of a layer.
+    Layer(LayerName),
+}
+
+/// A request that is not served, as far as this flow has a part in it.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Blocked {
+    /// Who asks.
+    pub to: Destination,
+    /// Why it gets nothing from a publisher.
+    pub code: WhyCode,
+    /// The facts, for people.
+    pub detail: String,
+}
+
+/// What a flow writes of a message that another flow addressed to it. `None` = not there.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Delivery {
+    /// Node scope, with header.
+    pub node_framed: Option<LaneSpec>,
+    /// Node scope, payload only.
+    pub node_bare: Option<LaneSpec>,
+    /// Layer scope.
+    pub layer: Option<LaneSpec>,
+}
+
+/// Plans what the flow `world.me` does for a topic.
+///
+/// `previous` is the plan in effect: as long as its receivers are still eligible they are kept, so that a flow that joins
+/// moves nothing. Equal inputs give equal plans. A flow that is not `Ready` takes in nothing and has no bridges.
+#[must_use]
+pub fn plan_topic(world: &World, topic: &TopicName, rules: &PlanRules, previous: Option<&TopicPlan>) -> TopicPlan {
+    let Some(view) = TopicView::new(world, topic) else {
+        return TopicPlan::default();
+    };
+    let lanes = LaneBuilder::new(rules.find(topic));
+    let mut plan = Planner {
+        view: &view,
+        lanes: &lanes,
+        bridges: BTreeMap::new(),
+    };
+    if world.own().is_some_and(|own| own.state == FlowState::Ready) {
+        plan.from_node(previous);
+        plan.from_layer(previous);
+        plan.from_inter();
+    }
+    TopicPlan {
+        bridges: plan
+            .bridges
+            .into_iter()
+            .map(|((from, to), lane)| Bridge { from, to, lane })
+            .collect(),
+        blocked: view.blocked(),
+    }
+}
+
+/// What the flow `world.me` writes of a message from the inter scope, whether or not it would have been chosen to get it:
+/// views differ for a moment, and a sender stays with the receiver that it has.
+#[must_use]
+pub fn delivery(world: &World, topic: &TopicName, rules: &PlanRules) -> Delivery {
+    TopicView::new(world, topic).map_or_else(Delivery::default, |view| {
+        deliver(&view, &LaneBuilder::new(rules.find(topic)))
+    })
+}
+
+/// The flow of `world.me`'s group that carries what services of the layer scope publish out of the layer.
+#[must_use]
+pub fn owner(world: &World, topic: &TopicName) -> Option<FlowId> {
+    TopicView::new(world, topic)?.owner().cloned()
+}
+
+fn deliver(view: &TopicView<'_>, lanes: &LaneBuilder<'_>) -> Delivery {
+    let outside: Vec<_> = view.publishers_outside().collect();
+    let node = view.own_node_requester();
+    let node_lane = node.and_then(|own| lanes.lane(view.pairs(outside.iter().copied(), std::iter::once(own))));
+    Delivery {
+        node_framed: node_lane.clone().filter(|_| node.is_some_and(|own| own.request.framed)),
+        node_bare: node_lane.filter(|_| node.is_some_and(|own| own.request.bare)),
+        layer: lanes.lane(view.pairs(outside.iter().copied(), view.requesters_over_own_layer())),
+    }
+}
+
+/// Collects the bridges of one topic.
+struct Planner<'a, 'w> {
+    view: &'a TopicView<'w>,
+    lanes: &'a LaneBuilder<'a>,
+    bridges: BTreeMap<(Scope, Target), LaneSpec>,
+}
+
+impl Planner<'_, '_> {
+    /// What services of the own node publish: a bare copy beside it, to the own layer, to every other group.
+    fn from_node(&mut self, previous: Option<&TopicPlan>) {
+        let Some(publisher) = self.view.own_node_publisher() else {
+            return;
+        };
+        let bare = self.view.own_node_requester().filter(|own| own.request.bare);
+        let lane = self.lanes.lane(self.view.pairs([publisher], bare));
+        self.put(Scope::Node, Target::Node { bare: true }, lane);
+        let lane = self
+            .lanes
+            .lane(self.view.pairs([publisher], self.view.requesters_over_own_layer()));
+        self.put(Scope::Node, Target::Layer, lane);
+        self.to_other_groups(publisher, previous);
+    }
+
+    /// What is on the own layer scope: to the own node, and what was born there to every other group.
+    fn from_layer(&mut self, previous: Option<&TopicPlan>) {
+        if let Some(own) = self.view.own_node_requester() {
+            let sources = self.view.publishers_over_own_layer(own);
+            let lane = self.lanes.lane(self.view.pairs(sources, [own]));
+            self.put_node(Scope::Layer, own, lane);
+        }
+        let publisher = self.view.own_layer_publisher();
+        if let Some(publisher) = publisher.filter(|_| self.view.owner() == Some(self.view.me)) {
+            self.to_other_groups(publisher, previous);
+        }
+    }
+
+    /// What other groups publish, where their senders choose this flow.
+    fn from_inter(&mut self) {
+        let delivery = deliver(self.view, self.lanes);
+        let mine: Vec<_> = self
+            .view
+            .publishers_outside()
+            .filter(|publisher| self.view.receiver(publisher, self.view.group, &[]) == Some(self.view.me))
+            .collect();
+        let mine = || mine.iter().copied();
+        if let Some(own) = self.view.own_node_requester()
+            && self.view.pairs(mine(), [own]).next().is_some()
+        {
+            self.put(Scope::Inter, Target::Node { bare: false }, delivery.node_framed);
+            self.put(Scope::Inter, Target::Node { bare: true }, delivery.node_bare);
+        }
+        let over_layer = self.view.requesters_over_own_layer();
+        if self.view.pairs(mine(), over_layer).next().is_some() {
+            self.put(Scope::Inter, Target::Layer, delivery.layer);
+        }
+    }
+
+    /// One copy to one flow of each other group that asks for it.
+    fn to_other_groups(&mut self, publisher: &Publisher<'_>, previous: Option<&TopicPlan>) {
+        let kept: Vec<&FlowId> = previous
+            .iter()
+            .flat_map(|plan| &plan.bridges)
+            .filter(|bridge| bridge.from == publisher.scope)
+            .filter_map(|bridge| match &bridge.to {
+                Target::Inter { receiver, .. } => Some(receiver),
+                Target::Node { .. } | Target::Layer => None,
+            })
+            .collect();
+        for (group, requesters) in self.view.requesters_outside() {
+            let lane = self
+                .lanes
+                .lane(self.view.pairs([publisher], requesters.iter().copied()));
+            let Some(receiver) = self.view.receiver(publisher, group, &kept) else {
+                continue;
+            };
+            let target = Target::Inter {
+                layer: receiver.layer.clone(),
+                receiver: receiver.clone(),
+            };
+            self.put(publisher.scope, target, lane);
+        }
+    }
+
+    fn put_node(&mut self, from: Scope, own: &Requester<'_>, lane: Option<LaneSpec>) {
+        if own.request.framed {
+            self.put(from, Target::Node { bare: false }, lane.clone());
+        }
+        if own.request.bare {
+            self.put(from, Target::Node { bare: true }, lane);
+        }
+    }
+
+    fn put(&mut self, from: Scope, to: Target, lane: Option<LaneSpec>) {
+        if let Some(lane) = lane {
+            self.bridges.insert((from, to), lane);
+        }
+    }
+}

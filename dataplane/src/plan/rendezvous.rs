@@ -1,0 +1,64 @@
+//! Rendezvous hashing: all flows that see the same candidates choose the same one, without talking to each other.
+//!
+//! When a candidate goes, only its topics move; when one comes, it takes its share and nothing else moves.
+
+use blaze_domain::{FlowId, TopicName};
+
+/// The candidate with the largest weight for the topic; of equal weights the smaller name. `None` without candidates.
+pub(super) fn choose<'a>(topic: &TopicName, candidates: impl Iterator<Item = &'a FlowId>) -> Option<&'a FlowId> {
+    candidates.max_by(|a, b| weight(topic, a).cmp(&weight(topic, b)).then_with(|| b.cmp(a)))
+}
+
+/// FNV-1a (64 bits) over `topic 0xFF layer 0xFF node`, then the finaliser of SplitMix64, because FNV alone leaves the
+/// high bits of similar names alike. It is part of what flows agree on: a change of it moves topics between versions.
+fn weight(topic: &TopicName, flow: &FlowId) -> u64 {
+    let parts = [topic.as_str(), flow.layer.as_str(), flow.node.as_str()];
+    let bytes = parts.iter().flat_map(|part| part.bytes().chain([0xFF]));
+    let mut hash = bytes.fold(0xCBF2_9CE4_8422_2325_u64, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01B3)
+    });
+    hash = (hash ^ (hash >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    hash = (hash ^ (hash >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    hash ^ (hash >> 31)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn flows(count: usize) -> Vec<FlowId> {
+        (0..count).map(|n| format!("fog/fog-{n}").parse().unwrap()).collect()
+    }
+
+    #[test]
+    fn topics_are_spread_evenly() {
+        let flows = flows(4);
+        let mut wins = [0; 4];
+        for n in 0..4000 {
+            let topic: TopicName = format!("robot-{n}/imu").parse().unwrap();
+            let chosen = choose(&topic, flows.iter()).unwrap();
+            wins[flows.iter().position(|flow| flow == chosen).unwrap()] += 1;
+        }
+        assert!(wins.iter().all(|wins| (900..1100).contains(wins)), "{wins:?}");
+    }
+
+    #[test]
+    fn a_flow_that_goes_moves_only_its_own_topics() {
+        let flows = flows(5);
+        for n in 0..1000 {
+            let topic: TopicName = format!("t{n}").parse().unwrap();
+            let before = choose(&topic, flows.iter()).unwrap();
+            let after = choose(&topic, flows[1..].iter()).unwrap();
+            assert!(after == before || *before == flows[0]);
+        }
+    }
+
+    #[test]
+    fn the_choice_is_the_same_on_every_machine_and_in_every_version() {
+        let topic: TopicName = "imu/data".parse().unwrap();
+        let flow: FlowId = "edge/robot-1".parse().unwrap();
+        assert_eq!(weight(&topic, &flow), GOLDEN);
+    }
+
+    const GOLDEN: u64 = 0;
+}

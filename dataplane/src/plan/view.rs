@@ -1,0 +1,335 @@
+//! The world as one topic sees it: publishers, requesters, and who of them matches whom.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use blaze_domain::{FlowId, LayerName, Scope, TopicName, WhyCode};
+
+use super::{Blocked, Destination, rendezvous};
+use crate::world::{Advertise, FlowState, FlowView, LayerScopeId, OriginFilter, Reach, Request, TopicEntry, World};
+
+/// Flows that reach each other over one layer broker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Group<'w> {
+    /// All flows of the layer that use this broker.
+    Shared(&'w LayerName, LayerScopeId),
+    /// A flow without a layer broker.
+    Alone(&'w FlowId),
+}
+
+impl<'w> Group<'w> {
+    pub(crate) fn of(id: &'w FlowId, flow: &FlowView) -> Self {
+        flow.layer_scope
+            .map_or(Self::Alone(id), |scope| Self::Shared(&id.layer, scope))
+    }
+}
+
+/// The services of one scope that advertise the topic, as one flow sees them.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Publisher<'w> {
+    pub(crate) flow: &'w FlowId,
+    pub(crate) group: Group<'w>,
+    pub(crate) scope: Scope,
+    pub(crate) advertise: &'w Advertise,
+}
+
+/// The services of one scope that request the topic, as one flow sees them.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Requester<'w> {
+    pub(crate) flow: &'w FlowId,
+    pub(crate) group: Group<'w>,
+    pub(crate) scope: Scope,
+    pub(crate) request: &'w Request,
+}
+
+/// Whether a request takes what a publisher offers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Pairing {
+    Matches,
+    OtherOrigin,
+    OtherType,
+}
+
+impl Requester<'_> {
+    pub(crate) fn destination(&self) -> Destination {
+        match self.scope {
+            Scope::Node | Scope::Inter => Destination::Flow(self.flow.clone()),
+            Scope::Layer => Destination::Layer(self.flow.layer.clone()),
+        }
+    }
+}
+
+impl Publisher<'_> {
+    /// Whether a request takes something of what is published here.
+    pub(crate) fn pairing(&self, request: &Request) -> Pairing {
+        if !request.from.is_empty() && !request.from.iter().any(|filter| self.has_origin(filter)) {
+            Pairing::OtherOrigin
+        } else if differ(&self.advertise.type_name, &request.type_name)
+            || differ(&self.advertise.type_hash, &request.type_hash)
+        {
+            Pairing::OtherType
+        } else {
+            Pairing::Matches
+        }
+    }
+
+    fn matches(&self, requester: &Requester<'_>) -> bool {
+        self.pairing(requester.request) == Pairing::Matches
+    }
+
+    fn has_origin(&self, filter: &OriginFilter) -> bool {
+        let part = |wanted: &Option<String>, found: &str| wanted.as_deref().is_none_or(|wanted| wanted == found);
+        if !part(&filter.layer, self.flow.layer.as_str()) {
+            return false;
+        }
+        let on_node = self.scope == Scope::Node;
+        if on_node && !part(&filter.node, self.flow.node.as_str()) {
+            return false;
+        }
+        self.advertise.more_sources
+            || self
+                .advertise
+                .sources
+                .iter()
+                .any(|source| part(&filter.service, &source.service) && (on_node || part(&filter.node, &source.node)))
+    }
+}
+
+/// Both are given and not the same.
+fn differ(a: &str, b: &str) -> bool {
+    !a.is_empty() && !b.is_empty() && a != b
+}
+
+/// Publishers and requesters of one topic.
+pub(crate) struct TopicView<'w> {
+    topic: &'w TopicName,
+    pub(crate) me: &'w FlowId,
+    pub(crate) group: Group<'w>,
+    /// Of flows that carry topics.
+    pub(crate) publishers: Vec<Publisher<'w>>,
+    /// Of flows that carry topics.
+    pub(crate) requesters: Vec<Requester<'w>>,
+    /// Of flows that are down.
+    lost_requesters: Vec<Requester<'w>>,
+}
+
+impl<'w> TopicView<'w> {
+    /// `None` if the world does not hold its own flow.
+    pub(crate) fn new(world: &'w World, topic: &'w TopicName) -> Option<Self> {
+        let (me, own) = world.flows.get_key_value(&world.me)?;
+        let mut view = Self {
+            topic,
+            me,
+            group: Group::of(me, own),
+            publishers: Vec::new(),
+            requesters: Vec::new(),
+            lost_requesters: Vec::new(),
+        };
+        for (id, flow) in &world.flows {
+            if let Some(entry) = flow.topics.get(topic) {
+                view.add(id, flow, entry);
+            }
+        }
+        Some(view)
+    }
+
+    fn add(&mut self, flow: &'w FlowId, view: &'w FlowView, entry: &'w TopicEntry) {
+        let group = Group::of(flow, view);
+        let node = view.node_scope.then_some((Scope::Node, &entry.node));
+        let layer = view.layer_scope.map(|_| (Scope::Layer, &entry.layer));
+        // A flow knows that it lives; what it is told of itself does not count.
+        let reachable = view.reach != Reach::Down || flow == self.me;
+        let carries = reachable && view.state == FlowState::Ready;
+        for (scope, entry) in node.into_iter().chain(layer) {
+            if let Some(advertise) = entry.advertise.as_ref().filter(|_| carries) {
+                self.publishers.push(Publisher {
+                    flow,
+                    group,
+                    scope,
+                    advertise,
+                });
+            }
+            if let Some(request) = &entry.request {
+                let requester = Requester {
+                    flow,
+                    group,
+                    scope,
+                    request,
+                };
+                if carries {
+                    self.requesters.push(requester);
+                } else if !reachable {
+                    self.lost_requesters.push(requester);
+                }
+            }
+        }
+    }
+
+    pub(crate) fn own_node_publisher(&self) -> Option<&Publisher<'w>> {
+        self.publishers
+            .iter()
+            .find(|publisher| publisher.flow == self.me && publisher.scope == Scope::Node)
+    }
+
+    pub(crate) fn own_layer_publisher(&self) -> Option<&Publisher<'w>> {
+        self.publishers
+            .iter()
+            .find(|publisher| publisher.flow == self.me && publisher.scope == Scope::Layer)
+    }
+
+    pub(crate) fn own_node_requester(&self) -> Option<&Requester<'w>> {
+        self.requesters
+            .iter()
+            .find(|requester| requester.flow == self.me && requester.scope == Scope::Node)
+    }
+
+    /// Everybody whom a message reaches that this flow writes to its layer scope: services there, other flows' services.
+    pub(crate) fn requesters_over_own_layer(&self) -> impl Iterator<Item = &Requester<'w>> + Clone {
+        let of_layer = |requester: &Requester<'_>| requester.scope == Scope::Layer || requester.flow != self.me;
+        self.requesters
+            .iter()
+            .filter(move |requester| requester.group == self.group && of_layer(requester))
+    }
+
+    /// Whose messages reach the layer scope without this flow, given that its own node asks for them.
+    ///
+    /// A publisher outside counts if another flow could be its receiver, even where this one would be chosen: its sender
+    /// may stay with an earlier choice that only it knows.
+    pub(crate) fn publishers_over_own_layer(&self, own: &Requester<'w>) -> impl Iterator<Item = &Publisher<'w>> {
+        self.publishers.iter().filter(move |publisher| {
+            if publisher.group == self.group {
+                publisher.scope == Scope::Layer || publisher.flow != self.me
+            } else {
+                publisher.matches(own) && self.candidates(publisher, self.group).any(|flow| flow != self.me)
+            }
+        })
+    }
+
+    /// Publishers that only the inter scope connects with this flow.
+    pub(crate) fn publishers_outside(&self) -> impl Iterator<Item = &Publisher<'w>> {
+        self.publishers.iter().filter(|publisher| publisher.group != self.group)
+    }
+
+    /// Requesters that only the inter scope connects with this flow, by group.
+    pub(crate) fn requesters_outside(&self) -> BTreeMap<Group<'w>, Vec<&Requester<'w>>> {
+        let mut groups: BTreeMap<_, Vec<_>> = BTreeMap::new();
+        for requester in self.requesters.iter().filter(|requester| requester.group != self.group) {
+            groups.entry(requester.group).or_default().push(requester);
+        }
+        groups
+    }
+
+    /// The pairs that match, of all publishers with all requesters.
+    pub(crate) fn pairs<'p>(
+        &self,
+        publishers: impl IntoIterator<Item = &'p Publisher<'w>>,
+        requesters: impl IntoIterator<Item = &'p Requester<'w>, IntoIter: Clone>,
+    ) -> impl Iterator<Item = (&'p Publisher<'w>, &'p Requester<'w>)>
+    where
+        'w: 'p,
+    {
+        let requesters = requesters.into_iter();
+        publishers.into_iter().flat_map(move |publisher| {
+            let matching = requesters.clone().filter(move |requester| publisher.matches(requester));
+            matching.map(move |requester| (publisher, requester))
+        })
+    }
+
+    /// The flows of a group that could take in what the publisher sends: those with a requester of their own for it, on
+    /// their node scope or on the layer scope that they share.
+    pub(crate) fn candidates<'p>(
+        &'p self,
+        publisher: &'p Publisher<'w>,
+        group: Group<'w>,
+    ) -> impl Iterator<Item = &'w FlowId> + use<'p, 'w> {
+        let in_group = self.requesters.iter().filter(move |requester| requester.group == group);
+        in_group
+            .filter(|requester| publisher.matches(requester))
+            .map(|requester| requester.flow)
+    }
+
+    /// The flow of a group that gets what the publisher sends: one of `kept` if it still could, else by rendezvous.
+    pub(crate) fn receiver(&self, publisher: &Publisher<'w>, group: Group<'w>, kept: &[&FlowId]) -> Option<&'w FlowId> {
+        self.candidates(publisher, group)
+            .find(|candidate| kept.contains(candidate))
+            .or_else(|| rendezvous::choose(self.topic, self.candidates(publisher, group)))
+    }
+
+    /// The flow of the own group that carries what is published on the layer scope to other groups.
+    pub(crate) fn owner(&self) -> Option<&'w FlowId> {
+        let sees_it = |publisher: &&Publisher<'_>| publisher.group == self.group && publisher.scope == Scope::Layer;
+        rendezvous::choose(
+            self.topic,
+            self.publishers.iter().filter(sees_it).map(|publisher| publisher.flow),
+        )
+    }
+
+    /// Requests that this flow or its publishers have a part in and that are not served.
+    pub(crate) fn blocked(&self) -> Vec<Blocked> {
+        let mut blocked = BTreeSet::new();
+        let carried = |publisher: &&Publisher<'w>| match publisher.scope {
+            Scope::Node | Scope::Inter => publisher.flow == self.me,
+            Scope::Layer => publisher.flow == self.me && self.owner() == Some(self.me),
+        };
+        let sent: Vec<_> = self.publishers.iter().filter(carried).collect();
+        for requester in &self.requesters {
+            let own = requester.flow == self.me;
+            let parts = self.publishers.iter().filter(|publisher| own || carried(publisher));
+            for publisher in parts.filter(|publisher| !meets_directly(publisher, requester)) {
+                if publisher.pairing(requester.request) == Pairing::OtherType {
+                    blocked.insert((
+                        requester.destination(),
+                        WhyCode::TypeMismatch,
+                        type_detail(publisher, requester),
+                    ));
+                }
+            }
+            let other_origin = |publisher: &Publisher<'_>| publisher.pairing(requester.request) == Pairing::OtherOrigin;
+            if (own || !sent.is_empty()) && !self.publishers.is_empty() && self.publishers.iter().all(other_origin) {
+                let detail = format!(
+                    "none of {} publishing scopes has an origin that it asks for",
+                    self.publishers.len()
+                );
+                blocked.insert((requester.destination(), WhyCode::NoMatchingOrigin, detail));
+            }
+        }
+        for requester in &self.lost_requesters {
+            let wanted = sent
+                .iter()
+                .any(|publisher| publisher.group != requester.group && publisher.matches(requester));
+            // A layer scope has other flows to reach it by; if it has none, nobody says that it is still there.
+            if wanted && requester.scope == Scope::Node {
+                blocked.insert((
+                    requester.destination(),
+                    WhyCode::PeerDown,
+                    format!("{} is down", requester.flow),
+                ));
+            }
+        }
+        let entry = |(to, code, detail)| Blocked { to, code, detail };
+        let mut blocked: Vec<_> = blocked.into_iter().map(entry).collect();
+        blocked.dedup_by(|next, kept| next.to == kept.to && next.code == kept.code);
+        blocked
+    }
+}
+
+/// Whether the services share a scope, so that no flow is between them (a bare copy is made by one).
+fn meets_directly(publisher: &Publisher<'_>, requester: &Requester<'_>) -> bool {
+    publisher.scope == requester.scope
+        && match publisher.scope {
+            Scope::Node | Scope::Inter => publisher.flow == requester.flow && !requester.request.bare,
+            Scope::Layer => publisher.group == requester.group,
+        }
+}
+
+pub(crate) fn type_detail(publisher: &Publisher<'_>, requester: &Requester<'_>) -> String {
+    let (offer, ask) = (publisher.advertise, requester.request);
+    let (offered, asked) = if differ(&offer.type_name, &ask.type_name) {
+        (&offer.type_name, &ask.type_name)
+    } else {
+        (&offer.type_hash, &ask.type_hash)
+    };
+    format!(
+        "{} advertises {offered}, {} requests {asked}",
+        publisher.flow, requester.flow
+    )
+}
