@@ -24,7 +24,7 @@ use super::path::{BridgeState, LaneId, Phase, Sink, TopicId, TopicInfo, TopicPat
 use super::stats::{BridgeStats, Drops};
 use super::window::DuplicateWindow;
 use crate::limit::bucket::TokenBucket;
-use crate::plan::{Bridge, LaneSpec, Target, TopicPlan};
+use crate::plan::{Bridge, Target, TopicPlan};
 
 /// Writers whose duplicate window a flow keeps; the least recently used go first.
 pub const MAX_WRITERS: usize = 65_536;
@@ -448,7 +448,7 @@ impl BridgeState {
         if self.from == Scope::Node && !message.born_here {
             return false;
         }
-        filter_matches(&self.lane, frame)
+        self.lane.carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
     }
 
     fn pass(&mut self, now: Instant, topic: TopicId, message: &Admitted, large: bool, link: &mut dyn LaneLink) {
@@ -506,14 +506,6 @@ impl BridgeState {
             }
         }
     }
-}
-
-fn filter_matches(lane: &LaneSpec, frame: &Frame) -> bool {
-    lane.from.is_empty()
-        || lane
-            .from
-            .iter()
-            .any(|filter| filter.matches(frame.origin_layer(), frame.origin_node(), frame.origin_service()))
 }
 
 fn is_bare(target: &Target) -> bool {

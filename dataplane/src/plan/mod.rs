@@ -12,7 +12,7 @@
 //! its own requesters and its layer scope for everybody else's. What crossed the inter scope never leaves a layer again.
 
 mod lane;
-mod rendezvous;
+pub(crate) mod rendezvous;
 mod rules;
 mod view;
 

@@ -2,17 +2,17 @@
 //!
 //! When a candidate goes, only its topics move; when one comes, it takes its share and nothing else moves.
 
-use blaze_domain::{FlowId, TopicName};
+use blaze_domain::FlowId;
 
-/// The candidate with the largest weight for the topic; of equal weights the smaller name. `None` without candidates.
-pub(super) fn choose<'a>(topic: &TopicName, candidates: impl Iterator<Item = &'a FlowId>) -> Option<&'a FlowId> {
-    candidates.max_by(|a, b| weight(topic, a).cmp(&weight(topic, b)).then_with(|| b.cmp(a)))
+/// The candidate with the largest weight for a key, which is the topic unless said otherwise; of equal weights the smaller name. `None` without candidates.
+pub(crate) fn choose<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>) -> Option<&'a FlowId> {
+    candidates.max_by(|a, b| weight(key, a).cmp(&weight(key, b)).then_with(|| b.cmp(a)))
 }
 
 /// FNV-1a (64 bits) over `topic 0xFF layer 0xFF node`, then the finaliser of SplitMix64, because FNV alone leaves the
 /// high bits of similar names alike. It is part of what flows agree on: a change of it moves topics between versions.
-fn weight(topic: &TopicName, flow: &FlowId) -> u64 {
-    let parts = [topic.as_str(), flow.layer.as_str(), flow.node.as_str()];
+fn weight(key: &str, flow: &FlowId) -> u64 {
+    let parts = [key, flow.layer.as_str(), flow.node.as_str()];
     let bytes = parts.iter().flat_map(|part| part.bytes().chain([0xFF]));
     let mut hash = bytes.fold(0xCBF2_9CE4_8422_2325_u64, |hash, byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01B3)
@@ -25,6 +25,7 @@ fn weight(topic: &TopicName, flow: &FlowId) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use blaze_domain::TopicName;
 
     fn flows(count: usize) -> Vec<FlowId> {
         (0..count).map(|n| format!("fog/fog-{n}").parse().unwrap()).collect()
@@ -36,7 +37,7 @@ mod tests {
         let mut wins = [0; 4];
         for n in 0..4000 {
             let topic: TopicName = format!("robot-{n}/imu").parse().unwrap();
-            let chosen = choose(&topic, flows.iter()).unwrap();
+            let chosen = choose(topic.as_str(), flows.iter()).unwrap();
             wins[flows.iter().position(|flow| flow == chosen).unwrap()] += 1;
         }
         assert!(wins.iter().all(|wins| (900..1100).contains(wins)), "{wins:?}");
@@ -47,8 +48,8 @@ mod tests {
         let flows = flows(5);
         for n in 0..1000 {
             let topic: TopicName = format!("t{n}").parse().unwrap();
-            let before = choose(&topic, flows.iter()).unwrap();
-            let after = choose(&topic, flows[1..].iter()).unwrap();
+            let before = choose(topic.as_str(), flows.iter()).unwrap();
+            let after = choose(topic.as_str(), flows[1..].iter()).unwrap();
             assert!(after == before || *before == flows[0]);
         }
     }
@@ -57,7 +58,7 @@ mod tests {
     fn the_choice_is_the_same_on_every_machine_and_in_every_version() {
         let topic: TopicName = "imu/data".parse().unwrap();
         let flow: FlowId = "edge/robot-1".parse().unwrap();
-        assert_eq!(weight(&topic, &flow), GOLDEN);
+        assert_eq!(weight(topic.as_str(), &flow), GOLDEN);
     }
 
     const GOLDEN: u64 = 0;

@@ -251,14 +251,14 @@ impl<'w> TopicView<'w> {
     pub(crate) fn receiver(&self, publisher: &Publisher<'w>, group: Group<'w>, kept: &[&FlowId]) -> Option<&'w FlowId> {
         self.candidates(publisher, group)
             .find(|candidate| kept.contains(candidate))
-            .or_else(|| rendezvous::choose(self.topic, self.candidates(publisher, group)))
+            .or_else(|| rendezvous::choose(self.topic.as_str(), self.candidates(publisher, group)))
     }
 
     /// The flow of the own group that carries what is published on the layer scope to other groups.
     pub(crate) fn owner(&self) -> Option<&'w FlowId> {
         let sees_it = |publisher: &&Publisher<'_>| publisher.group == self.group && publisher.scope == Scope::Layer;
         rendezvous::choose(
-            self.topic,
+            self.topic.as_str(),
             self.publishers.iter().filter(sees_it).map(|publisher| publisher.flow),
         )
     }
