@@ -165,18 +165,26 @@ impl DataCore {
         plan: &TopicPlan,
         mut publisher: impl FnMut(&Target) -> Option<Arc<dyn Publisher>>,
     ) {
-        let Self { topics, lanes, config, .. } = self;
+        let Self {
+            topics, lanes, config, ..
+        } = self;
         let path = &mut topics[topic.0 as usize];
         path.info = info;
         for bridge in &mut path.bridges {
-            let planned = plan.bridges.iter().any(|p| p.from == bridge.from && p.to == bridge.target);
+            let planned = plan
+                .bridges
+                .iter()
+                .any(|p| p.from == bridge.from && p.to == bridge.target);
             if !planned && matches!(bridge.phase, Phase::Up { .. }) {
                 bridge.phase = Phase::Draining { until: now + DRAIN };
             }
         }
         for planned in &plan.bridges {
             let class = path.class(&planned.lane, config.large_bytes);
-            let existing = path.bridges.iter_mut().find(|b| b.from == planned.from && b.target == planned.to);
+            let existing = path
+                .bridges
+                .iter_mut()
+                .find(|b| b.from == planned.from && b.target == planned.to);
             if let Some(bridge) = existing {
                 bridge.renew(now, planned, &mut publisher);
                 continue;
@@ -188,7 +196,10 @@ impl DataCore {
                     Sink::Lane { lane, class }
                 }
                 target => match publisher(target) {
-                    Some(publisher) => Sink::Publish { publisher, bare: is_bare(target) },
+                    Some(publisher) => Sink::Publish {
+                        publisher,
+                        bare: is_bare(target),
+                    },
                     None => continue,
                 },
             };
@@ -216,7 +227,9 @@ impl DataCore {
 
     /// Counts what a subscription of this topic dropped because the flow was slow.
     pub fn count_overrun(&mut self, topic: TopicId, messages: u64) {
-        self.topics[topic.0 as usize].ingress_drops.add(DropReason::QueueFull, messages);
+        self.topics[topic.0 as usize]
+            .ingress_drops
+            .add(DropReason::QueueFull, messages);
     }
 
     /// Takes a message that came over the link; its age is right at `now`.
@@ -240,7 +253,17 @@ impl DataCore {
             return;
         }
         let age_us = frame.age_us();
-        self.fan_out(now, topic, Scope::Inter, &Admitted { frame, born_here: false, age_us }, link);
+        self.fan_out(
+            now,
+            topic,
+            Scope::Inter,
+            &Admitted {
+                frame,
+                born_here: false,
+                age_us,
+            },
+            link,
+        );
     }
 
     /// What the link says of a lane.
@@ -271,7 +294,9 @@ impl DataCore {
     pub fn drain(&mut self, now: Instant, link: &mut dyn LaneLink) -> Option<Instant> {
         let mut next = None;
         for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
-            let Phase::Draining { until } = bridge.phase else { continue };
+            let Phase::Draining { until } = bridge.phase else {
+                continue;
+            };
             let lane = match bridge.sink {
                 Sink::Lane { lane, .. } => Some(lane),
                 Sink::Publish { .. } => None,
@@ -305,16 +330,21 @@ impl DataCore {
         let (frame, bare) = match received.content {
             Content::Malformed { .. } => return Err(DropReason::DecodeError),
             Content::Frame(frame) => (frame, false),
-            Content::Bare { payload, identity } => {
-                (self.wrap(wall_ns.saturating_sub(waited_us * 1000), topic, from, payload, identity)?, true)
-            }
+            Content::Bare { payload, identity } => (
+                self.wrap(wall_ns.saturating_sub(waited_us * 1000), topic, from, payload, identity)?,
+                true,
+            ),
         };
         if frame.topic() != self.path(topic).name.as_str() {
             return Err(DropReason::DecodeError);
         }
         if !self.is_new(topic, &frame) {
             // What a flow has written carries hops; a publisher that repeats itself does not.
-            return Err(if frame.hops() > 0 { DropReason::Echo } else { DropReason::Duplicate });
+            return Err(if frame.hops() > 0 {
+                DropReason::Echo
+            } else {
+                DropReason::Duplicate
+            });
         }
         let me = &self.config.me;
         let own_layer = frame.origin_layer() == me.layer.as_str();
@@ -336,7 +366,11 @@ impl DataCore {
         let bytes = frame.payload().len() as u64;
         path.largest_bytes = path.largest_bytes.max(bytes);
         path.in_rate.add(now, bytes);
-        Ok(Admitted { frame, born_here, age_us })
+        Ok(Admitted {
+            frame,
+            born_here,
+            age_us,
+        })
     }
 
     /// Gives a bare payload its header.
@@ -351,13 +385,19 @@ impl DataCore {
         let config = &self.config;
         let path = &mut self.topics[topic.0 as usize];
         let (writer, sequence) = identity.unwrap_or_else(|| {
-            let (writer, sequence) =
-                path.bare.entry(from).or_insert_with(|| (bare_writer(config, from, path.name.as_str()), 0));
+            let (writer, sequence) = path
+                .bare
+                .entry(from)
+                .or_insert_with(|| (bare_writer(config, from, path.name.as_str()), 0));
             *sequence += 1;
             (*writer, *sequence)
         });
         let info = &path.info;
-        let node = if from == Scope::Node { config.me.node.to_string() } else { String::new() };
+        let node = if from == Scope::Node {
+            config.me.node.to_string()
+        } else {
+            String::new()
+        };
         let origin = Origin {
             layer: config.me.layer.to_string(),
             node,
@@ -448,7 +488,8 @@ impl BridgeState {
         if self.from == Scope::Node && !message.born_here {
             return false;
         }
-        self.lane.carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
+        self.lane
+            .carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
     }
 
     fn pass(&mut self, now: Instant, topic: TopicId, message: &Admitted, large: bool, link: &mut dyn LaneLink) {
@@ -485,12 +526,18 @@ impl BridgeState {
                 }
             }
             Sink::Lane { lane, class } => {
-                let wanted = if large { Priority::Bulk } else { self.lane.priority.unwrap_or(Priority::State) };
+                let wanted = if large {
+                    Priority::Bulk
+                } else {
+                    self.lane.priority.unwrap_or(Priority::State)
+                };
                 // A small message of the new class must not overtake a large one of the old.
                 if wanted != *class && link.queued(*lane) == 0 {
                     *class = wanted;
                 }
-                let Target::Inter { receiver, .. } = &self.target else { return };
+                let Target::Inter { receiver, .. } = &self.target else {
+                    return;
+                };
                 let submit = Submit {
                     to: receiver,
                     class: *class,
@@ -515,9 +562,15 @@ fn is_bare(target: &Target) -> bool {
 /// Writer of bare messages that this flow numbers: new at each start of the flow.
 fn bare_writer(config: &DataConfig, from: Scope, topic: &str) -> WriterId {
     use sha2::{Digest, Sha256};
-    let text = format!("{from}|{}|{}|{topic}|{}|{}", config.me.layer, config.me.node, config.epoch, config.salt);
+    let text = format!(
+        "{from}|{}|{}|{topic}|{}|{}",
+        config.me.layer, config.me.node, config.epoch, config.salt
+    );
     let digest = Sha256::digest(text.as_bytes());
     let mut id = [0; 16];
     id.copy_from_slice(&digest[..16]);
     WriterId(id)
 }
+
+#[cfg(test)]
+mod tests;

@@ -18,7 +18,12 @@ impl RateMeter {
     /// A meter that has seen nothing.
     #[must_use]
     pub fn new(now: Instant) -> Self {
-        Self { start: now, slots: [(0, 0); SLOTS], second: 0, begun: 0 }
+        Self {
+            start: now,
+            slots: [(0, 0); SLOTS],
+            second: 0,
+            begun: 0,
+        }
     }
 
     /// Counts one message.
@@ -75,7 +80,11 @@ pub struct LatencyHistogram {
 
 impl Default for LatencyHistogram {
     fn default() -> Self {
-        Self { counts: Box::new([0; BUCKETS]), count: 0, sum_us: 0 }
+        Self {
+            counts: Box::new([0; BUCKETS]),
+            count: 0,
+            sum_us: 0,
+        }
     }
 }
 
@@ -160,7 +169,10 @@ mod tests {
             meter.add(start + Duration::from_millis(20) * n, 100);
         }
         let (rate, bytes) = meter.rate(start + Duration::from_secs(10));
-        assert!((rate - 50.0).abs() < 0.1 && (bytes - 5000.0).abs() < 10.0, "{rate} {bytes}");
+        assert!(
+            (rate - 50.0).abs() < 0.1 && (bytes - 5000.0).abs() < 10.0,
+            "{rate} {bytes}"
+        );
         assert!(meter.rate(start + Duration::from_secs(60)).0.abs() < f64::EPSILON);
     }
 

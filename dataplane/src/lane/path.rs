@@ -155,19 +155,29 @@ impl TopicPath {
     /// Size that decides the class: the largest seen, else as advertised.
     #[must_use]
     pub fn size_bytes(&self) -> u64 {
-        if self.largest_bytes > 0 { self.largest_bytes } else { self.info.max_bytes.unwrap_or(0) }
+        if self.largest_bytes > 0 {
+            self.largest_bytes
+        } else {
+            self.info.max_bytes.unwrap_or(0)
+        }
     }
 
     /// Class of a lane: bulk if the topic is large, else as the lane says, else state.
     #[must_use]
     pub fn class(&self, lane: &LaneSpec, large_bytes: u64) -> Priority {
         let large = self.largest_bytes.max(self.info.max_bytes.unwrap_or(0)) > large_bytes;
-        if large { Priority::Bulk } else { lane.priority.unwrap_or(Priority::State) }
+        if large {
+            Priority::Bulk
+        } else {
+            lane.priority.unwrap_or(Priority::State)
+        }
     }
 
     /// Whether a bridge takes messages in from that scope.
     #[must_use]
     pub fn reads(&self, scope: Scope) -> bool {
-        self.bridges.iter().any(|bridge| bridge.from == scope && matches!(bridge.phase, Phase::Up { .. }))
+        self.bridges
+            .iter()
+            .any(|bridge| bridge.from == scope && matches!(bridge.phase, Phase::Up { .. }))
     }
 }

@@ -44,7 +44,10 @@ impl Drops {
 
     /// All reasons that occurred, with their counts.
     pub fn iter(&self) -> impl Iterator<Item = (DropReason, u64)> + '_ {
-        DropReason::ALL.iter().map(|reason| (*reason, self.get(*reason))).filter(|(_, count)| *count > 0)
+        DropReason::ALL
+            .iter()
+            .map(|reason| (*reason, self.get(*reason)))
+            .filter(|(_, count)| *count > 0)
     }
 
     /// All of them.
@@ -71,6 +74,9 @@ impl BridgeStats {
     /// Messages that are inside: taken in, neither written nor dropped.
     #[must_use]
     pub fn queued(&self) -> u64 {
-        self.taken.messages.saturating_sub(self.out.messages).saturating_sub(self.dropped.total())
+        self.taken
+            .messages
+            .saturating_sub(self.out.messages)
+            .saturating_sub(self.dropped.total())
     }
 }

@@ -19,7 +19,12 @@ impl Pacer {
     /// A pacer for a budget; `burst_bytes` is the most that leaves at once after a pause.
     #[must_use]
     pub fn new(bytes_per_s: f64, burst_bytes: usize, now: Instant) -> Self {
-        Self { bytes_per_s: bytes_per_s.max(1.0), credit: 0.0, burst_bytes: burst_bytes as f64, filled: now }
+        Self {
+            bytes_per_s: bytes_per_s.max(1.0),
+            credit: 0.0,
+            burst_bytes: burst_bytes as f64,
+            filled: now,
+        }
     }
 
     /// Changes the budget from now on.
