@@ -1,0 +1,174 @@
+//! Real processes of the product, their output, and their end.
+
+use std::io::{BufRead, BufReader, Read};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use anyhow::Context;
+
+use crate::admin::Admin;
+use crate::wait;
+
+/// Lines of output that are kept.
+const MAX_LINES: usize = 20_000;
+
+/// A binary of the workspace, beside the test's own.
+///
+/// # Errors
+/// When it has not been built.
+pub fn binary(name: &str) -> anyhow::Result<PathBuf> {
+    let test = std::env::current_exe()?;
+    let folder = test.parent().and_then(|deps| deps.parent()).context("the test lies in target/<profile>/deps")?;
+    let path = folder.join(name);
+    anyhow::ensure!(path.exists(), "{} is not built: run `cargo build --workspace` first", path.display());
+    Ok(path)
+}
+
+type Lines = Arc<Mutex<Vec<String>>>;
+
+/// A running process; it is killed when dropped.
+pub struct Process {
+    child: Child,
+    namespace: Option<String>,
+    stdout: Lines,
+    stderr: Lines,
+}
+
+impl Process {
+    /// Starts a program of the workspace, in a namespace if one is named.
+    ///
+    /// # Errors
+    /// When it is not built or does not start.
+    pub fn start(name: &str, arguments: &[&str], namespace: Option<&str>) -> anyhow::Result<Self> {
+        let program = binary(name)?;
+        let mut command = match namespace {
+            None => Command::new(program),
+            Some(namespace) => {
+                let mut command = Command::new("ip");
+                command.args(["netns", "exec", namespace]).arg(program);
+                command
+            }
+        };
+        command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = command.spawn().with_context(|| format!("starting {name}"))?;
+        let stdout = collect(child.stdout.take());
+        let stderr = collect(child.stderr.take());
+        Ok(Self { child, namespace: namespace.map(str::to_owned), stdout, stderr })
+    }
+
+    /// Its process id. `ip netns exec` replaces itself, so it is that of the program also in a namespace.
+    #[must_use]
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// What it has printed on stdout so far.
+    #[must_use]
+    pub fn stdout(&self) -> Vec<String> {
+        self.stdout.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// What it has printed on stderr so far.
+    #[must_use]
+    pub fn stderr(&self) -> Vec<String> {
+        self.stderr.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Waits for the line `ready node=NODE admin=ADDRESS` on stderr and gives the admin port in it.
+    ///
+    /// # Errors
+    /// When the line does not come in time or the process ends.
+    pub fn node_ready(&mut self, node: &str, deadline: Duration) -> anyhow::Result<Admin> {
+        let start = format!("ready node={node} ");
+        let line = wait::until_some(
+            &format!("`{start}`"),
+            deadline,
+            || self.stderr().into_iter().find(|line| line.starts_with(&start)),
+            || self.tail(),
+        )?;
+        let address = line.split("admin=").nth(1).context("no admin= in the ready line")?.trim().parse()?;
+        Ok(Admin { address, namespace: self.namespace.clone() })
+    }
+
+    /// Kills it at once, as a crash would, and waits for its end.
+    ///
+    /// # Errors
+    /// When it cannot be killed.
+    pub fn kill(&mut self) -> anyhow::Result<()> {
+        self.child.kill()?;
+        self.child.wait()?;
+        Ok(())
+    }
+
+    /// Asks it to end (SIGTERM) and gives its exit code.
+    ///
+    /// # Errors
+    /// When it does not end in time.
+    pub fn terminate(&mut self, deadline: Duration) -> anyhow::Result<Option<i32>> {
+        Command::new("kill").args(["-TERM", &self.child.id().to_string()]).status()?;
+        self.exit(deadline)
+    }
+
+    /// Waits for its end and gives its exit code.
+    ///
+    /// # Errors
+    /// When it does not end in time.
+    pub fn exit(&mut self, deadline: Duration) -> anyhow::Result<Option<i32>> {
+        let status = wait::until_some(
+            "the end of the process",
+            deadline,
+            || self.child.try_wait().ok().flatten(),
+            || "it still runs".to_owned(),
+        )?;
+        Ok(status.code())
+    }
+
+    /// Resident memory in bytes; `None` when it does not run.
+    #[must_use]
+    pub fn resident_bytes(&self) -> Option<u64> {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).ok()?;
+        let line = status.lines().find(|line| line.starts_with("VmRSS:"))?;
+        let kilobytes: u64 = line.split_whitespace().nth(1)?.parse().ok()?;
+        Some(kilobytes * 1024)
+    }
+
+    /// Whether it still runs.
+    pub fn runs(&mut self) -> bool {
+        matches!(self.child.try_wait(), Ok(None))
+    }
+
+    /// The last lines of its output, for a test that failed.
+    #[must_use]
+    pub fn tail(&self) -> String {
+        let last = |lines: Vec<String>| {
+            let from = lines.len().saturating_sub(30);
+            lines[from..].join("\n")
+        };
+        format!("stdout:\n{}\nstderr:\n{}", last(self.stdout()), last(self.stderr()))
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn collect(pipe: Option<impl Read + Send + 'static>) -> Lines {
+    let lines = Lines::default();
+    let Some(pipe) = pipe else { return lines };
+    let kept = Arc::clone(&lines);
+    std::thread::spawn(move || {
+        for line in BufReader::new(pipe).lines().map_while(Result::ok) {
+            let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
+            if kept.len() >= MAX_LINES {
+                kept.drain(..MAX_LINES / 2);
+            }
+            kept.push(line);
+        }
+    });
+    lines
+}
