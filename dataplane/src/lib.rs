@@ -1,4 +1,5 @@
 //! BlazeFlow: connects whoever publishes a topic with whoever asks for it.
 
 pub mod link;
+pub mod registry;
 pub mod world;
