@@ -1,7 +1,10 @@
 //! BlazeFlow: connects whoever publishes a topic with whoever asks for it.
+//!
+//! See `ARCHITECTURE.md` for the map.
 
 pub mod lane;
 pub mod limit;
 pub mod link;
 pub mod plan;
+pub mod registry;
 pub mod world;

@@ -1,8 +1,9 @@
-//! The words of BlazeAIoT: names, identities, quality of service, drop reasons.
+//! The words of BlazeAIoT: names, identities, quality of service, control protocol, drop reasons.
 //!
 //! Everything here is plain data and pure functions: no input or output, no clock, no asynchronous code. Each name is a
 //! type that cannot hold a bad value; each closed set of the contract is an `enum` with its text on the wire.
 
+pub mod control;
 pub mod identity;
 pub mod names;
 pub mod qos;

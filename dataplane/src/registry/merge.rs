@@ -1,0 +1,172 @@
+//! Many leases of one topic become one entry: what the planner sees and other flows are told.
+
+use std::collections::BTreeSet;
+
+use blaze_domain::control::{DEFAULT_ENCODING, LeaseKind, Quality};
+use blaze_domain::{Durability, LayerName, NodeName, Priority, Reliability, Scope, ServiceName};
+
+use super::leases::{LeaseView, Terms};
+use crate::world::{Advertise, OriginFilter, Request, ScopeEntry, Source, TopicEntry};
+
+/// Most services that one entry lists.
+const MAX_SOURCES: usize = 256;
+/// Most different origin filters of one scope; with more, messages of any origin are asked for.
+pub(super) const MAX_FILTERS: usize = 128;
+
+/// Merges the leases of one topic per scope.
+pub(super) fn merge<'a>(leases: &(impl Iterator<Item = LeaseView<'a>> + Clone)) -> TopicEntry {
+    let of = |scope: Scope| {
+        let of_kind = |kind| {
+            leases
+                .clone()
+                .filter(move |lease| lease.key.scope == scope && lease.key.kind == kind)
+        };
+        ScopeEntry {
+            advertise: merge_advertise(of_kind(LeaseKind::Advertise)),
+            request: merge_request(of_kind(LeaseKind::Request)),
+        }
+    };
+    TopicEntry {
+        node: of(Scope::Node),
+        layer: of(Scope::Layer),
+    }
+}
+
+fn merge_advertise<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Option<Advertise> {
+    let terms = leases.clone().filter_map(|lease| match lease.terms {
+        Terms::Advertise { rate_hz, max_bytes, .. } => Some((*rate_hz, *max_bytes)),
+        Terms::Request { .. } => None,
+    });
+    let quality = merge_quality(leases.clone().map(|lease| lease.quality()))?;
+    let mut sources: BTreeSet<Source> = leases.clone().map(|lease| source(&lease)).collect();
+    let more_sources = sources.len() > MAX_SOURCES;
+    while sources.len() > MAX_SOURCES {
+        sources.pop_last();
+    }
+    Some(Advertise {
+        rate_hz: terms.clone().map(|(rate, _)| rate).sum(),
+        max_bytes: terms
+            .map(|(_, bytes)| bytes)
+            .collect::<Option<Vec<_>>>()
+            .and_then(|all| all.into_iter().max()),
+        encoding: quality.encoding,
+        type_name: quality.type_name,
+        type_hash: quality.type_hash,
+        reliability: quality.reliability,
+        durability: quality.durability,
+        depth: quality.depth,
+        // The highest class that any of them gives; one that gives none goes with the others.
+        priority: leases.filter_map(|lease| lease.quality().priority).min(),
+        lifespan_ms: quality.lifespan_ms,
+        sources: sources.into_iter().collect(),
+        more_sources,
+    })
+}
+
+fn merge_request<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> Option<Request> {
+    let terms = leases.clone().filter_map(|lease| match lease.terms {
+        Terms::Request {
+            max_rate_hz,
+            bare,
+            from,
+            ..
+        } => Some((*max_rate_hz, *bare, from)),
+        Terms::Advertise { .. } => None,
+    });
+    let quality = merge_quality(leases.clone().map(|lease| lease.quality()))?;
+    let mut filters = BTreeSet::new();
+    let mut any_origin = false;
+    for (_, _, from) in terms.clone() {
+        any_origin |= from.is_any();
+        if !any_origin {
+            filters.insert(OriginFilter {
+                layer: from.layer.as_ref().map(LayerName::to_string),
+                node: from.node.as_ref().map(NodeName::to_string),
+                service: from.service.as_ref().map(ServiceName::to_string),
+            });
+            any_origin = filters.len() > MAX_FILTERS;
+        }
+    }
+    Some(Request {
+        max_rate_hz: highest_rate(terms.clone().map(|(rate, _, _)| rate)),
+        lifespan_ms: quality.lifespan_ms,
+        reliability: quality.reliability,
+        durability: quality.durability,
+        depth: quality.depth,
+        // A request may only lower the class, so one that says nothing asks for the highest there is: as published.
+        priority: leases
+            .map(|lease| lease.quality().priority)
+            .collect::<Option<Vec<Priority>>>()
+            .and_then(|all| all.into_iter().min()),
+        from: if any_origin {
+            Vec::new()
+        } else {
+            filters.into_iter().collect()
+        },
+        type_name: quality.type_name,
+        type_hash: quality.type_hash,
+        framed: terms.clone().any(|(_, bare, _)| !bare),
+        bare: terms.into_iter().any(|(_, bare, _)| bare),
+    })
+}
+
+/// The highest limit; `None` where one of them sets none.
+fn highest_rate(rates: impl Iterator<Item = Option<f64>>) -> Option<f64> {
+    rates.collect::<Option<Vec<f64>>>()?.into_iter().reduce(f64::max)
+}
+
+struct MergedQuality {
+    encoding: String,
+    type_name: String,
+    type_hash: String,
+    reliability: Reliability,
+    durability: Durability,
+    depth: u32,
+    lifespan_ms: u32,
+}
+
+/// `None` for no lease at all.
+fn merge_quality<'a>(all: impl Iterator<Item = &'a Quality> + Clone) -> Option<MergedQuality> {
+    let first = all.clone().next()?;
+    // Type and hash come from one lease where possible; leases come in the order of their keys, so every flow that sees
+    // the same leases takes the same one.
+    let typed = all
+        .clone()
+        .find(|quality| !quality.type_name.is_empty())
+        .unwrap_or(first);
+    let type_hash = if typed.type_hash.is_empty() {
+        all.clone()
+            .filter(|quality| quality.type_name == typed.type_name)
+            .map(|quality| &quality.type_hash)
+            .find(|hash| !hash.is_empty())
+            .cloned()
+            .unwrap_or_default()
+    } else {
+        typed.type_hash.clone()
+    };
+    let endless = all.clone().any(|quality| quality.lifespan_ms == 0);
+    let longest = all.clone().map(|quality| quality.lifespan_ms).max().unwrap_or(0);
+    Some(MergedQuality {
+        encoding: all
+            .clone()
+            .find_map(|quality| quality.encoding.clone())
+            .unwrap_or_else(|| DEFAULT_ENCODING.into()),
+        type_name: typed.type_name.clone(),
+        type_hash,
+        reliability: all.clone().map(|quality| quality.reliability).max()?,
+        durability: all.clone().map(|quality| quality.durability).max()?,
+        depth: all.map(|quality| quality.depth).max()?,
+        lifespan_ms: if endless { 0 } else { longest },
+    })
+}
+
+fn source(lease: &LeaseView<'_>) -> Source {
+    Source {
+        node: lease.key.node.as_ref().map(NodeName::to_string).unwrap_or_default(),
+        service: lease.key.service.to_string(),
+    }
+}
+
+#[cfg(test)]
+#[path = "merge_tests.rs"]
+mod tests;

@@ -1,0 +1,414 @@
+//! Entries as they travel: conversion, cutting into pieces that fit a datagram, and the digest.
+//!
+//! ```text
+//! TopicEntry ─to_wire─► Entry ─pieces─► [Entry ≤ 1150 B] ─pack─► parts of a Delta or Snapshot
+//! parts ─join─► Entry (equal to the one that was cut) ─from_wire─► TopicEntry
+//! ```
+//!
+//! An entry that does not fit one datagram travels as several with the same topic; they are joined when all parts of
+//! their Delta or Snapshot are there. The digest is taken over whole entries, so both sides compute the same.
+
+use std::collections::BTreeMap;
+
+use blaze_domain::control::{DEFAULT_ENCODING, MAX_ENCODING_BYTES, MAX_TYPE_BYTES};
+use blaze_domain::{Durability, Priority, Reliability, TopicName};
+use blaze_proto::link::link_control as wire;
+use prost::Message;
+
+use super::merge::MAX_FILTERS;
+use crate::world::{Advertise, OriginFilter, Request, ScopeEntry, Source, TopicEntry};
+
+/// Largest encoded LinkControl, in bytes.
+pub const MAX_LINK_CONTROL_BYTES: usize = 1200;
+/// What remains of it for entries, beside the envelope of a Delta with the largest numbers.
+const MAX_PART_BYTES: usize = MAX_LINK_CONTROL_BYTES - 40;
+/// Largest piece of an entry: one fits a part with its tag and length.
+const MAX_PIECE_BYTES: usize = MAX_PART_BYTES - 4;
+/// Largest advertisement: with the longest topic it fits a piece.
+const MAX_ADVERTISE_BYTES: usize = MAX_PIECE_BYTES - 212;
+/// Most services that an announced entry lists.
+const MAX_ANNOUNCED_SOURCES: usize = 8;
+/// Most routes that an entry tells of.
+pub(super) const MAX_ROUTES: usize = 16;
+/// Longest text of a route state, in bytes; `layer/node` has 127.
+const MAX_ROUTE_TEXT: usize = 127;
+/// Longest name of a layer, node or service, in bytes.
+const MAX_NAME: usize = blaze_domain::names::MAX_NAME_BYTES;
+
+/// What is wrong with an entry of another flow.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum EntryFault {
+    #[error("its topic is not a name")]
+    Topic,
+    #[error("{0} is too long")]
+    TooLong(&'static str),
+    #[error("it has too many {0}")]
+    TooMany(&'static str),
+}
+
+/// An own entry as it is announced; what does not fit is left out and said to be.
+pub(super) fn to_wire(topic: &TopicName, entry: &TopicEntry, routes: &[wire::RouteState]) -> wire::Entry {
+    wire::Entry {
+        topic: topic.to_string(),
+        removed: false,
+        node_advertise: entry.node.advertise.as_ref().map(advertise_to_wire),
+        layer_advertise: entry.layer.advertise.as_ref().map(advertise_to_wire),
+        node_request: entry.node.request.as_ref().map(request_to_wire),
+        layer_request: entry.layer.request.as_ref().map(request_to_wire),
+        route_state: routes.iter().take(MAX_ROUTES).map(trim_route).collect(),
+    }
+}
+
+/// Says that nothing is left of a topic.
+pub(super) fn removed(topic: &TopicName) -> wire::Entry {
+    wire::Entry {
+        topic: topic.to_string(),
+        removed: true,
+        ..wire::Entry::default()
+    }
+}
+
+fn advertise_to_wire(advertise: &Advertise) -> wire::Advertise {
+    let mut message = wire::Advertise {
+        rate_hz: advertise.rate_hz.unwrap_or(0.0),
+        max_bytes: advertise.max_bytes.unwrap_or(0),
+        encoding: advertise.encoding.clone(),
+        r#type: advertise.type_name.clone(),
+        type_hash: advertise.type_hash.clone(),
+        reliable: advertise.reliability == Reliability::Reliable,
+        transient_local: advertise.durability == Durability::TransientLocal,
+        depth: advertise.depth,
+        priority: class_to_wire(advertise.priority),
+        lifespan_ms: advertise.lifespan_ms,
+        sources: Vec::new(),
+        // Set while measuring, so that setting it later does not make the message longer.
+        more_sources: true,
+    };
+    for source in advertise.sources.iter().take(MAX_ANNOUNCED_SOURCES) {
+        message.sources.push(wire::Source {
+            node: source.node.clone(),
+            service: source.service.clone(),
+        });
+        if message.encoded_len() > MAX_ADVERTISE_BYTES {
+            message.sources.pop();
+            break;
+        }
+    }
+    message.more_sources = advertise.more_sources || message.sources.len() < advertise.sources.len();
+    message
+}
+
+fn request_to_wire(request: &Request) -> wire::Request {
+    wire::Request {
+        max_rate_hz: request.max_rate_hz.unwrap_or(0.0),
+        lifespan_ms: request.lifespan_ms,
+        reliable: request.reliability == Reliability::Reliable,
+        transient_local: request.durability == Durability::TransientLocal,
+        depth: request.depth,
+        priority: class_to_wire(request.priority),
+        from: request
+            .from
+            .iter()
+            .map(|filter| wire::From {
+                layer: filter.layer.clone().unwrap_or_default(),
+                node: filter.node.clone().unwrap_or_default(),
+                service: filter.service.clone().unwrap_or_default(),
+            })
+            .collect(),
+        r#type: request.type_name.clone(),
+        type_hash: request.type_hash.clone(),
+    }
+}
+
+fn trim_route(route: &wire::RouteState) -> wire::RouteState {
+    wire::RouteState {
+        to_layer: cut(&route.to_layer),
+        receiver: cut(&route.receiver),
+        step: cut(&route.step),
+        ok: route.ok,
+        code: cut(&route.code),
+        next_offset: route.next_offset,
+    }
+}
+
+fn cut(text: &str) -> String {
+    text.get(..text.floor_char_boundary(MAX_ROUTE_TEXT))
+        .unwrap_or_default()
+        .to_owned()
+}
+
+fn class_to_wire(class: Option<Priority>) -> u32 {
+    class.map_or(0, |class| {
+        u32::try_from(blaze_proto::priority_to_wire(class)).unwrap_or(0)
+    })
+}
+
+fn class_from_wire(class: u32) -> Option<Priority> {
+    match class {
+        1 => Some(Priority::Control),
+        2 => Some(Priority::State),
+        3 => Some(Priority::Bulk),
+        _ => None,
+    }
+}
+
+/// Another flow's entry, checked.
+pub(super) fn from_wire(entry: &wire::Entry) -> Result<(TopicName, TopicEntry), EntryFault> {
+    let topic = entry.topic.parse().map_err(|_| EntryFault::Topic)?;
+    if entry.route_state.len() > MAX_ROUTES {
+        return Err(EntryFault::TooMany("route states"));
+    }
+    for route in &entry.route_state {
+        for text in [&route.to_layer, &route.receiver, &route.step, &route.code] {
+            within(text, MAX_ROUTE_TEXT, "a route state")?;
+        }
+    }
+    let scope = |advertise: Option<&wire::Advertise>, request: Option<&wire::Request>| -> Result<_, EntryFault> {
+        Ok(ScopeEntry {
+            advertise: advertise.map(advertise_from_wire).transpose()?,
+            request: request.map(request_from_wire).transpose()?,
+        })
+    };
+    let merged = TopicEntry {
+        node: scope(entry.node_advertise.as_ref(), entry.node_request.as_ref())?,
+        layer: scope(entry.layer_advertise.as_ref(), entry.layer_request.as_ref())?,
+    };
+    Ok((topic, merged))
+}
+
+fn within(text: &str, limit: usize, what: &'static str) -> Result<(), EntryFault> {
+    if text.len() > limit {
+        Err(EntryFault::TooLong(what))
+    } else {
+        Ok(())
+    }
+}
+
+fn rate_from_wire(rate: f64) -> Option<f64> {
+    (rate.is_finite() && rate > 0.0).then_some(rate)
+}
+
+fn advertise_from_wire(message: &wire::Advertise) -> Result<Advertise, EntryFault> {
+    within(&message.encoding, MAX_ENCODING_BYTES, "the encoding")?;
+    within(&message.r#type, MAX_TYPE_BYTES, "the type")?;
+    within(&message.type_hash, MAX_TYPE_BYTES, "the type hash")?;
+    if message.sources.len() > MAX_ANNOUNCED_SOURCES {
+        return Err(EntryFault::TooMany("sources"));
+    }
+    let mut sources = Vec::with_capacity(message.sources.len());
+    for source in &message.sources {
+        within(&source.node, MAX_NAME, "a source's node")?;
+        within(&source.service, MAX_NAME, "a source's service")?;
+        sources.push(Source {
+            node: source.node.clone(),
+            service: source.service.clone(),
+        });
+    }
+    sources.sort();
+    Ok(Advertise {
+        rate_hz: rate_from_wire(message.rate_hz),
+        max_bytes: (message.max_bytes > 0).then_some(message.max_bytes),
+        encoding: if message.encoding.is_empty() {
+            DEFAULT_ENCODING.into()
+        } else {
+            message.encoding.clone()
+        },
+        type_name: message.r#type.clone(),
+        type_hash: message.type_hash.clone(),
+        reliability: reliability(message.reliable),
+        durability: durability(message.transient_local),
+        depth: message.depth.max(1),
+        priority: class_from_wire(message.priority),
+        lifespan_ms: message.lifespan_ms,
+        sources,
+        more_sources: message.more_sources,
+    })
+}
+
+fn request_from_wire(message: &wire::Request) -> Result<Request, EntryFault> {
+    within(&message.r#type, MAX_TYPE_BYTES, "the type")?;
+    within(&message.type_hash, MAX_TYPE_BYTES, "the type hash")?;
+    if message.from.len() > MAX_FILTERS {
+        return Err(EntryFault::TooMany("origin filters"));
+    }
+    let mut from = Vec::with_capacity(message.from.len());
+    for filter in &message.from {
+        for part in [&filter.layer, &filter.node, &filter.service] {
+            within(part, MAX_NAME, "an origin filter")?;
+        }
+        let part = |text: &String| Some(text).filter(|text| !text.is_empty()).cloned();
+        from.push(OriginFilter {
+            layer: part(&filter.layer),
+            node: part(&filter.node),
+            service: part(&filter.service),
+        });
+    }
+    // A filter without any part lets everything pass.
+    if from.contains(&OriginFilter::default()) {
+        from.clear();
+    }
+    from.sort();
+    Ok(Request {
+        max_rate_hz: rate_from_wire(message.max_rate_hz),
+        lifespan_ms: message.lifespan_ms,
+        reliability: reliability(message.reliable),
+        durability: durability(message.transient_local),
+        depth: message.depth.max(1),
+        priority: class_from_wire(message.priority),
+        from,
+        type_name: message.r#type.clone(),
+        type_hash: message.type_hash.clone(),
+        // How a scope of another flow is served is that flow's affair.
+        framed: true,
+        bare: false,
+    })
+}
+
+fn reliability(reliable: bool) -> Reliability {
+    if reliable {
+        Reliability::Reliable
+    } else {
+        Reliability::BestEffort
+    }
+}
+
+fn durability(transient_local: bool) -> Durability {
+    if transient_local {
+        Durability::TransientLocal
+    } else {
+        Durability::Volatile
+    }
+}
+
+/// Cuts an entry into pieces that each fit a part; most entries are one piece.
+pub(super) fn pieces(entry: wire::Entry) -> Vec<wire::Entry> {
+    if entry.encoded_len() <= MAX_PIECE_BYTES {
+        return vec![entry];
+    }
+    let mut pieces: Vec<wire::Entry> = Vec::new();
+    for atom in atoms(&entry) {
+        if let Some(last) = pieces.last_mut() {
+            let mut joined = last.clone();
+            absorb(&mut joined, atom.clone());
+            if joined.encoded_len() <= MAX_PIECE_BYTES {
+                *last = joined;
+                continue;
+            }
+        }
+        pieces.push(atom);
+    }
+    pieces
+}
+
+/// The smallest parts of an entry that [`absorb`] joins again, in order.
+fn atoms(entry: &wire::Entry) -> Vec<wire::Entry> {
+    let blank = || wire::Entry {
+        topic: entry.topic.clone(),
+        ..wire::Entry::default()
+    };
+    let mut atoms = vec![
+        wire::Entry {
+            node_advertise: entry.node_advertise.clone(),
+            ..blank()
+        },
+        wire::Entry {
+            layer_advertise: entry.layer_advertise.clone(),
+            ..blank()
+        },
+    ];
+    let mut request = |request: Option<wire::Request>, place: fn(wire::Entry, wire::Request) -> wire::Entry| {
+        let Some(mut request) = request else { return };
+        let filters = std::mem::take(&mut request.from);
+        atoms.push(place(blank(), request));
+        atoms.extend(filters.into_iter().map(|filter| {
+            let more = wire::Request {
+                from: vec![filter],
+                ..wire::Request::default()
+            };
+            place(blank(), more)
+        }));
+    };
+    request(entry.node_request.clone(), |entry, request| wire::Entry {
+        node_request: Some(request),
+        ..entry
+    });
+    request(entry.layer_request.clone(), |entry, request| wire::Entry {
+        layer_request: Some(request),
+        ..entry
+    });
+    atoms.extend(entry.route_state.iter().map(|route| wire::Entry {
+        route_state: vec![route.clone()],
+        ..blank()
+    }));
+    atoms
+}
+
+/// Adds a piece to the pieces before it. The first piece of a request holds all but its further filters.
+fn absorb(into: &mut wire::Entry, piece: wire::Entry) {
+    fn request(into: &mut Option<wire::Request>, piece: Option<wire::Request>) {
+        match (into, piece) {
+            (Some(into), Some(piece)) => into.from.extend(piece.from),
+            (into @ None, piece) => *into = piece,
+            (Some(_), None) => {}
+        }
+    }
+    into.removed |= piece.removed;
+    into.node_advertise = into.node_advertise.take().or(piece.node_advertise);
+    into.layer_advertise = into.layer_advertise.take().or(piece.layer_advertise);
+    request(&mut into.node_request, piece.node_request);
+    request(&mut into.layer_request, piece.layer_request);
+    into.route_state.extend(piece.route_state);
+}
+
+/// Joins the pieces of a complete Delta or Snapshot to one entry per topic.
+pub(super) fn join(pieces: impl IntoIterator<Item = wire::Entry>) -> BTreeMap<String, wire::Entry> {
+    let mut entries: BTreeMap<String, wire::Entry> = BTreeMap::new();
+    for piece in pieces {
+        match entries.get_mut(&piece.topic) {
+            Some(entry) => absorb(entry, piece),
+            None => {
+                entries.insert(piece.topic.clone(), piece);
+            }
+        }
+    }
+    entries
+}
+
+/// Spreads pieces over parts that each fit a LinkControl; at least one part, which may be empty.
+pub(super) fn pack(pieces: impl IntoIterator<Item = wire::Entry>) -> Vec<Vec<wire::Entry>> {
+    let mut parts: Vec<Vec<wire::Entry>> = vec![Vec::new()];
+    let mut used = 0;
+    for piece in pieces {
+        let length = piece.encoded_len();
+        let length = 1 + prost::length_delimiter_len(length) + length;
+        if used + length > MAX_PART_BYTES && used > 0 {
+            parts.push(Vec::new());
+            used = 0;
+        }
+        used += length;
+        if let Some(part) = parts.last_mut() {
+            part.push(piece);
+        }
+    }
+    parts
+}
+
+/// Hash of one whole entry. The digest of a flow is the wrapping sum over its entries, so their order does not matter.
+pub(super) fn entry_hash(entry: &wire::Entry) -> u64 {
+    text_hash(&entry.encode_to_vec())
+}
+
+/// A hash that is the same in every flow.
+pub(super) fn text_hash(bytes: &[u8]) -> u64 {
+    // FNV-1a, then the finalizer of SplitMix64: sums of plain FNV values would share their weak low bits.
+    let mut hash = bytes.iter().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
+        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
+    });
+    hash = (hash ^ (hash >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    hash = (hash ^ (hash >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    hash ^ (hash >> 31)
+}
+
+#[cfg(test)]
+#[path = "wire_tests.rs"]
+mod tests;

@@ -1,0 +1,211 @@
+//! What a flow says of control messages: answers to their senders, events to everybody.
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::words::{ErrorCode, EventKind};
+use crate::identity::FlowId;
+use crate::names::TopicName;
+
+/// Longest `detail` of an error, in characters; it may hold text of the sender.
+const MAX_DETAIL_CHARS: usize = 200;
+
+/// What is wrong with a control message, and where.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
+#[error("{code} at {pointer:?}: {detail}")]
+pub struct ControlError {
+    /// The fault.
+    pub code: ErrorCode,
+    /// JSON pointer (RFC 6901) to the faulty field; in an array it begins with the index. Empty: the whole payload.
+    pub pointer: String,
+    /// For people.
+    pub detail: String,
+}
+
+impl ControlError {
+    /// An error at a place; an overlong detail is cut.
+    #[must_use]
+    pub fn new(code: ErrorCode, pointer: impl Into<String>, detail: impl Into<String>) -> Self {
+        let mut detail = detail.into();
+        if let Some((cut, _)) = detail.char_indices().nth(MAX_DETAIL_CHARS) {
+            detail.truncate(cut);
+            detail.push('…');
+        }
+        Self {
+            code,
+            pointer: pointer.into(),
+            detail,
+        }
+    }
+}
+
+/// The answer to one control message that named a `reply_to`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Answer {
+    /// The `id` of the message, if it had one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub id: Option<String>,
+    /// Whether it was accepted.
+    pub ok: bool,
+    /// The flow that accepted it, `layer/node`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flow: Option<String>,
+    /// Seconds until the lease lapses; 0 = never, or withdrawn.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lease_s: Option<u32>,
+    /// Why it was refused.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<ControlError>,
+}
+
+impl Answer {
+    /// The message was accepted by `flow` for `lease_s` seconds.
+    #[must_use]
+    pub fn granted(id: Option<String>, flow: &FlowId, lease_s: u32) -> Self {
+        Self {
+            id,
+            ok: true,
+            flow: Some(flow.to_string()),
+            lease_s: Some(lease_s),
+            error: None,
+        }
+    }
+
+    /// The message was refused.
+    #[must_use]
+    pub fn refused(id: Option<String>, error: ControlError) -> Self {
+        Self {
+            id,
+            ok: false,
+            flow: None,
+            lease_s: None,
+            error: Some(error),
+        }
+    }
+
+    /// The answer as a JSON object.
+    #[must_use]
+    pub fn to_json(&self) -> Value {
+        serde_json::to_value(self).unwrap_or_default()
+    }
+}
+
+/// What a flow tells everybody on `blaze/flow/events`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Event {
+    /// What happened.
+    pub event: EventKind,
+    /// The flow that says so, `layer/node`.
+    pub flow: String,
+    /// The topic; empty where none is meant.
+    #[serde(default)]
+    pub topic: String,
+    /// Error code or verdict; empty where there is none.
+    #[serde(default)]
+    pub code: String,
+    /// When, RFC 3339 in UTC with milliseconds.
+    pub time: String,
+}
+
+impl Event {
+    /// An event at a wall-clock time in milliseconds since 1970.
+    #[must_use]
+    pub fn new(event: EventKind, flow: &FlowId, topic: Option<&TopicName>, code: &str, unix_ms: u64) -> Self {
+        Self {
+            event,
+            flow: flow.to_string(),
+            topic: topic.map(ToString::to_string).unwrap_or_default(),
+            code: code.to_owned(),
+            time: rfc3339_millis(unix_ms),
+        }
+    }
+
+    /// The event as a JSON object.
+    #[must_use]
+    pub fn to_json(&self) -> Value {
+        serde_json::to_value(self).unwrap_or_default()
+    }
+}
+
+/// A time in milliseconds since 1970 as `2026-01-31T12:00:00.000Z`.
+#[must_use]
+pub fn rfc3339_millis(unix_ms: u64) -> String {
+    let (days, ms) = (unix_ms / 86_400_000, unix_ms % 86_400_000);
+    // Days to a date of the Gregorian calendar, with years that begin in March (eras of 400 years = 146,097 days).
+    let shifted = days + 719_468;
+    let (era, day_of_era) = (shifted / 146_097, shifted % 146_097);
+    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let shifted_month = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * shifted_month + 2) / 5 + 1;
+    let month = if shifted_month < 10 {
+        shifted_month + 3
+    } else {
+        shifted_month - 9
+    };
+    let year = year_of_era + era * 400 + u64::from(month <= 2);
+    let (hour, minute, second, milli) = (ms / 3_600_000, ms / 60_000 % 60, ms / 1000 % 60, ms % 1000);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{milli:03}Z")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn answers_have_the_keys_of_the_contract_in_its_order() {
+        let flow: FlowId = "edge/robot-1".parse().unwrap();
+        let granted = Answer::granted(Some("7".into()), &flow, 15);
+        assert_eq!(
+            granted.to_json().to_string(),
+            r#"{"id":"7","ok":true,"flow":"edge/robot-1","lease_s":15}"#
+        );
+        let refused = Answer::refused(
+            Some("7".into()),
+            ControlError::new(ErrorCode::InvalidTopic, "/topic", "is empty"),
+        );
+        assert_eq!(
+            refused.to_json().to_string(),
+            r#"{"id":"7","ok":false,"error":{"code":"invalid_topic","pointer":"/topic","detail":"is empty"}}"#
+        );
+        for answer in [granted, refused] {
+            assert_eq!(serde_json::from_value::<Answer>(answer.to_json()).unwrap(), answer);
+        }
+    }
+
+    #[test]
+    fn events_have_the_keys_of_the_contract() {
+        let flow: FlowId = "edge/robot-1".parse().unwrap();
+        let topic: TopicName = "imu/data".parse().unwrap();
+        let event = Event::new(
+            EventKind::LeaseExpired,
+            &flow,
+            Some(&topic),
+            "lease_expired",
+            1_700_000_000_123,
+        );
+        let text = r#"{"event":"lease_expired","flow":"edge/robot-1","topic":"imu/data","code":"lease_expired","time":"2023-11-14T22:13:20.123Z"}"#;
+        assert_eq!(event.to_json().to_string(), text);
+        assert_eq!(serde_json::from_str::<Event>(text).unwrap(), event);
+    }
+
+    #[test]
+    fn times_are_rfc_3339() {
+        for (ms, text) in [
+            (0, "1970-01-01T00:00:00.000Z"),
+            (951_782_400_000, "2000-02-29T00:00:00.000Z"),
+            (1_709_251_199_999, "2024-02-29T23:59:59.999Z"),
+            (1_709_251_200_000, "2024-03-01T00:00:00.000Z"),
+            (4_102_444_799_999, "2099-12-31T23:59:59.999Z"),
+        ] {
+            assert_eq!(rfc3339_millis(ms), text);
+        }
+        assert!(rfc3339_millis(u64::MAX).ends_with('Z'));
+    }
+
+    #[test]
+    fn details_are_bounded() {
+        let error = ControlError::new(ErrorCode::InvalidValue, "/x", "ä".repeat(5000));
+        assert_eq!(error.detail.chars().count(), MAX_DETAIL_CHARS + 1);
+    }
+}
