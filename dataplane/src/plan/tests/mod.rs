@@ -1,1 +1,7 @@
+//! The planner against tables of its rules, and against a simulated system of random shape.
 
+mod generate;
+mod property;
+mod simulate;
+mod table;
+pub(crate) mod worlds;

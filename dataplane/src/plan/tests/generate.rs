@@ -1,0 +1,210 @@
+//! Random systems.
+
+use std::collections::BTreeMap;
+
+use blaze_domain::{FlowId, LayerKind};
+
+use super::worlds::{advertise, flow, request, topic};
+use crate::world::{
+    Advertise, FlowState, LayerScopeId, OriginFilter, Reach, Request, ScopeEntry, Source, TopicEntry, World,
+};
+
+const SERVICES: [&str; 3] = ["driver", "filter", "logger"];
+
+/// SplitMix64: the same worlds everywhere for the same seed.
+pub(super) struct Dice(pub(super) u64);
+
+impl Dice {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ (z >> 31)
+    }
+
+    /// `0..count`
+    pub(super) fn below(&mut self, count: usize) -> usize {
+        (self.next() % count as u64) as usize
+    }
+
+    pub(super) fn percent(&mut self, chance: usize) -> bool {
+        self.below(100) < chance
+    }
+
+    pub(super) fn pick<'a, T>(&mut self, from: &'a [T]) -> &'a T {
+        &from[self.below(from.len())]
+    }
+}
+
+/// A system: what all flows know, and who really publishes.
+#[derive(Clone)]
+pub(super) struct System {
+    /// The view of all flows; `me` is set by whoever plans.
+    pub(super) world: World,
+    /// Names of nodes that a source or a filter may name.
+    pub(super) nodes: Vec<String>,
+}
+
+impl System {
+    pub(super) fn random(dice: &mut Dice) -> Self {
+        let mut flows = BTreeMap::new();
+        for l in 0..3 + dice.below(4) {
+            let kind = *dice.pick(LayerKind::ALL);
+            // Brokers of different layers may have one number; in one layer there may be two, or flows without.
+            let brokers: &[Option<u64>] = match dice.below(4) {
+                0 => &[None],
+                1 => &[Some(1)],
+                2 => &[Some(1), Some(1), None],
+                _ => &[Some(1), Some(2), None],
+            };
+            for n in 0..1 + dice.below(4) {
+                let mut view = flow(*dice.pick(brokers));
+                view.kind = kind;
+                let name: FlowId = format!("layer-{l}/n{l}{n}").parse().unwrap();
+                flows.insert(name, view);
+            }
+        }
+        let nodes = flows
+            .keys()
+            .map(|id: &FlowId| id.node.to_string())
+            .chain(["ghost".to_owned()])
+            .collect();
+        let me = flows.keys().next().unwrap().clone();
+        let world = World { me, flows };
+        let mut system = Self { world, nodes };
+        for id in system.ids() {
+            system.reroll_flow(dice, &id);
+            system.reroll_node(dice, &id);
+            system.reroll_layer(dice, &id);
+        }
+        system
+    }
+
+    pub(super) fn ids(&self) -> Vec<FlowId> {
+        self.world.flows.keys().cloned().collect()
+    }
+
+    /// Something happens somewhere.
+    pub(super) fn change(&mut self, dice: &mut Dice) {
+        let id = dice.pick(&self.ids()).clone();
+        match dice.below(3) {
+            0 => self.reroll_flow(dice, &id),
+            1 => self.reroll_node(dice, &id),
+            _ => self.reroll_layer(dice, &id),
+        }
+    }
+
+    fn reroll_flow(&mut self, dice: &mut Dice, id: &FlowId) {
+        let view = self.world.flows.get_mut(id).unwrap();
+        view.node_scope = dice.percent(80);
+        view.state = match dice.below(12) {
+            0 => FlowState::Starting,
+            1 => FlowState::Draining,
+            _ => FlowState::Ready,
+        };
+        view.reach = match dice.below(12) {
+            0 => Reach::Down,
+            1 => Reach::Suspect,
+            _ => Reach::Up,
+        };
+    }
+
+    fn reroll_node(&mut self, dice: &mut Dice, id: &FlowId) {
+        let entry = self.scope_entry(dice, Some(id.node.as_str()));
+        self.entry(id).node = entry;
+    }
+
+    /// Flows that share a broker know the same of it.
+    fn reroll_layer(&mut self, dice: &mut Dice, id: &FlowId) {
+        let entry = self.scope_entry(dice, None);
+        let broker = self.world.flows[id].layer_scope;
+        for other in self.ids() {
+            let same = broker.is_some() && other.layer == id.layer && self.world.flows[&other].layer_scope == broker;
+            if same || other == *id {
+                self.entry(&other).layer = entry.clone();
+            }
+        }
+    }
+
+    fn entry(&mut self, id: &FlowId) -> &mut TopicEntry {
+        self.world.flows.get_mut(id).unwrap().topics.entry(topic()).or_default()
+    }
+
+    fn scope_entry(&self, dice: &mut Dice, node: Option<&str>) -> ScopeEntry {
+        ScopeEntry {
+            advertise: dice.percent(30).then(|| self.advertise(dice, node)),
+            request: dice.percent(35).then(|| self.request(dice)),
+        }
+    }
+
+    fn advertise(&self, dice: &mut Dice, node: Option<&str>) -> Advertise {
+        let sources = 1 + dice.below(2);
+        let mut sources: Vec<Source> = (0..sources)
+            .map(|_| Source {
+                node: match node {
+                    Some(node) => node.to_owned(),
+                    None if dice.percent(50) => String::new(),
+                    None => dice.pick(&self.nodes).clone(),
+                },
+                service: (*dice.pick(&SERVICES)).to_owned(),
+            })
+            .collect();
+        sources.sort();
+        sources.dedup();
+        Advertise {
+            sources,
+            more_sources: dice.percent(10),
+            type_name: type_name(dice),
+            ..advertise()
+        }
+    }
+
+    fn request(&self, dice: &mut Dice) -> Request {
+        let filters = if dice.percent(60) { 0 } else { 1 + dice.below(2) };
+        let from = (0..filters)
+            .map(|_| OriginFilter {
+                layer: dice.percent(40).then(|| format!("layer-{}", dice.below(6))),
+                node: dice.percent(30).then(|| dice.pick(&self.nodes).clone()),
+                service: dice.percent(40).then(|| (*dice.pick(&SERVICES)).to_owned()),
+            })
+            .collect();
+        let wish = dice.below(4);
+        Request {
+            from,
+            type_name: type_name(dice),
+            framed: wish < 3,
+            bare: wish > 1,
+            ..request()
+        }
+    }
+
+    /// Who really publishes behind an advertisement: what it lists, and everybody that it may have left out.
+    pub(super) fn sources(&self, advertise: &Advertise, node: Option<&str>) -> Vec<Source> {
+        let mut sources = advertise.sources.clone();
+        if advertise.more_sources {
+            let nodes: Vec<&str> = match node {
+                Some(node) => vec![node],
+                None => self.nodes.iter().map(String::as_str).chain([""]).collect(),
+            };
+            for node in nodes {
+                sources.extend(SERVICES.map(|service| Source {
+                    node: node.to_owned(),
+                    service: service.to_owned(),
+                }));
+            }
+            sources.sort();
+            sources.dedup();
+        }
+        sources
+    }
+}
+
+fn type_name(dice: &mut Dice) -> String {
+    ["", "", "", "a/A", "b/B"][dice.below(5)].to_owned()
+}
+
+/// Whether two flows use one layer broker.
+pub(super) fn share_broker(a: (&FlowId, Option<LayerScopeId>), b: (&FlowId, Option<LayerScopeId>)) -> bool {
+    a.0 == b.0 || (a.0.layer == b.0.layer && a.1.is_some() && a.1 == b.1)
+}

@@ -1,0 +1,140 @@
+//! Short ways to write a world.
+
+use std::collections::BTreeMap;
+
+use blaze_domain::{Durability, FlowId, LayerKind, Reliability, TopicName};
+
+use crate::world::{
+    Advertise, FlowState, FlowView, LayerScopeId, OriginFilter, Reach, Request, ScopeEntry, Source, TopicEntry, World,
+};
+
+pub(crate) fn topic() -> TopicName {
+    "imu/data".parse().unwrap()
+}
+
+pub(crate) fn id(text: &str) -> FlowId {
+    text.parse().unwrap()
+}
+
+pub(crate) fn advertise() -> Advertise {
+    Advertise {
+        rate_hz: Some(50.0),
+        max_bytes: Some(400),
+        encoding: "application/json".to_owned(),
+        type_name: String::new(),
+        type_hash: String::new(),
+        reliability: Reliability::BestEffort,
+        durability: Durability::Volatile,
+        depth: 1,
+        priority: None,
+        lifespan_ms: 0,
+        sources: vec![Source {
+            node: String::new(),
+            service: "driver".to_owned(),
+        }],
+        more_sources: false,
+    }
+}
+
+pub(crate) fn request() -> Request {
+    Request {
+        max_rate_hz: None,
+        lifespan_ms: 0,
+        reliability: Reliability::BestEffort,
+        durability: Durability::Volatile,
+        depth: 1,
+        priority: None,
+        from: Vec::new(),
+        type_name: String::new(),
+        type_hash: String::new(),
+        framed: true,
+        bare: false,
+    }
+}
+
+/// A filter written `layer/node/service`, where `*` is any.
+pub(crate) fn filter(text: &str) -> OriginFilter {
+    let part = |n: usize| text.split('/').nth(n).filter(|part| *part != "*").map(str::to_owned);
+    OriginFilter {
+        layer: part(0),
+        node: part(1),
+        service: part(2),
+    }
+}
+
+pub(crate) fn flow(layer_scope: Option<u64>) -> FlowView {
+    FlowView {
+        kind: LayerKind::Edge,
+        epoch: 1,
+        state: FlowState::Ready,
+        reach: Reach::Up,
+        node_scope: true,
+        layer_scope: layer_scope.map(LayerScopeId),
+        topics: BTreeMap::new(),
+    }
+}
+
+/// A world written as one line per flow: `edge/a@1 node+ layer-`: `@1` is its layer broker, `+` an advertisement on
+/// that scope, `-` a request, `-b` a request for bare payloads; `down`, `suspect`, `starting` and `draining` as they
+/// read. The first flow is `me`.
+pub(crate) fn world(lines: &[&str]) -> World {
+    let mut flows = BTreeMap::new();
+    let mut me = None;
+    for line in lines {
+        let mut words = line.split(' ');
+        let name = words.next().unwrap();
+        let (name, broker) = match name.split_once('@') {
+            Some((name, broker)) => (name, Some(broker.parse().unwrap())),
+            None => (name, None),
+        };
+        let mut view = flow(broker);
+        let mut entry = TopicEntry::default();
+        for word in words {
+            match word {
+                "down" => view.reach = Reach::Down,
+                "suspect" => view.reach = Reach::Suspect,
+                "starting" => view.state = FlowState::Starting,
+                "draining" => view.state = FlowState::Draining,
+                "node+" => entry.node.advertise = Some(advertise()),
+                "layer+" => entry.layer.advertise = Some(advertise()),
+                "node-" => entry.node.request = Some(request()),
+                "layer-" => entry.layer.request = Some(request()),
+                "node-b" => {
+                    entry.node.request = Some(Request {
+                        framed: false,
+                        bare: true,
+                        ..request()
+                    });
+                }
+                other => panic!("{other}"),
+            }
+        }
+        view.topics.insert(topic(), entry);
+        me.get_or_insert_with(|| id(name));
+        flows.insert(id(name), view);
+    }
+    World { me: me.unwrap(), flows }
+}
+
+/// What a flow says of the topic on one scope.
+pub(crate) fn entry<'a>(world: &'a mut World, flow: &str, scope: &str) -> &'a mut ScopeEntry {
+    let entry = world
+        .flows
+        .get_mut(&id(flow))
+        .unwrap()
+        .topics
+        .entry(topic())
+        .or_default();
+    match scope {
+        "node" => &mut entry.node,
+        _ => &mut entry.layer,
+    }
+}
+
+pub(crate) fn offer<'a>(world: &'a mut World, flow: &str, scope: &str) -> &'a mut Advertise {
+    entry(world, flow, scope).advertise.as_mut().unwrap()
+}
+
+pub(crate) fn ask<'a>(world: &'a mut World, flow: &str, scope: &str) -> &'a mut Request {
+    entry(world, flow, scope).request.as_mut().unwrap()
+}
