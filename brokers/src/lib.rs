@@ -2,6 +2,8 @@
 //!
 //! [`Broker`] is what BlazeFlow and the SDK know of a message system; [`memory`] serves services and flows of one process.
 
+#[cfg(feature = "conformance")]
+pub mod conformance;
 pub mod memory;
 pub mod port;
 
