@@ -5,6 +5,7 @@
 
 pub mod identity;
 pub mod names;
+pub mod node_file;
 pub mod qos;
 pub mod reasons;
 
