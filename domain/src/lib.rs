@@ -6,6 +6,7 @@
 pub mod control;
 pub mod identity;
 pub mod names;
+pub mod node_file;
 pub mod qos;
 pub mod reasons;
 

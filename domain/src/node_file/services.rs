@@ -1,0 +1,228 @@
+//! Sections of the worker, the monitor and of every program: `admin`, `log`, `config`, `cache`, `database`.
+
+use std::fmt;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use super::walk::{Node, Section, formed, from_empty, parsed, path, text, whole};
+use super::{AutoBool, RedisBroker, SecretText, auto_bool, url};
+use crate::names::TopicName;
+use crate::qos::{UnknownWord, word_enum};
+
+/// Where each program answers `/livez`, `/readyz` and `/metrics`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AdminSection {
+    /// Of `blaze-flow`.
+    pub flow: SocketAddr,
+    /// Of `blaze-worker`.
+    pub worker: SocketAddr,
+    /// Of `blaze-monitor`.
+    pub monitor: SocketAddr,
+}
+
+impl Default for AdminSection {
+    fn default() -> Self {
+        from_empty(Self::section)
+    }
+}
+
+impl AdminSection {
+    pub(super) fn section(s: &mut Section<'_>) -> Self {
+        Self {
+            flow: s.or("flow", socket, loopback(9101)),
+            worker: s.or("worker", socket, loopback(9102)),
+            monitor: s.or("monitor", socket, loopback(9103)),
+        }
+    }
+}
+
+/// A port of this machine alone: what listens is not reachable from outside unless the file says so.
+pub(super) fn loopback(port: u16) -> SocketAddr {
+    SocketAddr::from((Ipv4Addr::LOCALHOST, port))
+}
+
+pub(super) fn socket(node: &Node<'_>) -> Option<SocketAddr> {
+    formed("an address with a port, such as 127.0.0.1:9101", |text| {
+        text.parse().ok()
+    })(node)
+}
+
+/// How the worker reaches the main service.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ConfigSection {
+    /// `https://HOST:PORT` of its gRPC port.
+    pub server: SecretText,
+    /// Authorities that are trusted instead of the system's; read again when it changes.
+    pub ca_file: Option<PathBuf>,
+    /// File that holds the token; read again when it changes.
+    pub token_file: Option<PathBuf>,
+}
+
+impl ConfigSection {
+    pub(super) fn section(s: &mut Section<'_>) -> Option<Self> {
+        let server = s.need("server", url(&["https://", "http://"]));
+        let (ca_file, token_file) = (s.opt("ca_file", path), s.opt("token_file", path));
+        Some(Self {
+            server: server?,
+            ca_file,
+            token_file,
+        })
+    }
+}
+
+/// Where services of the node find copies of data.
+#[derive(Debug, Clone, PartialEq)]
+pub enum CacheSection {
+    /// A Redis server.
+    Redis(RedisBroker),
+}
+
+impl CacheSection {
+    pub(super) fn section(s: &mut Section<'_>) -> Option<Self> {
+        s.one_of(&[("redis", |s| RedisBroker::section(s).map(Self::Redis))])
+    }
+}
+
+/// Where the worker keeps its copy of the configuration.
+#[derive(Debug, Clone, PartialEq)]
+pub enum DatabaseSection {
+    /// A MongoDB server.
+    MongoDb {
+        /// `mongodb://` or `mongodb+srv://`.
+        uri: SecretText,
+        /// Name of the database.
+        database: String,
+    },
+    /// A directory of this machine.
+    Embedded {
+        /// Which one.
+        path: PathBuf,
+    },
+}
+
+impl DatabaseSection {
+    pub(super) fn section(s: &mut Section<'_>) -> Option<Self> {
+        s.one_of(&[
+            ("mongodb", |s| {
+                let (uri, database) = mongodb(s, "blaze")?;
+                Some(Self::MongoDb { uri, database })
+            }),
+            ("embedded", |s| {
+                Some(Self::Embedded {
+                    path: s.need("path", path)?,
+                })
+            }),
+        ])
+    }
+}
+
+pub(super) fn mongodb(s: &mut Section<'_>, default: &str) -> Option<(SecretText, String)> {
+    let uri = s.need("uri", url(&["mongodb://", "mongodb+srv://"]));
+    let database = s.or("database", text, default.to_owned());
+    Some((uri?, database))
+}
+
+/// `monitor`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MonitorSection {
+    /// Between two rounds of pings, in seconds.
+    pub ping_period_s: u32,
+    /// Topics whose latency is measured.
+    pub latency_topics: Vec<TopicName>,
+}
+
+impl Default for MonitorSection {
+    fn default() -> Self {
+        from_empty(Self::section)
+    }
+}
+
+impl MonitorSection {
+    pub(super) fn section(s: &mut Section<'_>) -> Self {
+        Self {
+            ping_period_s: s.or("ping_period_s", whole(1, 86_400), 60),
+            latency_topics: s.list("latency_topics", parsed),
+        }
+    }
+}
+
+word_enum!(
+    /// How a log line is written.
+    LogFormat {
+        /// For people.
+        Text = "text",
+        /// For machines: one JSON object a line.
+        Json = "json",
+    }
+);
+
+/// `log`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LogSection {
+    /// A level, or directives such as `info,blaze_flow=debug`; reloads.
+    pub level: String,
+    /// How a line is written.
+    pub format: LogFormat,
+}
+
+impl Default for LogSection {
+    fn default() -> Self {
+        from_empty(Self::section)
+    }
+}
+
+impl LogSection {
+    pub(super) fn section(s: &mut Section<'_>) -> Self {
+        Self {
+            level: s.or("level", level, "info".to_owned()),
+            format: s.or("format", parsed, LogFormat::Text),
+        }
+    }
+}
+
+fn level(node: &Node<'_>) -> Option<String> {
+    let directive = |text: &str| {
+        let level = text.rsplit_once('=').map_or(text, |(_, level)| level).trim();
+        ["off", "error", "warn", "info", "debug", "trace"].contains(&level)
+    };
+    formed(
+        "error, warn, info, debug, trace, off, or directives such as info,blaze_flow=debug",
+        |text| text.split(',').all(directive).then(|| text.to_owned()),
+    )(node)
+}
+
+/// `worker`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct WorkerSection {
+    /// Documents to start from when there is neither a database nor a last good copy.
+    pub defaults_file: Option<PathBuf>,
+    /// Where the last good copy lies; below the node's `state_dir` if absent.
+    pub state_dir: Option<PathBuf>,
+    /// Key that the last good copy is encrypted with.
+    pub key_file: Option<PathBuf>,
+    /// Whether services get secrets as their text.
+    pub deliver_secrets: AutoBool,
+    /// How long the worker answers alone on its broker, in ms.
+    pub lease_ms: u32,
+}
+
+impl Default for WorkerSection {
+    fn default() -> Self {
+        from_empty(Self::section)
+    }
+}
+
+impl WorkerSection {
+    pub(super) fn section(s: &mut Section<'_>) -> Self {
+        Self {
+            defaults_file: s.opt("defaults_file", path),
+            state_dir: s.opt("state_dir", path),
+            key_file: s.opt("key_file", path),
+            deliver_secrets: s.or("deliver_secrets", auto_bool, AutoBool::Auto),
+            lease_ms: s.or("lease_ms", whole(100, 600_000), 5000),
+        }
+    }
+}
