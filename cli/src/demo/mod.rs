@@ -1,0 +1,13 @@
+//! `blaze demo`.
+pub mod options;
+
+use crate::exit::{CliError, Exit};
+use crate::output::Format;
+
+/// Runs the demo.
+///
+/// # Errors
+/// See [`CliError`].
+pub async fn run(_options: options::DemoOptions, _format: Format) -> Result<Exit, CliError> {
+    Err(CliError::Usage("the demo is not part of this build".to_owned()))
+}
