@@ -1,5 +1,10 @@
 //! `blaze demo`.
+pub mod camera;
 pub mod options;
+pub mod player;
+pub mod recording;
+pub mod schedule;
+pub mod stats;
 
 use crate::exit::{CliError, Exit};
 use crate::output::Format;
