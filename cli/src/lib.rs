@@ -1,0 +1,56 @@
+//! The command line of BlazeAIoT.
+//!
+//! ```text
+//! args ──► admin: topics, bridges, peers, why ──► http ──► admin port of a flow ──► output
+//!      └─► demo: recordings ──► player ──► flows and services of one process ──► board ──► report
+//! ```
+
+pub mod admin;
+pub mod args;
+pub mod demo;
+pub mod exit;
+pub mod http;
+pub mod output;
+
+use std::process::ExitCode;
+
+use clap::CommandFactory as _;
+
+pub use args::Arguments;
+use args::Command;
+use exit::{CliError, Exit};
+
+/// Runs one command and returns what the process exits with. A failure is told on stderr, in one sentence.
+#[must_use]
+pub fn run(arguments: Arguments) -> ExitCode {
+    let outcome = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .map_err(|error| CliError::Failed(format!("the asynchronous runtime does not start: {error}")))
+        .and_then(|runtime| runtime.block_on(dispatch(arguments)));
+    match outcome {
+        Ok(exit) => exit.into(),
+        Err(CliError::OutputClosed) => Exit::Done.into(),
+        Err(error) => {
+            eprintln!("blaze: {error}");
+            error.exit().into()
+        }
+    }
+}
+
+async fn dispatch(arguments: Arguments) -> Result<Exit, CliError> {
+    let format = arguments.output;
+    match arguments.command {
+        Command::Topics(target) => admin::topics(&target.flow, format).await,
+        Command::Bridges(target) => admin::bridges(&target.flow, format).await,
+        Command::Peers(target) => admin::peers(&target.flow, format).await,
+        Command::Why(why) => admin::why(&why, format).await,
+        Command::Demo(options) => demo::run(options, format).await,
+        Command::Completions { shell } => {
+            let mut script = Vec::new();
+            clap_complete::generate(shell, &mut Arguments::command(), "blaze", &mut script);
+            output::print(&String::from_utf8_lossy(&script))?;
+            Ok(Exit::Done)
+        }
+    }
+}

@@ -1,0 +1,152 @@
+//! Tables for people, JSON and YAML for programs.
+
+use std::io::Write as _;
+
+use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use serde_json::Value;
+
+use crate::exit::CliError;
+
+/// How results are printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Format {
+    /// For people
+    Table,
+    /// As the flow answers
+    Json,
+    /// The same as YAML
+    Yaml,
+}
+
+/// Where a column's content stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Align {
+    /// Words.
+    Left,
+    /// Numbers.
+    Right,
+}
+
+/// Width of the terminal in columns; `None` when standard output is none.
+#[must_use]
+pub fn terminal_width() -> Option<u16> {
+    Table::new().width()
+}
+
+/// Lays out rows under headings; wraps cells so that lines fit `width`, and does not wrap without one.
+#[must_use]
+pub fn render_table(columns: &[(&str, Align)], rows: Vec<Vec<String>>, width: Option<u16>) -> String {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    table.set_header(columns.iter().map(|(name, _)| *name));
+    table.add_rows(rows);
+    match width {
+        Some(width) => {
+            table.set_width(width);
+            table.set_content_arrangement(ContentArrangement::Dynamic);
+        }
+        None => {
+            table.set_content_arrangement(ContentArrangement::Disabled);
+        }
+    }
+    for (index, (_, align)) in columns.iter().enumerate() {
+        if let Some(column) = table.column_mut(index) {
+            column.set_padding((0, 2));
+            if *align == Align::Right {
+                column.set_cell_alignment(CellAlignment::Right);
+            }
+        }
+    }
+    table.lines().map(|line| format!("{}\n", line.trim_end())).collect()
+}
+
+/// Writes a text to standard output, with a newline at its end.
+///
+/// # Errors
+/// [`CliError::OutputClosed`] when nobody reads it any more, [`CliError::Failed`] for a full disk and the like.
+pub fn print(text: &str) -> Result<(), CliError> {
+    let mut out = std::io::stdout().lock();
+    let newline = if text.ends_with('\n') { "" } else { "\n" };
+    write!(out, "{text}{newline}")
+        .and_then(|()| out.flush())
+        .map_err(|error| match error.kind() {
+            std::io::ErrorKind::BrokenPipe => CliError::OutputClosed,
+            _ => CliError::Failed(format!("standard output: {error}")),
+        })
+}
+
+/// An object in one of the formats for programs, or the text that `table` makes of it.
+///
+/// # Errors
+/// [`CliError::Failed`] when YAML cannot hold it; whatever `table` says.
+pub fn format_object(
+    value: &Value,
+    format: Format,
+    table: impl FnOnce(&Value) -> Result<String, CliError>,
+) -> Result<String, CliError> {
+    match format {
+        Format::Table => table(value),
+        Format::Json => serde_json::to_string_pretty(value).map_err(|error| CliError::Failed(error.to_string())),
+        Format::Yaml => yaml_serde::to_string(value).map_err(|error| CliError::Failed(error.to_string())),
+    }
+}
+
+/// Bytes with a binary unit: `921.6 KB` would be wrong here, `900.0 KiB` is meant.
+#[must_use]
+pub fn bytes(count: f64) -> String {
+    const UNITS: [&str; 5] = ["B", "KiB", "MiB", "GiB", "TiB"];
+    let mut value = count;
+    let mut unit = 0;
+    while value >= 1024.0 && unit + 1 < UNITS.len() {
+        value /= 1024.0;
+        unit += 1;
+    }
+    if unit == 0 {
+        format!("{value:.0} {}", UNITS[unit])
+    } else {
+        format!("{value:.1} {}", UNITS[unit])
+    }
+}
+
+/// A number with a fixed count of decimals, or a dash where there is none.
+#[must_use]
+pub fn number(value: Option<f64>, decimals: usize) -> String {
+    value.map_or_else(|| "-".to_owned(), |value| format!("{value:.decimals$}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const COLUMNS: [(&str, Align); 2] = [("TOPIC", Align::Left), ("HZ", Align::Right)];
+
+    #[test]
+    fn tables_are_plain_and_aligned() {
+        let rows = vec![
+            vec!["imu/data".to_owned(), "50.0".to_owned()],
+            vec!["x".to_owned(), "1.0".to_owned()],
+        ];
+        assert_eq!(
+            render_table(&COLUMNS, rows, None),
+            "TOPIC       HZ\nimu/data  50.0\nx          1.0\n"
+        );
+    }
+
+    #[test]
+    fn tables_fit_the_terminal() {
+        let rows = vec![vec![
+            "a/rather/long/topic name/with many/parts".to_owned(),
+            "50.0".to_owned(),
+        ]];
+        let text = render_table(&COLUMNS, rows, Some(24));
+        assert!(text.lines().count() > 2, "{text}");
+        assert!(text.lines().all(|line| line.chars().count() <= 24), "{text}");
+    }
+
+    #[test]
+    fn bytes_have_units() {
+        assert_eq!(bytes(0.0), "0 B");
+        assert_eq!(bytes(921_600.0), "900.0 KiB");
+        assert_eq!(bytes(5e15), "4547.5 TiB");
+    }
+}
