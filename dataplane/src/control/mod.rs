@@ -12,16 +12,16 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 
+use blaze_domain::control::EventKind;
 use blaze_domain::names::ChannelName;
 use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
-use blaze_proto::link::link_control::Body;
+use blaze_proto::link::link_control::{Body, RouteState};
 use bytes::Bytes;
 
 use crate::lane::path::TopicInfo;
 use crate::link::engine::LinkEvent;
-use crate::plan::rendezvous;
-use crate::plan::{PlanRules, TopicPlan, plan_topic};
-use crate::registry::{ControlOutcome, Event, EventKind, Registry, RegistryConfig};
+use crate::plan::{Destination, PlanRules, Target, TopicPlan, plan_topic};
+use crate::registry::{EventDraft, Registry, RegistryConfig};
 use crate::world::{FlowState, FlowView, LayerScopeId, Reach, World};
 
 /// A changed topic is planned after this much quiet …
@@ -32,6 +32,9 @@ pub const LATEST: Duration = Duration::from_millis(250);
 pub const LISTEN: Duration = Duration::from_millis(1500);
 /// All topics are planned anew that often, changed or not.
 pub const RECONCILE: Duration = Duration::from_secs(5);
+
+/// Routes of one topic that other flows are told of.
+const MAX_ROUTE_STATES: usize = 16;
 
 /// What the control core wants done.
 #[derive(Debug)]
@@ -87,6 +90,8 @@ pub struct ControlConfig {
     pub layer_scope: Option<LayerScopeId>,
     /// Whether it has an inter scope, so that it must listen for peers before it is ready.
     pub inter_scope: bool,
+    /// Answers on the layer scope share one channel (Kafka, DDS).
+    pub layer_answers_need_id: bool,
     /// Rules of the node file.
     pub rules: PlanRules,
 }
@@ -122,9 +127,10 @@ impl ControlCore {
             node_scope: config.node_scope,
             layer_scope: config.layer_scope,
             max_leases: 10_000,
+            layer_answers_need_id: config.layer_answers_need_id,
             started: now,
         });
-        let mut core = Self {
+        Self {
             config,
             registry,
             plans: BTreeMap::new(),
@@ -135,9 +141,7 @@ impl ControlCore {
             reconciled: now,
             announced: (0, 0),
             refused: 0,
-        };
-        core.registry.set_state(FlowState::Starting);
-        core
+        }
     }
 
     /// Leases and what other flows announced.
@@ -166,8 +170,7 @@ impl ControlCore {
 
     /// Tells all services that the flow has started, so that they send their leases again.
     pub fn announce_start(&mut self, wall_ms: u64) {
-        let event = Event::new(EventKind::FlowStarted, &self.config.me, None, None, wall_ms);
-        self.tell(&event);
+        self.tell(&draft(EventKind::FlowStarted, None), wall_ms);
     }
 
     /// Changes the rules; every topic is planned anew.
@@ -177,26 +180,23 @@ impl ControlCore {
     }
 
     /// Takes in nothing more: every bridge drains.
-    pub fn start_draining(&mut self, now: Instant) {
+    pub fn start_draining(&mut self, now: Instant, wall_ms: u64) {
         self.set_state(now, FlowState::Draining);
-        self.plan_due(now + LATEST, 0);
+        self.plan_due(now + LATEST, wall_ms);
     }
 
     /// Takes a payload of the control channel of a scope.
     pub fn control(&mut self, now: Instant, wall_ms: u64, scope: Scope, payload: &[u8]) {
-        let ControlOutcome { answers, events, changed, faults } = self.registry.control(now, wall_ms, scope, payload);
-        self.refused += faults;
-        for answer in answers {
-            let Some(channel) = answer.reply_to else { continue };
-            if !self.answers_on(scope, answer.id.as_deref()) {
-                continue;
-            }
-            self.outputs.push_back(Output::Publish { scope, channel, body: Bytes::from(answer.body.to_string()) });
+        let outcome = self.registry.control(now, scope, payload);
+        self.refused += outcome.faults;
+        for answer in outcome.answers.into_iter().filter(|answer| answer.designated) {
+            let body = Bytes::from(answer.body.to_string());
+            self.outputs.push_back(Output::Publish { scope, channel: answer.reply_to, body });
         }
-        for event in events {
-            self.tell(&event);
+        for event in &outcome.events {
+            self.tell(event, wall_ms);
         }
-        self.touch(now, changed);
+        self.touch(now, outcome.changed);
     }
 
     /// Takes what the link says of other flows.
@@ -221,9 +221,9 @@ impl ControlCore {
         if self.state == FlowState::Starting && listened {
             self.set_state(now, FlowState::Ready);
         }
-        let expired = self.registry.expire(now, wall_ms);
-        for event in expired.events {
-            self.tell(&event);
+        let expired = self.registry.expire(now);
+        for event in &expired.events {
+            self.tell(event, wall_ms);
         }
         self.touch(now, expired.changed);
         if now.saturating_duration_since(self.reconciled) >= RECONCILE {
@@ -248,8 +248,9 @@ impl ControlCore {
 
     fn set_state(&mut self, now: Instant, state: FlowState) {
         self.state = state;
-        self.registry.set_state(state);
+        let changed = self.registry.set_state(state);
         self.outputs.push_back(Output::State(state));
+        self.touch(now, changed);
         self.touch_all(now);
     }
 
@@ -260,10 +261,8 @@ impl ControlCore {
     }
 
     fn touch_all(&mut self, now: Instant) {
-        let mut topics: BTreeSet<TopicName> = self.plans.keys().cloned().collect();
-        for flow in self.registry.world().flows.values() {
-            topics.extend(flow.topics.keys().cloned());
-        }
+        let mut topics = self.registry.all_topics();
+        topics.extend(self.plans.keys().cloned());
         self.touch(now, topics);
     }
 
@@ -275,11 +274,11 @@ impl ControlCore {
             self.dirty.iter().filter(|(_, dirty)| due(dirty)).map(|(topic, _)| topic.clone()).collect();
         for topic in topics {
             self.dirty.remove(&topic);
-            self.plan(&topic, wall_ms);
+            self.plan(now, &topic, wall_ms);
         }
     }
 
-    fn plan(&mut self, topic: &TopicName, wall_ms: u64) {
+    fn plan(&mut self, now: Instant, topic: &TopicName, wall_ms: u64) {
         let previous = self.plans.get(topic);
         let world = self.registry.world();
         let plan = plan_topic(world, topic, &self.config.rules, previous);
@@ -292,35 +291,48 @@ impl ControlCore {
         } else {
             self.plans.insert(topic.clone(), plan.clone());
         }
+        self.registry.set_route_state(now, topic, route_states(&self.config.me, &plan));
         self.outputs.push_back(Output::Plan { topic: topic.clone(), plan, info });
         if had_route != has_route {
             let kind = if has_route { EventKind::RouteUp } else { EventKind::RouteDown };
-            let event = Event::new(kind, &self.config.me, Some(topic), None, wall_ms);
-            self.tell(&event);
+            self.tell(&draft(kind, Some(topic.clone())), wall_ms);
         }
     }
 
-    /// Of several flows that hear one control message on a shared layer broker, one answers.
-    fn answers_on(&self, scope: Scope, id: Option<&str>) -> bool {
-        if scope == Scope::Node {
-            return true;
+    fn tell(&mut self, event: &EventDraft, wall_ms: u64) {
+        if !event.detail.is_empty() {
+            tracing::info!(event = event.event.as_str(), code = event.code, "{}", event.detail);
         }
-        let sharing = self.world().flows.iter().filter(|(flow, view)| {
-            flow.layer == self.config.me.layer
-                && view.layer_scope.is_some()
-                && view.layer_scope == self.config.layer_scope
-                && view.reach == Reach::Up
-        });
-        rendezvous::choose(id.unwrap_or_default(), sharing.map(|(flow, _)| flow)) == Some(&self.config.me)
-    }
-
-    fn tell(&mut self, event: &Event) {
-        let body = Bytes::from(event.to_json());
+        let body = Bytes::from(event.stamp(&self.config.me, wall_ms).to_json().to_string());
         let scopes = [(Scope::Node, self.config.node_scope), (Scope::Layer, self.config.layer_scope.is_some())];
         for (scope, _) in scopes.into_iter().filter(|(_, there)| *there) {
             self.outputs.push_back(Output::Publish { scope, channel: ChannelName::events(), body: body.clone() });
         }
     }
+}
+
+fn draft(event: EventKind, topic: Option<TopicName>) -> EventDraft {
+    EventDraft { event, topic, code: "", detail: String::new() }
+}
+
+/// What this flow does for a topic, as other flows are told for their `why`.
+fn route_states(me: &FlowId, plan: &TopicPlan) -> Vec<RouteState> {
+    let carried = plan.bridges.iter().map(|bridge| {
+        let (to_layer, receiver, step) = match &bridge.to {
+            Target::Inter { layer, receiver } => (layer.to_string(), receiver.to_string(), "bridge"),
+            Target::Node { .. } | Target::Layer => (me.layer.to_string(), me.to_string(), "deliver"),
+        };
+        RouteState { to_layer, receiver, step: step.to_owned(), ok: true, code: "ok".to_owned(), next_offset: 0 }
+    });
+    let blocked = plan.blocked.iter().map(|blocked| {
+        let (to_layer, receiver) = match &blocked.to {
+            Destination::Flow(flow) => (flow.layer.to_string(), flow.to_string()),
+            Destination::Layer(layer) => (layer.to_string(), String::new()),
+        };
+        let code = blocked.code.as_str().to_owned();
+        RouteState { to_layer, receiver, step: "plan".to_owned(), ok: false, code, next_offset: 0 }
+    });
+    carried.chain(blocked).take(MAX_ROUTE_STATES).collect()
 }
 
 /// What the local advertisements of a topic say.

@@ -182,6 +182,7 @@ impl<'a> Simulation<'a> {
                 node_scope: true,
                 layer_scope: Some(layer_scope),
                 inter_scope: true,
+                layer_answers_need_id: false,
                 rules: PlanRules::default(),
             },
             self.now,
