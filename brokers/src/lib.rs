@@ -2,6 +2,7 @@
 //!
 //! [`Broker`] is what BlazeFlow and the SDK know of a message system; [`memory`] serves services and flows of one process.
 
+pub mod dds;
 pub mod memory;
 pub mod port;
 
