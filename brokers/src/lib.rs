@@ -4,6 +4,7 @@
 
 #[cfg(feature = "conformance")]
 pub mod conformance;
+pub mod dds;
 pub mod memory;
 pub mod port;
 

@@ -1,3 +1,4 @@
 //! The inter scope: flow to flow.
 
+pub mod dds;
 pub mod transport;

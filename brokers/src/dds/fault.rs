@@ -1,0 +1,52 @@
+//! Faults inside RustDDS on demand. Its event loop calls the wakers of readers, so a waker can end or block it.
+
+use std::sync::Arc;
+use std::task::{Wake, Waker};
+use std::thread;
+use std::time::Duration;
+
+use bytes::Bytes;
+
+use super::{DdsError, Participant, Profile};
+
+/// What is to go wrong.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    /// The event loop panics and unwinds.
+    Panic,
+    /// The event loop stands still for a minute.
+    Hang,
+}
+
+struct Trap(Fault);
+
+impl Wake for Trap {
+    fn wake(self: Arc<Self>) {
+        self.wake_by_ref();
+    }
+
+    #[allow(clippy::panic, reason = "the panic is what the caller asked for")]
+    fn wake_by_ref(self: &Arc<Self>) {
+        match self.0 {
+            Fault::Panic => panic!("injected into the event loop"),
+            Fault::Hang => thread::sleep(Duration::from_secs(60)),
+        }
+    }
+}
+
+pub(super) fn inject(participant: &Participant, fault: Fault) -> Result<(), DdsError> {
+    let topic = format!("blaze/fault/{}", participant.prefix());
+    let profile = Profile::best_effort(1);
+    let reader = participant.raw_reader(&topic, profile)?;
+    reader.set_waker(Some(Waker::from(Arc::new(Trap(fault)))));
+    let writer = participant.writer(&topic, profile)?;
+    for _ in 0..200 {
+        if writer.write(Bytes::from_static(b"!")) {
+            break;
+        }
+        thread::sleep(Duration::from_millis(10));
+    }
+    // Both stay until the event loop has met the waker; a dead or hanging loop never hears of their end anyway.
+    thread::sleep(Duration::from_millis(50));
+    Ok(())
+}

@@ -1,0 +1,85 @@
+//! RustDDS behind a small surface: one participant on one interface, samples that are plain octets, discovery over
+//! unicast, and the means to see that a participant has died.
+//!
+//! ```text
+//! Participant ── Writer::write ──► RustDDS event loop ──► UDP
+//!             ── Reader (a thread of its own) ──► sink(participant, octets)
+//!             ── ReaderWatch (a thread of its own) ──► sink(all remote readers)
+//! Relay       ── repeats the participant's announcement to hosts that multicast does not reach
+//! ```
+//!
+//! Nothing here blocks a caller on the network, and a panic inside RustDDS never leaves this module: it marks the
+//! participant as failed, and the owner builds a new one.
+
+#[cfg(feature = "fault-injection")]
+mod fault;
+mod participant;
+mod reader;
+mod relay;
+mod sample;
+mod watch;
+
+use std::net::IpAddr;
+
+#[cfg(feature = "fault-injection")]
+pub use fault::Fault;
+pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile, Writer};
+pub use reader::{Reader, SampleSink};
+pub use relay::{Relay, RelayConfig, RelayStatus};
+pub use watch::{ReaderWatch, RemoteReader};
+
+/// The type of all samples, IDL `sequence<octet>`.
+pub const FRAME_TYPE: &str = "blaze::v1::Frame";
+
+/// Largest DDS domain whose ports lie below 65,536.
+pub const MAX_DOMAIN: u16 = 231;
+
+/// RustDDS announces itself to this many participant slots of its own host.
+const LOCAL_SLOTS: u16 = 12;
+
+/// UDP port of a domain on which multicast announcements come; user multicast is the next one.
+fn multicast_port(domain: u16) -> u16 {
+    7400 + 250 * domain
+}
+
+/// UDP port on which the participant in a slot takes announcements.
+fn announcement_port(domain: u16, slot: u16) -> u16 {
+    multicast_port(domain) + 10 + 2 * slot
+}
+
+/// Why DDS refused.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DdsError {
+    /// Ports of that domain would lie above 65,535.
+    #[error("DDS domain {0} is above {MAX_DOMAIN}")]
+    Domain(u16),
+    /// RustDDS speaks IPv4 alone.
+    #[error("{0} is not an IPv4 address of one interface")]
+    Address(IpAddr),
+    /// No interface has the address (yet).
+    #[error("no interface has {address}: {error}")]
+    AddressMissing {
+        /// What the configuration names.
+        address: IpAddr,
+        /// What the system says.
+        error: String,
+    },
+    /// RustDDS or the system could not make something.
+    #[error("cannot make a DDS {what}: {error}")]
+    Create {
+        /// What was to be made.
+        what: &'static str,
+        /// What was said.
+        error: String,
+    },
+    /// A panic inside RustDDS.
+    #[error("RustDDS failed while making a {0}")]
+    Panicked(&'static str),
+}
+
+fn create_error(what: &'static str) -> impl FnOnce(std::io::Error) -> DdsError {
+    move |error| DdsError::Create {
+        what,
+        error: error.to_string(),
+    }
+}

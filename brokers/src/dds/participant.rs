@@ -1,0 +1,349 @@
+//! One DDS participant on one interface.
+
+use std::fmt;
+use std::net::{IpAddr, Ipv4Addr, UdpSocket};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use bytes::Bytes;
+use rustdds::policy::{Durability, History, ResourceLimits};
+use rustdds::{
+    DataWriterStatus, DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies, QosPolicyBuilder,
+    RTPSEntity, StatusEvented, Subscriber, Topic, TopicKind, no_key,
+};
+
+use super::reader::{Reader, SampleSink};
+use super::sample::{Octets, OctetsAdapter};
+use super::watch::{ReaderWatch, RemoteReader};
+use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, MAX_DOMAIN, announcement_port};
+
+/// Identity of one participant on the wire; a rebuilt one has a new identity.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct GuidPrefix(pub [u8; 12]);
+
+impl fmt::Display for GuidPrefix {
+    /// 24 lower-case hexadecimal digits.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+impl fmt::Debug for GuidPrefix {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}
+
+/// Where a participant lives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ParticipantConfig {
+    /// DDS domain, 0 to [`MAX_DOMAIN`].
+    pub domain: u16,
+    /// Address of the one interface that it announces. Never unspecified.
+    pub address: Ipv4Addr,
+    /// Send buffer of the socket in bytes: what can queue in the system behind the application's pacing.
+    pub send_buffer_bytes: usize,
+    /// Receive buffer of each socket in bytes; the system caps it (`net.core.rmem_max`).
+    pub receive_buffer_bytes: usize,
+}
+
+impl ParticipantConfig {
+    /// A participant with RustDDS' receive buffer and a send buffer of 64 KiB.
+    #[must_use]
+    pub fn new(domain: u16, address: Ipv4Addr) -> Self {
+        Self {
+            domain,
+            address,
+            send_buffer_bytes: 64 * 1024,
+            receive_buffer_bytes: DomainParticipantBuilder::DEFAULT_SOCKET_RECEIVE_BUFFER_SIZE,
+        }
+    }
+
+    fn check(&self) -> Result<(), DdsError> {
+        if self.domain > MAX_DOMAIN {
+            return Err(DdsError::Domain(self.domain));
+        }
+        let address = IpAddr::V4(self.address);
+        if self.address.is_unspecified() || self.address.is_multicast() || self.address.is_broadcast() {
+            return Err(DdsError::Address(address));
+        }
+        // RustDDS would announce no address at all and stay invisible.
+        match UdpSocket::bind((self.address, 0)) {
+            Ok(_) => Ok(()),
+            Err(error) => Err(DdsError::AddressMissing {
+                address,
+                error: error.to_string(),
+            }),
+        }
+    }
+}
+
+/// Quality of service of a writer or reader.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Profile {
+    /// RTPS repairs losses. A write to a full window is refused, it never waits.
+    pub reliable: bool,
+    /// Writers: samples that may wait for the event loop, and with `transient_local` those kept for late joiners.
+    /// Readers: samples that may wait for the sink.
+    pub depth: u16,
+    /// Late joiners get the last `depth` samples.
+    pub transient_local: bool,
+}
+
+impl Profile {
+    /// Best effort with room for `depth` samples.
+    #[must_use]
+    pub fn best_effort(depth: u16) -> Self {
+        Self {
+            reliable: false,
+            depth,
+            transient_local: false,
+        }
+    }
+
+    fn qos(self) -> QosPolicies {
+        let depth = i32::from(self.depth.max(1));
+        let durability = if self.transient_local {
+            Durability::TransientLocal
+        } else {
+            Durability::Volatile
+        };
+        let builder = QosPolicyBuilder::new()
+            .durability(durability)
+            .history(History::KeepLast { depth })
+            .resource_limits(ResourceLimits {
+                max_samples: depth,
+                max_instances: 1,
+                max_samples_per_instance: depth,
+            });
+        if self.reliable {
+            builder.reliable(Duration::ZERO).build()
+        } else {
+            builder.best_effort().build()
+        }
+    }
+}
+
+/// One participant. Dropping it says good-bye to the others and ends its threads, which may take a while when one of
+/// them hangs: drop it where that does not matter.
+pub struct Participant {
+    dds: DomainParticipant,
+    publisher: Publisher,
+    subscriber: Subscriber,
+    config: ParticipantConfig,
+    prefix: GuidPrefix,
+    port: u16,
+    failed: Arc<AtomicBool>,
+}
+
+impl fmt::Debug for Participant {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "Participant {} on {} port {}",
+            self.prefix, self.config.address, self.port
+        )
+    }
+}
+
+impl Participant {
+    /// Starts a participant. It announces itself to the other participants of this host; a [`super::Relay`] does so to
+    /// other hosts.
+    ///
+    /// # Errors
+    /// [`DdsError`] when the configuration is not possible here or now, or RustDDS cannot start.
+    pub fn start(config: ParticipantConfig) -> Result<Self, DdsError> {
+        config.check()?;
+        let qos = Profile::best_effort(1).qos();
+        let (dds, publisher, subscriber, id) = contain("participant", || {
+            let dds = DomainParticipantBuilder::new(config.domain)
+                .with_only_networks([IpAddr::V4(config.address)])
+                .socket_send_buffer_size(config.send_buffer_bytes)
+                .socket_receive_buffer_size(config.receive_buffer_bytes)
+                .build()?;
+            let publisher = dds.create_publisher(&qos)?;
+            let subscriber = dds.create_subscriber(&qos)?;
+            let id = dds.participant_id();
+            Ok((dds, publisher, subscriber, id))
+        })?;
+        if id >= LOCAL_SLOTS {
+            tracing::warn!(
+                slot = id,
+                domain = config.domain,
+                "too many DDS participants on this host: others here do not see this one"
+            );
+        }
+        Ok(Self {
+            prefix: prefix_of(dds.guid()),
+            port: announcement_port(config.domain, id),
+            dds,
+            publisher,
+            subscriber,
+            config,
+            failed: Arc::default(),
+        })
+    }
+
+    /// Its identity on the wire.
+    #[must_use]
+    pub fn prefix(&self) -> GuidPrefix {
+        self.prefix
+    }
+
+    /// The UDP port on which it takes announcements; user data come on the next one.
+    #[must_use]
+    pub fn port(&self) -> u16 {
+        self.port
+    }
+
+    /// Makes a writer of a topic.
+    ///
+    /// # Errors
+    /// [`DdsError`] when RustDDS refuses or has died.
+    pub fn writer(&self, topic: &str, profile: Profile) -> Result<Writer, DdsError> {
+        let writer = self.contain("writer", || {
+            let topic = self.topic(topic, profile)?;
+            self.publisher
+                .create_datawriter_no_key::<Octets, OctetsAdapter>(&topic, Some(profile.qos()))
+        })?;
+        Ok(Writer {
+            writer,
+            matched: AtomicBool::new(false),
+            failed: Arc::clone(&self.failed),
+        })
+    }
+
+    /// Makes a reader of a topic, and the thread that hands its samples to `sink`.
+    ///
+    /// # Errors
+    /// [`DdsError`] when RustDDS refuses or has died.
+    pub fn reader(&self, topic: &str, profile: Profile, sink: SampleSink) -> Result<Reader, DdsError> {
+        Reader::start(self.raw_reader(topic, profile)?, sink, Arc::clone(&self.failed))
+    }
+
+    /// Calls `sink` with all readers of other participants whose topics begin with `topics`, whenever one comes or
+    /// goes, and once a second.
+    ///
+    /// # Errors
+    /// [`DdsError`] when there is no thread for it.
+    pub fn watch_readers(
+        &self,
+        topics: &str,
+        sink: Box<dyn Fn(Vec<RemoteReader>) + Send>,
+    ) -> Result<ReaderWatch, DdsError> {
+        ReaderWatch::start(
+            self.dds.clone(),
+            self.prefix,
+            topics.to_owned(),
+            sink,
+            Arc::clone(&self.failed),
+        )
+    }
+
+    /// Whether its threads are alive, as far as that shows without traffic: a panic anywhere was seen, the event loop
+    /// holds its port, the discovery thread takes commands.
+    #[must_use]
+    pub fn is_alive(&self) -> bool {
+        if self.failed.load(Ordering::Relaxed) {
+            return false;
+        }
+        // The event loop owns the sockets: when it has unwound, the port is free.
+        let held = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, self.port)).is_err();
+        let commands = catch_unwind(AssertUnwindSafe(|| self.dds.assert_liveliness().is_ok())).unwrap_or(false);
+        held && commands
+    }
+
+    /// Ends or blocks the event loop of RustDDS, which then panics or hangs, for tests of those who must notice.
+    ///
+    /// # Errors
+    /// [`DdsError`] when RustDDS refuses or has died.
+    #[cfg(feature = "fault-injection")]
+    pub fn inject(&self, fault: super::Fault) -> Result<(), DdsError> {
+        super::fault::inject(self, fault)
+    }
+
+    pub(super) fn raw_reader(
+        &self,
+        name: &str,
+        profile: Profile,
+    ) -> Result<no_key::SimpleDataReader<Octets, OctetsAdapter>, DdsError> {
+        self.contain("reader", || {
+            let topic = self.topic(name, profile)?;
+            self.subscriber
+                .create_simple_datareader_no_key::<Octets, OctetsAdapter>(&topic, Some(profile.qos()))
+        })
+    }
+
+    fn topic(&self, name: &str, profile: Profile) -> rustdds::dds::CreateResult<Topic> {
+        self.dds
+            .create_topic(name.to_owned(), FRAME_TYPE.to_owned(), &profile.qos(), TopicKind::NoKey)
+    }
+
+    fn contain<T>(
+        &self,
+        what: &'static str,
+        make: impl FnOnce() -> rustdds::dds::CreateResult<T>,
+    ) -> Result<T, DdsError> {
+        contain(what, make).inspect_err(|error| {
+            if matches!(error, DdsError::Panicked(_)) {
+                self.failed.store(true, Ordering::Relaxed);
+            }
+        })
+    }
+}
+
+fn contain<T>(what: &'static str, make: impl FnOnce() -> rustdds::dds::CreateResult<T>) -> Result<T, DdsError> {
+    match catch_unwind(AssertUnwindSafe(make)) {
+        Ok(Ok(made)) => Ok(made),
+        Ok(Err(error)) => Err(DdsError::Create {
+            what,
+            error: error.to_string(),
+        }),
+        Err(_) => Err(DdsError::Panicked(what)),
+    }
+}
+
+pub(super) fn prefix_of(guid: rustdds::GUID) -> GuidPrefix {
+    let mut prefix = [0; 12];
+    prefix.copy_from_slice(&guid.to_bytes()[..12]);
+    GuidPrefix(prefix)
+}
+
+/// Writes one topic. Never waits.
+pub struct Writer {
+    writer: no_key::DataWriter<Octets, OctetsAdapter>,
+    matched: AtomicBool,
+    failed: Arc<AtomicBool>,
+}
+
+impl Writer {
+    /// Hands a sample to RustDDS. Returns whether it was taken and has at least one reader; best effort takes always
+    /// and lets the oldest that still wait give way.
+    pub fn write(&self, octets: Bytes) -> bool {
+        self.contain(|| (self.is_matched_now() && self.writer.write(Octets(octets), None).is_ok()).then_some(()))
+            .is_some()
+    }
+
+    /// Whether a reader is there.
+    #[must_use]
+    pub fn is_matched(&self) -> bool {
+        self.contain(|| self.is_matched_now().then_some(())).is_some()
+    }
+
+    fn is_matched_now(&self) -> bool {
+        while let Some(status) = self.writer.try_recv_status() {
+            if let DataWriterStatus::PublicationMatched { current, .. } = status {
+                self.matched.store(current.count() > 0, Ordering::Relaxed);
+            }
+        }
+        self.matched.load(Ordering::Relaxed)
+    }
+
+    fn contain<T>(&self, call: impl FnOnce() -> Option<T>) -> Option<T> {
+        catch_unwind(AssertUnwindSafe(call)).unwrap_or_else(|_| {
+            self.failed.store(true, Ordering::Relaxed);
+            None
+        })
+    }
+}

@@ -1,0 +1,142 @@
+//! A reader and the thread that empties it.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::task::{Wake, Waker};
+use std::thread::{self, JoinHandle, Thread};
+use std::time::Duration;
+
+use bytes::Bytes;
+use rustdds::no_key::SimpleDataReader;
+
+use super::participant::prefix_of;
+use super::sample::{Octets, OctetsAdapter};
+use super::{DdsError, GuidPrefix, create_error};
+
+/// Takes each sample and the participant that wrote it. It runs in the reader's thread: while it works, at most `depth`
+/// samples wait, then the oldest are lost.
+pub type SampleSink = Box<dyn Fn(GuidPrefix, Bytes) + Send>;
+
+/// A safety net only: RustDDS wakes the thread.
+const LONGEST_SLEEP: Duration = Duration::from_millis(250);
+
+/// Reads one topic until it is dropped.
+pub struct Reader {
+    thread: StoppableThread,
+    malformed: Arc<AtomicU64>,
+}
+
+impl Reader {
+    pub(super) fn start(
+        reader: SimpleDataReader<Octets, OctetsAdapter>,
+        sink: SampleSink,
+        failed: Arc<AtomicBool>,
+    ) -> Result<Self, DdsError> {
+        let malformed = Arc::<AtomicU64>::default();
+        let counter = Arc::clone(&malformed);
+        let thread = StoppableThread::start("dds-reader", failed, move |stop| {
+            let waker = unpark_waker();
+            while !stop.load(Ordering::Relaxed) {
+                drain(&reader, &sink, &counter);
+                reader.set_waker(Some(waker.clone()));
+                // What came before the waker was set woke nobody.
+                if !drain(&reader, &sink, &counter) {
+                    thread::park_timeout(LONGEST_SLEEP);
+                }
+            }
+        })?;
+        Ok(Self { thread, malformed })
+    }
+
+    /// Samples that were not a sequence of octets, and were dropped.
+    #[must_use]
+    pub fn malformed(&self) -> u64 {
+        self.malformed.load(Ordering::Relaxed)
+    }
+
+    /// Whether its thread still runs.
+    #[must_use]
+    pub fn is_running(&self) -> bool {
+        self.thread.is_running()
+    }
+}
+
+/// Takes what is there. Returns whether there was anything.
+fn drain(reader: &SimpleDataReader<Octets, OctetsAdapter>, sink: &SampleSink, malformed: &AtomicU64) -> bool {
+    let mut any = false;
+    reader.drain_read_notifications();
+    loop {
+        match reader.try_take_one() {
+            Ok(Some(change)) => {
+                any = true;
+                sink(prefix_of(change.writer_guid()), change.into_value().0);
+            }
+            Ok(None) => return any,
+            Err(_) => {
+                any = true;
+                malformed.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+    }
+}
+
+struct Unpark(Thread);
+
+impl Wake for Unpark {
+    fn wake(self: Arc<Self>) {
+        self.0.unpark();
+    }
+}
+
+/// A waker of the calling thread.
+pub(super) fn unpark_waker() -> Waker {
+    Waker::from(Arc::new(Unpark(thread::current())))
+}
+
+/// A named thread that is asked to stop and joined on drop. A panic in it sets `failed`.
+pub(super) struct StoppableThread {
+    stop: Arc<AtomicBool>,
+    handle: Option<JoinHandle<()>>,
+}
+
+impl StoppableThread {
+    pub(super) fn start(
+        name: &'static str,
+        failed: Arc<AtomicBool>,
+        body: impl FnOnce(&AtomicBool) + Send + 'static,
+    ) -> Result<Self, DdsError> {
+        let stop = Arc::<AtomicBool>::default();
+        let flag = Arc::clone(&stop);
+        let handle = thread::Builder::new()
+            .name(name.to_owned())
+            .spawn(move || {
+                if catch_unwind(AssertUnwindSafe(|| body(&flag))).is_err() {
+                    failed.store(true, Ordering::Relaxed);
+                }
+            })
+            .map_err(create_error("thread"))?;
+        Ok(Self {
+            stop,
+            handle: Some(handle),
+        })
+    }
+
+    pub(super) fn is_running(&self) -> bool {
+        self.handle.as_ref().is_some_and(|handle| !handle.is_finished())
+    }
+}
+
+impl Drop for StoppableThread {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(handle) = self.handle.take() {
+            handle.thread().unpark();
+            // A sink may own the reader that calls it.
+            if handle.thread().id() != thread::current().id() {
+                // The body caught its own panic.
+                let _ = handle.join();
+            }
+        }
+    }
+}

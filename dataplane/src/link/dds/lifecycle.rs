@@ -1,0 +1,365 @@
+//! The thread that owns the participant of a transport: it makes writers, watches over RustDDS and builds it anew.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::net::{IpAddr, Ipv4Addr};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use blaze_brokers::dds::{
+    DdsError, GuidPrefix, Participant, ParticipantConfig, Profile, Reader, ReaderWatch, RemoteReader, Writer,
+};
+use blaze_domain::Priority;
+use bytes::Bytes;
+
+use super::{CLASSES, MAX_HEARD, Shared, TOPIC_PREFIX, index, parse_topic, profile, topic};
+use crate::link::transport::{Endpoint, TransportEvent};
+
+const TICK: Duration = Duration::from_millis(200);
+const PROBE: Duration = Duration::from_millis(400);
+/// A participant that did not answer itself for this long hangs.
+const HANG: Duration = Duration::from_millis(1500);
+/// A pause of this thread after which silence says nothing, because all threads may have paused.
+const STALL: Duration = Duration::from_millis(600);
+/// Hello comes every 500 ms.
+const LIVE: Duration = Duration::from_millis(1200);
+const RETRY: Duration = Duration::from_secs(1);
+
+pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
+    thread::Builder::new()
+        .name("dds-lifecycle".into())
+        .spawn(move || Lifecycle::new(shared).run())
+        .map_err(|error| DdsError::Create {
+            what: "thread",
+            error: error.to_string(),
+        })
+}
+
+/// One life of the participant. Fields drop in this order: users first, the participant last.
+struct Generation {
+    _watch: ReaderWatch,
+    readers: Vec<Reader>,
+    probe: Probe,
+    participant: Participant,
+}
+
+/// Writes to a reader of its own participant.
+struct Probe {
+    writer: Writer,
+    _reader: Reader,
+    answered: Arc<AtomicU64>,
+    sent: u64,
+    last_sent: Instant,
+    /// When the last answer was seen; `None` before the first.
+    last_answer: Option<Instant>,
+    seen: u64,
+}
+
+struct Lifecycle {
+    shared: Arc<Shared>,
+    local: Endpoint,
+    generation: Option<Generation>,
+    next_attempt: Instant,
+    last_tick: Instant,
+    /// Whether a participant ran before, so that the next one is a new life.
+    had_life: bool,
+}
+
+impl Lifecycle {
+    fn new(shared: Arc<Shared>) -> Self {
+        let now = Instant::now();
+        Self {
+            local: shared.config.local.clone(),
+            shared,
+            generation: None,
+            next_attempt: now,
+            last_tick: now,
+            had_life: false,
+        }
+    }
+
+    fn run(mut self) {
+        while !self.shared.stop.load(Ordering::Relaxed) {
+            // A panic of RustDDS in this thread is one more way of its death.
+            if catch_unwind(AssertUnwindSafe(|| self.tick())).is_err() {
+                self.bury("RustDDS panicked in a call");
+            }
+            thread::park_timeout(TICK);
+        }
+        self.shared.writers.write().clear();
+        self.shared.discarded.lock().clear();
+        drop(self.generation.take());
+    }
+
+    fn tick(&mut self) {
+        let now = Instant::now();
+        let stalled = now.duration_since(self.last_tick) > STALL;
+        self.last_tick = now;
+        if let Some(reason) = self.generation.as_mut().and_then(|it| it.illness(now, stalled)) {
+            self.bury(reason);
+        }
+        if self.generation.is_none() && now >= self.next_attempt {
+            self.give_birth(now);
+        }
+        self.shared.discarded.lock().clear();
+        self.make_writers();
+        self.tell_relay(now);
+        #[cfg(test)]
+        if let Some(fault) = self.shared.fault.lock().take()
+            && let Some(generation) = &self.generation
+        {
+            generation.participant.inject(fault).ok();
+        }
+    }
+
+    /// Puts a dead participant aside. Its end may hang, so it is left to a thread of its own.
+    fn bury(&mut self, reason: &'static str) {
+        tracing::error!(flow = %self.local, reason, "DDS participant died, building a new one");
+        let writers: Vec<_> = self.shared.writers.write().drain().collect();
+        let discarded = std::mem::take(&mut *self.shared.discarded.lock());
+        self.shared.homes.lock().clear();
+        self.shared.heard.lock().clear();
+        {
+            let mut status = self.shared.status.lock();
+            status.ready = false;
+            status.endpoints = 0;
+            reason.clone_into(&mut status.detail);
+        }
+        let remains = (writers, discarded, self.generation.take());
+        let buried = thread::Builder::new().name("dds-remains".into()).spawn(move || {
+            let _ = catch_unwind(AssertUnwindSafe(|| drop(remains)));
+        });
+        if let Err(error) = buried {
+            tracing::error!(%error, "no thread for the end of a DDS participant");
+        }
+        self.next_attempt = Instant::now();
+    }
+
+    fn give_birth(&mut self, now: Instant) {
+        if self.had_life {
+            self.local.epoch = (self.shared.config.next_epoch)();
+        }
+        match Generation::start(&self.shared, &self.local) {
+            Ok(generation) => {
+                self.shared.relay.set_participant(generation.participant.prefix());
+                tracing::info!(flow = %self.local, participant = ?generation.participant, "DDS participant started");
+                self.generation = Some(generation);
+                let mut status = self.shared.status.lock();
+                status.ready = true;
+                status.detail.clear();
+                if self.had_life {
+                    status.rebuilds += 1;
+                }
+                drop(status);
+                if self.had_life {
+                    (self.shared.config.sink)(TransportEvent::Rebuilt {
+                        epoch: self.local.epoch,
+                    });
+                }
+                self.had_life = true;
+            }
+            Err(error) => {
+                tracing::warn!(flow = %self.local, %error, "DDS participant cannot start, trying again");
+                self.shared.status.lock().detail = error.to_string();
+                self.next_attempt = now + RETRY;
+            }
+        }
+    }
+
+    /// Makes the writers that are wanted and missing.
+    fn make_writers(&mut self) {
+        let Some(generation) = &self.generation else { return };
+        let missing: Vec<(Endpoint, Priority)> = {
+            let wanted = self.shared.wanted.lock();
+            let writers = self.shared.writers.read();
+            let is_missing = |endpoint: &Endpoint, class: Priority| {
+                writers.get(endpoint).is_none_or(|slots| slots[index(class)].is_none())
+            };
+            let classes = |(endpoint, flags): (&Endpoint, &[bool; CLASSES])| {
+                let missing = Priority::ALL
+                    .iter()
+                    .filter(|class| flags[index(**class)] && is_missing(endpoint, **class));
+                missing.map(|class| (endpoint.clone(), *class)).collect::<Vec<_>>()
+            };
+            wanted.iter().flat_map(classes).collect()
+        };
+        for (endpoint, class) in missing {
+            let room = profile(class, self.shared.wire.max_datagram_bytes());
+            match generation.participant.writer(&topic(&endpoint, class), room) {
+                Ok(writer) => {
+                    // It may have been disconnected meanwhile.
+                    let wanted = self.shared.wanted.lock();
+                    if wanted.get(&endpoint).is_some_and(|flags| flags[index(class)]) {
+                        let mut writers = self.shared.writers.write();
+                        writers.entry(endpoint).or_default()[index(class)] = Some(Arc::new(writer));
+                    }
+                }
+                Err(error) => {
+                    tracing::warn!(%endpoint, %class, %error, "no writer");
+                    return;
+                }
+            }
+        }
+    }
+
+    /// Tells the relay which hosts answer.
+    fn tell_relay(&self, now: Instant) {
+        let homes = self.shared.homes.lock();
+        let heard = self.shared.heard.lock();
+        let live: HashSet<Ipv4Addr> = heard
+            .iter()
+            .filter(|(_, at)| now.duration_since(**at) < LIVE)
+            .filter_map(|(participant, _)| homes.get(participant))
+            .flatten()
+            .copied()
+            .collect();
+        drop((homes, heard));
+        self.shared.relay.set_live(live);
+        if let Some(generation) = &self.generation {
+            self.shared.status.lock().malformed = generation.readers.iter().map(Reader::malformed).sum();
+        }
+    }
+}
+
+impl Generation {
+    fn start(shared: &Arc<Shared>, local: &Endpoint) -> Result<Self, DdsError> {
+        let participant = Participant::start(ParticipantConfig::new(shared.config.domain, shared.address))?;
+        let probe = Probe::start(&participant)?;
+        let readers = Priority::ALL
+            .iter()
+            .map(|class| link_reader(&participant, shared, local, *class))
+            .collect::<Result<_, _>>()?;
+        let (watcher, own) = (Arc::clone(shared), local.clone());
+        let known = parking_lot::Mutex::new(BTreeMap::new());
+        let watch = participant.watch_readers(
+            TOPIC_PREFIX,
+            Box::new(move |readers| note_readers(&watcher, &own, &mut known.lock(), &readers)),
+        )?;
+        Ok(Self {
+            _watch: watch,
+            readers,
+            probe,
+            participant,
+        })
+    }
+
+    /// Why it must be replaced, if so.
+    fn illness(&mut self, now: Instant, stalled: bool) -> Option<&'static str> {
+        if self.readers.iter().any(|reader| !reader.is_running()) {
+            return Some("a reader's thread ended");
+        }
+        if !self.participant.is_alive() {
+            return Some("a thread of RustDDS ended");
+        }
+        self.probe
+            .hangs(now, stalled)
+            .then_some("the event loop of RustDDS hangs")
+    }
+}
+
+impl Probe {
+    fn start(participant: &Participant) -> Result<Self, DdsError> {
+        let name = format!("blaze/probe/{}", participant.prefix());
+        let answered = Arc::<AtomicU64>::default();
+        let seen = Arc::clone(&answered);
+        let reader = participant.reader(
+            &name,
+            Profile::best_effort(16),
+            Box::new(move |_, _| {
+                seen.fetch_add(1, Ordering::Relaxed);
+            }),
+        )?;
+        Ok(Self {
+            writer: participant.writer(&name, Profile::best_effort(16))?,
+            _reader: reader,
+            answered,
+            sent: 0,
+            last_sent: Instant::now(),
+            last_answer: None,
+            seen: 0,
+        })
+    }
+
+    fn hangs(&mut self, now: Instant, stalled: bool) -> bool {
+        let answered = self.answered.load(Ordering::Relaxed);
+        if answered != self.seen || (stalled && self.last_answer.is_some()) {
+            self.seen = answered;
+            self.last_answer = Some(now);
+        }
+        if now.duration_since(self.last_sent) >= PROBE || self.sent == 0 {
+            self.last_sent = now;
+            self.sent += u64::from(self.writer.write(Bytes::from_static(b"?")));
+        }
+        self.last_answer.is_some_and(|at| now.duration_since(at) > HANG)
+    }
+}
+
+fn link_reader(
+    participant: &Participant,
+    shared: &Arc<Shared>,
+    local: &Endpoint,
+    class: Priority,
+) -> Result<Reader, DdsError> {
+    let room = profile(class, shared.wire.max_datagram_bytes());
+    let shared = Arc::clone(shared);
+    participant.reader(
+        &topic(local, class),
+        room,
+        Box::new(move |writer, datagram| {
+            note_heard(&shared, writer);
+            (shared.config.sink)(TransportEvent::Received { class, datagram });
+        }),
+    )
+}
+
+fn note_heard(shared: &Shared, writer: GuidPrefix) {
+    let now = Instant::now();
+    let mut heard = shared.heard.lock();
+    if heard.len() >= MAX_HEARD && !heard.contains_key(&writer) {
+        heard.retain(|_, at| now.duration_since(*at) < LIVE);
+        if heard.len() >= MAX_HEARD {
+            return;
+        }
+    }
+    heard.insert(writer, now);
+}
+
+/// What is known of an endpoint: its participant and which of its classes have a reader.
+type Known = BTreeMap<Endpoint, (GuidPrefix, [bool; CLASSES])>;
+
+/// Compares all remote readers with those known before and tells the differences.
+fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[RemoteReader]) {
+    let mut homes: HashMap<GuidPrefix, Vec<Ipv4Addr>> = HashMap::new();
+    let mut found = Known::new();
+    for reader in readers {
+        let Some((endpoint, class)) = parse_topic(&reader.topic) else {
+            continue;
+        };
+        let addresses = homes.entry(reader.participant).or_default();
+        for address in &reader.addresses {
+            if let IpAddr::V4(address) = address
+                && !addresses.contains(address)
+            {
+                addresses.push(*address);
+            }
+        }
+        // Another participant with this flow's name is a mistake of the operator; the engine tells it from Hello.
+        if endpoint != *own {
+            let entry = found.entry(endpoint).or_insert((reader.participant, [false; CLASSES]));
+            entry.1[index(class)] = true;
+        }
+    }
+    // A datagram needs all three topics, so an endpoint counts when it is complete.
+    found.retain(|_, (_, classes)| *classes == [true; CLASSES]);
+    *shared.homes.lock() = homes;
+    shared.status.lock().endpoints = found.len();
+    for endpoint in known.keys().filter(|endpoint| !found.contains_key(*endpoint)) {
+        (shared.config.sink)(TransportEvent::Lost(endpoint.clone()));
+    }
+    for endpoint in found.keys().filter(|endpoint| !known.contains_key(*endpoint)) {
+        (shared.config.sink)(TransportEvent::Discovered(endpoint.clone()));
+    }
+    *known = found;
+}
