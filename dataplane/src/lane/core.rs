@@ -136,6 +136,19 @@ impl DataCore {
         &self.topics[topic.0 as usize]
     }
 
+    /// Whether a payload of that size makes a topic `bulk`.
+    #[must_use]
+    pub fn is_large(&self, bytes: Option<u64>) -> bool {
+        bytes.is_some_and(|bytes| bytes > self.config.large_bytes)
+    }
+
+    /// Whether a bridge still empties its queue.
+    #[must_use]
+    pub fn is_draining(&self) -> bool {
+        let mut bridges = self.topics.iter().flat_map(|topic| &topic.bridges);
+        bridges.any(|bridge| matches!(bridge.phase, Phase::Draining { .. }))
+    }
+
     /// Changes what counts as large, from the next message on.
     pub fn set_large_bytes(&mut self, bytes: u64) {
         self.config.large_bytes = bytes;

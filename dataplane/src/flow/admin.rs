@@ -1,0 +1,350 @@
+//! `GET /v1/…`: what the flow knows and does, as JSON. Each answer also names the flow, its epoch and the time.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::extract::{Query, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use blaze_domain::control::{LeaseKind, rfc3339_millis};
+use blaze_domain::{Durability, Priority, Reliability, Scope, TopicName};
+use serde_json::{Map, Value, json};
+
+use super::plane::wall_ns;
+use super::{Shared, class_label};
+use crate::lane::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
+use crate::plan::Target;
+use crate::registry::{LeaseView, Terms};
+use crate::world::{Advertise, Request, World};
+
+type App = State<Arc<Shared>>;
+
+/// The routes below `/v1`.
+pub(super) fn router(shared: Arc<Shared>) -> Router {
+    Router::new()
+        .route("/v1/topics", get(topics))
+        .route("/v1/bridges", get(bridges))
+        .route("/v1/peers", get(peers))
+        .route("/v1/allocation", get(allocation))
+        .route("/v1/why", get(super::why::why))
+        .with_state(shared)
+}
+
+/// An answer with the flow's name, epoch and the time before its own members.
+pub(super) fn answer(shared: &Shared, body: Value) -> Json<Value> {
+    let mut whole = Map::new();
+    whole.insert("flow".into(), json!(shared.me));
+    whole.insert("epoch".into(), json!(shared.epoch));
+    whole.insert("time".into(), json!(rfc3339_millis(wall_ns() / 1_000_000)));
+    if let Value::Object(members) = body {
+        whole.extend(members);
+    }
+    Json(Value::Object(whole))
+}
+
+/// A refusal.
+pub(super) fn refusal(status: StatusCode, code: &str, detail: &str) -> Response {
+    (status, Json(json!({"error": {"code": code, "detail": detail}}))).into_response()
+}
+
+/// Rounds for people: three digits behind the point.
+fn rounded(value: f64) -> Value {
+    json!((value * 1000.0).round() / 1000.0)
+}
+
+async fn topics(State(shared): App) -> Json<Value> {
+    let now = Instant::now();
+    let rates: BTreeMap<TopicName, (f64, f64)> = shared.plane.read(|state| {
+        state.core.topics_mut().iter_mut().map(|path| (path.name.clone(), path.in_rate.rate(now))).collect()
+    });
+    let control = shared.control.lock();
+    let registry = control.registry();
+    let mut rows = Vec::new();
+    for topic in registry.all_topics() {
+        let mut advertised: Vec<Value> = Vec::new();
+        let mut requested: Vec<Value> = Vec::new();
+        for lease in registry.leases_of(&topic) {
+            let row = lease_row(&shared, now, &lease);
+            match lease.key.kind {
+                LeaseKind::Advertise => advertised.push(row),
+                LeaseKind::Request => requested.push(row),
+            }
+        }
+        for remote in registry.remote_leases(&topic) {
+            advertised.extend(remote.advertise.iter().flat_map(|a| remote_advertise(remote.flow, remote.scope, a)));
+            requested.extend(remote.request.iter().map(|r| remote_request(remote.flow, remote.scope, r)));
+        }
+        if advertised.is_empty() && requested.is_empty() {
+            continue;
+        }
+        let blocked = control.plans().get(&topic).is_some_and(|p| p.bridges.is_empty() && !p.blocked.is_empty());
+        let state = match (advertised.is_empty(), requested.is_empty()) {
+            (true, _) => "no_advertise",
+            (false, true) => "no_request",
+            (false, false) if blocked => "blocked",
+            (false, false) => "flowing",
+        };
+        let (rate_hz, bytes_per_s) = rates.get(&topic).copied().unwrap_or_default();
+        rows.push(json!({
+            "topic": topic, "state": state, "rate_hz": rounded(rate_hz), "bytes_per_s": bytes_per_s.round(),
+            "advertised": advertised, "requested": requested,
+        }));
+    }
+    drop(control);
+    answer(&shared, json!({"topics": rows}))
+}
+
+fn broker_of(shared: &Shared, scope: Scope) -> Value {
+    json!(shared.brokers.of(scope).map(|broker| broker.kind().as_str()))
+}
+
+fn lease_row(shared: &Shared, now: Instant, lease: &LeaseView<'_>) -> Value {
+    let key = lease.key;
+    let quality = lease.quality();
+    let mut row = json!({
+        "layer": key.layer, "node": key.node.as_ref().map_or("", |node| node.as_str()), "service": key.service,
+        "instance": key.instance, "scope": key.scope, "broker": broker_of(shared, key.scope),
+    });
+    let terms = match lease.terms {
+        Terms::Advertise { rate_hz, max_bytes, .. } => json!({"rate_hz": rate_hz, "max_bytes": max_bytes}),
+        Terms::Request { max_rate_hz, bare, from, .. } => json!({
+            "max_rate_hz": max_rate_hz, "lifespan_ms": quality.lifespan_ms, "bare": bare,
+            "from": (!from.is_any()).then(|| json!({"layer": from.layer, "node": from.node, "service": from.service})),
+        }),
+    };
+    extend(&mut row, terms);
+    extend(
+        &mut row,
+        json!({
+            "priority": quality.priority, "reliability": quality.reliability, "durability": quality.durability,
+            "expires_in_s": lease.expires_in(now).map(|left| rounded(left.as_secs_f64())), "local": true,
+        }),
+    );
+    row
+}
+
+fn extend(row: &mut Value, more: Value) {
+    if let (Value::Object(row), Value::Object(more)) = (row, more) {
+        row.extend(more);
+    }
+}
+
+/// What another flow announced: its services merged, so that per-service rates are not known.
+fn remote_advertise(flow: &blaze_domain::FlowId, scope: Scope, advertise: &Advertise) -> Vec<Value> {
+    let row = |source: &crate::world::Source| {
+        json!({
+            "layer": flow.layer, "node": source.node, "service": source.service, "instance": "", "scope": scope,
+            "broker": null, "rate_hz": advertise.rate_hz, "max_bytes": advertise.max_bytes,
+            "priority": advertise.priority, "reliability": advertise.reliability, "durability": advertise.durability,
+            "expires_in_s": null, "local": false, "flow": flow,
+        })
+    };
+    advertise.sources.iter().map(row).collect()
+}
+
+fn remote_request(flow: &blaze_domain::FlowId, scope: Scope, request: &Request) -> Value {
+    json!({
+        "layer": flow.layer, "node": if scope == Scope::Node { flow.node.as_str() } else { "" }, "service": "",
+        "instance": "", "scope": scope, "broker": null, "max_rate_hz": request.max_rate_hz,
+        "lifespan_ms": request.lifespan_ms, "bare": request.bare, "priority": request.priority,
+        "reliability": request.reliability, "durability": request.durability, "expires_in_s": null, "local": false,
+        "flow": flow,
+    })
+}
+
+async fn bridges(State(shared): App) -> Json<Value> {
+    let now = Instant::now();
+    let routes = &shared.routes;
+    // First the places, then whether they are subscribed: the two locks are never held together.
+    let mut rows = shared.plane.read(|state| {
+        let mut rows = Vec::new();
+        for (index, path) in state.core.topics().iter().enumerate() {
+            let id = TopicId(u32::try_from(index).unwrap_or(u32::MAX));
+            for bridge in path.bridges.iter().filter(|bridge| bridge.phase != Phase::Ended) {
+                rows.push((id, bridge.from, bridge_row(&shared, now, path, bridge)));
+            }
+        }
+        rows
+    });
+    for (id, from, row) in &mut rows {
+        if row["state"] == "up" && !routes.is_subscribed(*id, *from) {
+            row["state"] = json!("starting");
+        }
+    }
+    let rows: Vec<Value> = rows.into_iter().map(|(_, _, row)| row).collect();
+    answer(&shared, json!({"bridges": rows}))
+}
+
+fn scope_and_broker(shared: &Shared, scope: Scope) -> Value {
+    let broker = if scope == Scope::Inter { json!("dds") } else { broker_of(shared, scope) };
+    json!({"scope": scope, "broker": broker})
+}
+
+/// `imu/data|node>inter|cloud`; where one layer has several receivers, the receiver's node follows.
+fn bridge_id(path: &TopicPath, bridge: &BridgeState, own_layer: &str) -> String {
+    let topic = &path.name;
+    let from = bridge.from;
+    match &bridge.target {
+        Target::Node { bare: false } => format!("{topic}|{from}>node|{own_layer}"),
+        Target::Node { bare: true } => format!("{topic}|{from}>node|{own_layer}|bare"),
+        Target::Layer => format!("{topic}|{from}>layer|{own_layer}"),
+        Target::Inter { layer, receiver } => {
+            let same_layer = |other: &&BridgeState| {
+                other.from == from
+                    && other.phase != Phase::Ended
+                    && other.receiver().is_some_and(|(other_layer, _)| other_layer == layer)
+            };
+            let several = path.bridges.iter().filter(same_layer).count() > 1;
+            let node = if several { format!("|{}", receiver.node) } else { String::new() };
+            format!("{topic}|{from}>inter|{layer}{node}")
+        }
+    }
+}
+
+fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeState) -> Value {
+    let (state, since) = match bridge.phase {
+        Phase::Up { since } => ("up", now.saturating_duration_since(since).as_secs_f64()),
+        Phase::Draining { .. } | Phase::Ended => ("draining", 0.0),
+    };
+    let (to_scope, layer, flow) = match &bridge.target {
+        Target::Node { .. } => (Scope::Node, shared.me.layer.to_string(), shared.me.to_string()),
+        Target::Layer => (Scope::Layer, shared.me.layer.to_string(), shared.me.to_string()),
+        Target::Inter { layer, receiver } => (Scope::Inter, layer.to_string(), receiver.to_string()),
+    };
+    let mut to = scope_and_broker(shared, to_scope);
+    extend(&mut to, json!({"layer": layer, "flow": flow}));
+    let dropped: Map<String, Value> =
+        bridge.stats.dropped.iter().map(|(reason, count)| (reason.to_string(), json!(count))).collect();
+    let class = match bridge.sink {
+        Sink::Lane { class, .. } => json!(class),
+        Sink::Publish { .. } => Value::Null,
+    };
+    json!({
+        "id": bridge_id(path, bridge, shared.me.layer.as_str()), "topic": path.name,
+        "from": scope_and_broker(shared, bridge.from), "to": to, "state": state, "since_s": rounded(since),
+        "in": {"messages": bridge.stats.taken.messages, "bytes": bridge.stats.taken.bytes},
+        "out": {"messages": bridge.stats.out.messages, "bytes": bridge.stats.out.bytes},
+        "queued": bridge.stats.queued(), "dropped": dropped,
+        "latency_ms": {
+            "p50": bridge.stats.latency.quantile_ms(0.5), "p99": bridge.stats.latency.quantile_ms(0.99),
+        },
+        "class": class, "reliable": bridge.lane.reliable, "max_rate_hz": bridge.lane.max_rate_hz,
+        "lifespan_ms": bridge.lane.lifespan_ms,
+    })
+}
+
+async fn peers(State(shared): App) -> Json<Value> {
+    let now = Instant::now();
+    let peers = shared.plane.read(|state| state.engine.as_ref().map(|engine| engine.peers(now)).unwrap_or_default());
+    let control = shared.control.lock();
+    let rows: Vec<Value> = peers
+        .iter()
+        .map(|peer| {
+            json!({
+                "flow": peer.flow, "layer": peer.flow.layer, "kind": peer.kind, "epoch": peer.epoch,
+                "version": peer.registry_version, "state": peer.state.as_str(),
+                "last_heard_ms": peer.last_heard.map(|at| rounded(now.saturating_duration_since(at).as_secs_f64() * 1e3)),
+                "rtt_ms": peer.rtt.map(|rtt| rounded(rtt.as_secs_f64() * 1e3)),
+                "clock_offset_ms": peer.clock_offset_ns.map(|ns| rounded(ns as f64 / 1e6)),
+                "clock_error_ms": peer.clock_error_ns.map(|ns| rounded(ns as f64 / 1e6)),
+                "loss": rounded(peer.loss), "address": peer.address,
+                "in_step": control.registry().is_in_step_with(&peer.flow),
+                "outstanding_bytes": peer.outstanding_bytes, "window_bytes": peer.window_bytes,
+            })
+        })
+        .collect();
+    drop(control);
+    answer(&shared, json!({"peers": rows}))
+}
+
+async fn allocation(State(shared): App) -> Json<Value> {
+    let now = Instant::now();
+    let limit_mbps = shared.live.lock().limit_mbps;
+    let mut traffic = shared.egress.traffic();
+    let rows = shared.plane.read(|state| {
+        let mut rows = Vec::new();
+        let mut payload = 0.0;
+        for path in state.core.topics_mut() {
+            if let Some(row) = allocation_row(now, path, &mut payload) {
+                rows.push(row);
+            }
+        }
+        (rows, payload)
+    });
+    let (rows, payload) = rows;
+    let links: BTreeMap<String, f64> = traffic.by_destination.iter_mut().fold(BTreeMap::new(), |mut links, to| {
+        *links.entry(to.flow.layer.to_string()).or_default() += to.rate.rate(now).1;
+        links
+    });
+    let wire: f64 = links.values().sum();
+    // F9: s·α with the overhead factor α = 1.02.
+    let factor = if payload > 0.0 { rounded(wire / (payload * 1.02)) } else { Value::Null };
+    let links: Vec<Value> = links
+        .into_iter()
+        .map(|(layer, rate)| json!({"layer": layer, "limit_bytes_per_s": null, "wire_bytes_per_s": rate.round()}))
+        .collect();
+    answer(
+        &shared,
+        json!({
+            "limit_mbps": limit_mbps, "budget_bytes_per_s": shared.egress.budget(), "measured_bytes_per_s": null,
+            "wire_factor": factor, "feasible": null, "wire_bytes": traffic.wire_bytes,
+            "control_wire_bytes": traffic.control_bytes, "topics": rows, "links": links,
+        }),
+    )
+}
+
+/// One topic that leaves on the inter scope. Lanes are not allocated a rate yet, so `allocated_hz` is what requesters ask.
+fn allocation_row(now: Instant, path: &mut TopicPath, payload_bytes_per_s: &mut f64) -> Option<Value> {
+    let mut lanes = Vec::new();
+    let mut class = None;
+    let size = path.size_bytes();
+    for bridge in path.bridges.iter_mut().filter(|bridge| bridge.phase != Phase::Ended) {
+        let Some(layer) = bridge.receiver().map(|(layer, _)| layer.clone()) else { continue };
+        let (hz, bytes) = bridge.out_rate.rate(now);
+        *payload_bytes_per_s += bytes;
+        if let Sink::Lane { class: lane_class, .. } = bridge.sink {
+            class = Some(lane_class);
+        }
+        lanes.push(json!({
+            "layer": layer, "allocated_hz": bridge.lane.max_rate_hz, "actual_hz": rounded(hz),
+            "skipped": bridge.stats.dropped.total(),
+        }));
+    }
+    if lanes.is_empty() {
+        return None;
+    }
+    let advertised = path.info.rate_hz.unwrap_or_else(|| path.in_rate.rate(now).0);
+    let class = if class == Some(Priority::Bulk) { "large" } else { "standard" };
+    Some(json!({
+        "topic": path.name, "class": class, "size_bytes": size, "advertised_hz": rounded(advertised), "lanes": lanes,
+    }))
+}
+
+/// Largest topic name plus room for `to`: anything longer is no question.
+const MAX_QUERY: usize = 1024;
+
+/// `topic` and `to` of a question, checked for length.
+pub(super) fn query_text(query: &Query<BTreeMap<String, String>>, key: &str) -> Option<String> {
+    query.get(key).filter(|text| text.len() <= MAX_QUERY).cloned()
+}
+
+/// What an advertise says about quality, for steps of `why`.
+pub(super) fn describe(advertise: &Advertise) -> String {
+    let durable = if advertise.durability == Durability::TransientLocal { ", transient_local" } else { "" };
+    let reliable = if advertise.reliability == Reliability::Reliable { "reliable" } else { "best_effort" };
+    let sources: Vec<_> = advertise.sources.iter().map(|source| source.service.as_str()).collect();
+    format!("{} ({reliable}{durable})", sources.join(", "))
+}
+
+/// Whether any flow knows the topic.
+pub(super) fn known(world: &World, topic: &TopicName) -> bool {
+    world.flows.values().any(|flow| flow.topics.contains_key(topic))
+}
+
+/// The class labels, for metrics.
+pub(super) fn classes() -> [&'static str; 3] {
+    [class_label(0), class_label(1), class_label(2)]
+}

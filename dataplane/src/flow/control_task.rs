@@ -1,0 +1,190 @@
+//! The task that drives the control core: control channels and link news in, answers, plans and registry messages out.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use blaze_brokers::{Broker, BrokerError, Content, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription};
+use blaze_domain::Scope;
+use blaze_domain::names::ChannelName;
+use bytes::Bytes;
+use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
+
+use super::Shared;
+use super::plane::wall_ns;
+use crate::control::Output;
+use crate::link::engine::HelloState;
+use crate::world::FlowState;
+
+/// How often what is due is looked for.
+const TICK: Duration = Duration::from_millis(20);
+/// Between attempts to subscribe to a broker that is away.
+const RETRY: Duration = Duration::from_millis(250);
+/// Control payloads that are taken at once, and that wait at most.
+const BATCH: usize = 64;
+const MAX_WAITING: usize = 4096;
+/// Reply channels whose writers are kept.
+const MAX_WRITERS: usize = 1024;
+
+/// Milliseconds since 1970.
+fn wall_ms() -> u64 {
+    wall_ns() / 1_000_000
+}
+
+/// Drives the control core until the flow drains.
+pub(super) struct ControlTask {
+    pub(super) shared: Arc<Shared>,
+    pub(super) ready: Arc<Notify>,
+    pub(super) writers: HashMap<(Scope, ChannelName), Arc<dyn Publisher>>,
+    pub(super) draining: CancellationToken,
+}
+
+impl ControlTask {
+    pub(super) async fn run(mut self) {
+        let mut node = ControlChannel::new(self.shared.brokers.node.clone());
+        let mut layer = ControlChannel::new(self.shared.brokers.layer.clone());
+        let mut tick = tokio::time::interval(TICK);
+        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let mut announced = false;
+        let mut batch: Vec<Received> = Vec::new();
+        loop {
+            let mut scope = None;
+            tokio::select! {
+                () = self.draining.cancelled() => break,
+                _ = tick.tick() => {}
+                () = self.shared.plane.news() => {}
+                () = node.receive(&mut batch) => scope = Some(Scope::Node),
+                () = layer.receive(&mut batch) => scope = Some(Scope::Layer),
+            }
+            if let Some(scope) = scope {
+                self.take_control(scope, &mut batch);
+            }
+            if !announced && node.is_settled() && layer.is_settled() {
+                announced = true;
+                self.shared.control.lock().announce_start(wall_ms());
+            }
+            self.work();
+        }
+        self.shared.control.lock().start_draining(Instant::now(), wall_ms());
+        self.work();
+    }
+
+    fn take_control(&self, scope: Scope, batch: &mut Vec<Received>) {
+        let mut control = self.shared.control.lock();
+        for received in batch.drain(..) {
+            match received.content {
+                Content::Bare { payload, .. } => control.control(Instant::now(), wall_ms(), scope, &payload),
+                // Control channels carry JSON as it is.
+                Content::Frame(_) | Content::Malformed { .. } => control.refused += 1,
+            }
+        }
+    }
+
+    fn work(&mut self) {
+        let now = Instant::now();
+        let mut outputs = Vec::new();
+        {
+            let mut control = self.shared.control.lock();
+            for event in self.shared.plane.take_news() {
+                if let crate::link::engine::LinkEvent::Addresses(addresses) = &event {
+                    if let Some(transport) = &self.shared.transport {
+                        transport.learn(addresses);
+                    }
+                }
+                control.link_event(now, event);
+            }
+            control.tick(now, wall_ms());
+            outputs.extend(std::iter::from_fn(|| control.poll()));
+        }
+        for output in outputs {
+            self.carry_out(now, output);
+        }
+        // A flow without an inter scope has no pacer that would do it.
+        self.shared.plane.with(|state| state.run_timers(now));
+    }
+
+    fn carry_out(&mut self, now: Instant, output: Output) {
+        let plane = &self.shared.plane;
+        match output {
+            Output::Publish { scope, channel, body } => self.publish(scope, channel, &body),
+            Output::Link { to, body } => {
+                plane.with(|state| state.engine.as_mut().map(|engine| engine.send_control(now, &to, body)));
+            }
+            Output::Announce { version, digest } => {
+                plane.with(|state| state.engine.as_mut().map(|engine| engine.set_registry(now, version, digest)));
+            }
+            Output::State(flow_state) => {
+                let said = match flow_state {
+                    FlowState::Starting => HelloState::Starting,
+                    FlowState::Ready => HelloState::Ready,
+                    FlowState::Draining => HelloState::Draining,
+                };
+                plane.with(|state| state.engine.as_mut().map(|engine| engine.set_state(now, said)));
+                if flow_state == FlowState::Ready {
+                    self.ready.notify_one();
+                }
+            }
+            Output::Plan { topic, plan, info } => self.shared.routes.apply(&topic, &plan, *info),
+        }
+    }
+
+    fn publish(&mut self, scope: Scope, channel: ChannelName, body: &Bytes) {
+        let Some(broker) = self.shared.brokers.of(scope) else { return };
+        if self.writers.len() >= MAX_WRITERS {
+            self.writers.clear();
+        }
+        let key = (scope, channel);
+        let writer = match self.writers.get(&key) {
+            Some(writer) => Arc::clone(writer),
+            None => match broker.publisher(&key.1, PublisherOptions::default()) {
+                Ok(writer) => {
+                    self.writers.insert(key, Arc::clone(&writer));
+                    writer
+                }
+                Err(error) => {
+                    tracing::warn!(channel = %key.1, %error, "cannot answer");
+                    return;
+                }
+            },
+        };
+        writer.publish_bare(body);
+    }
+}
+
+/// The control channel of one scope, subscribed anew whenever it ends.
+struct ControlChannel {
+    broker: Option<Arc<dyn Broker>>,
+    subscription: Option<Subscription>,
+}
+
+impl ControlChannel {
+    fn new(broker: Option<Arc<dyn Broker>>) -> Self {
+        Self { broker, subscription: None }
+    }
+
+    /// Whether it is subscribed, or there is none.
+    fn is_settled(&self) -> bool {
+        self.broker.is_none() || self.subscription.is_some()
+    }
+
+    /// Waits for payloads; returns also when it has just been subscribed. Without a broker it never returns.
+    async fn receive(&mut self, batch: &mut Vec<Received>) {
+        let Some(broker) = &self.broker else { return std::future::pending().await };
+        if let Some(subscription) = &mut self.subscription {
+            if subscription.receive(batch, BATCH).await > 0 {
+                return;
+            }
+            self.subscription = None;
+        }
+        let options = SubscribeOptions { max_messages: MAX_WAITING, ..SubscribeOptions::default() };
+        match broker.subscribe(&ChannelName::control(), options).await {
+            Ok(subscription) => self.subscription = Some(subscription),
+            Err(BrokerError::Closed) => std::future::pending().await,
+            Err(error) => {
+                tracing::debug!(%error, "cannot subscribe to the control channel, trying on");
+                tokio::time::sleep(RETRY).await;
+            }
+        }
+    }
+}

@@ -1,0 +1,345 @@
+//! One BlazeFlow process, or one of several in a process: tasks, threads, brokers and the link around the pure cores.
+//!
+//! | who | what | how many |
+//! |---|---|---|
+//! | control task | control channels, link news → control core → answers, plans | 1 |
+//! | source task | one topic of one local scope → message path | per topic and scope that is read |
+//! | pacer thread | link engine → transport, within the budget | 1 |
+//! | transport threads | transport → link engine → message path → brokers | 3 readers and DDS's own |
+//! | admin task | `/livez`, `/readyz`, `/metrics`, `/v1/…` | 1 and one per connection |
+
+mod admin;
+mod control_task;
+mod metrics;
+pub mod pacing;
+pub mod plane;
+mod routes;
+pub mod settings;
+
+use std::collections::HashMap;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use blaze_brokers::{Broker, Health};
+use blaze_domain::{FlowId, Priority};
+use blaze_runtime::admin::{AdminServer, CheckState, Readiness};
+use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
+use parking_lot::Mutex;
+use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
+
+use crate::control::{ControlConfig, ControlCore};
+use crate::lane::core::{DataConfig, DataCore};
+use crate::link::dds::{DdsConfig, DdsStatus, DdsTransport};
+use crate::link::engine::{Engine, EngineConfig};
+use crate::link::transport::{Endpoint, Transport};
+use crate::world::LayerScopeId;
+use pacing::Egress;
+use plane::{Plane, wall_ns};
+pub use routes::LocalBrokers;
+use routes::Routes;
+use settings::{FlowSettings, InterSettings, LiveSettings};
+
+/// The layer broker of a flow, and who shares it.
+#[derive(Clone)]
+pub struct LayerBroker {
+    /// The broker.
+    pub broker: Arc<dyn Broker>,
+    /// Flows of the layer with an equal identity share it.
+    pub id: LayerScopeId,
+}
+
+/// What a flow is started with.
+pub struct FlowOptions {
+    /// From the node file.
+    pub settings: FlowSettings,
+    /// Broker of the node scope.
+    pub node: Option<Arc<dyn Broker>>,
+    /// Broker of the layer scope.
+    pub layer: Option<LayerBroker>,
+    /// Where the epoch is kept; `None`: the clock alone gives it.
+    pub state_dir: Option<PathBuf>,
+}
+
+/// The inter scope's transport and what it says of itself.
+pub(crate) struct InterTransport {
+    dds: DdsTransport,
+}
+
+impl InterTransport {
+    fn learn(&self, addresses: &[String]) {
+        self.dds.learn_addresses(addresses);
+    }
+
+    fn status(&self) -> DdsStatus {
+        self.dds.status()
+    }
+}
+
+/// What the parts of one flow share.
+pub(crate) struct Shared {
+    pub(crate) me: FlowId,
+    pub(crate) epoch: u64,
+    pub(crate) plane: Arc<Plane>,
+    pub(crate) control: Mutex<ControlCore>,
+    pub(crate) routes: Routes,
+    pub(crate) brokers: LocalBrokers,
+    pub(crate) transport: Option<InterTransport>,
+    pub(crate) egress: Arc<Egress>,
+    pub(crate) live: Mutex<LiveSettings>,
+    pub(crate) readiness: Readiness,
+}
+
+/// A flow that runs.
+pub struct RunningFlow {
+    shared: Arc<Shared>,
+    supervisor: Supervisor,
+    admin: SocketAddr,
+    draining: CancellationToken,
+    pacer: Option<blaze_runtime::supervisor::ThreadHandle>,
+}
+
+/// How long a flow takes at most to let out what is queued.
+const DRAIN: Duration = Duration::from_millis(600);
+/// How long its good-bye may take to leave.
+const GOODBYE: Duration = Duration::from_millis(100);
+/// How often the health of brokers and link is looked at.
+const HEALTH: Duration = Duration::from_millis(200);
+
+/// Starts a flow. It returns as soon as the admin port listens; [`RunningFlow::ready`] waits for the rest.
+///
+/// # Errors
+/// When the admin port cannot be bound, the epoch cannot be kept or the inter scope's configuration can never work.
+pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Result<RunningFlow> {
+    let FlowOptions { settings, node, layer, state_dir } = options;
+    let epochs = Arc::new(Epochs { me: settings.me.clone(), state_dir });
+    let epoch = epochs.next().context("keeping the epoch")?;
+    let now = Instant::now();
+    let layer_scope = layer.as_ref().map(|layer| layer.id);
+
+    let core = DataCore::new(DataConfig {
+        me: settings.me.clone(),
+        epoch,
+        large_bytes: settings.live.large_bytes,
+        salt: rand::random(),
+    });
+    let engine = settings.inter.as_ref().map(|inter| {
+        let max_datagram = crate::link::dds::max_datagram_bytes(inter.mtu.into(), inter.chunking, inter.listen_address());
+        let config = EngineConfig::new(settings.me.clone(), settings.kind, epoch, layer_scope, max_datagram);
+        Engine::new(config, now, wall_ns())
+    });
+    let plane = Plane::new(core, engine);
+    let transport = settings.inter.as_ref().map(|inter| connect(inter, &settings.me, epoch, &epochs, &plane)).transpose()?;
+    if let Some(transport) = &transport {
+        let addresses = transport.dds.addresses();
+        plane.with(|state| state.engine.as_mut().map(|engine| engine.set_addresses(addresses)));
+    }
+
+    let control = ControlCore::new(
+        ControlConfig {
+            me: settings.me.clone(),
+            kind: settings.kind,
+            epoch,
+            node_scope: node.is_some(),
+            layer_scope,
+            inter_scope: settings.inter.is_some(),
+            layer_answers_need_id: false,
+            rules: settings.live.rules.clone(),
+        },
+        now,
+    );
+    let brokers = LocalBrokers { node, layer: layer.map(|layer| layer.broker) };
+    let egress = Egress::new(settings.live.budget_bytes_per_s());
+    let readiness = readiness(&brokers, transport.is_some());
+    let shared = Arc::new(Shared {
+        me: settings.me.clone(),
+        epoch,
+        routes: Routes::new(Arc::clone(&plane), brokers.clone(), supervisor.clone()),
+        plane,
+        control: Mutex::new(control),
+        brokers,
+        transport,
+        egress,
+        live: Mutex::new(settings.live),
+        readiness: readiness.clone(),
+    });
+
+    let metrics_of = Arc::clone(&shared);
+    let admin = AdminServer::bind(
+        settings.admin,
+        admin::router(Arc::clone(&shared)),
+        readiness,
+        Arc::new(move || metrics::render(&metrics_of)),
+        &supervisor,
+    )
+    .await
+    .with_context(|| format!("admin port {}", settings.admin))?;
+
+    let ready = Arc::new(Notify::new());
+    let draining = CancellationToken::new();
+    let task = control_task::ControlTask {
+        shared: Arc::clone(&shared),
+        ready: Arc::clone(&ready),
+        writers: HashMap::new(),
+        draining: draining.clone(),
+    };
+    supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
+    supervisor.spawn("health", TaskPolicy::Essential, watch_health(Arc::clone(&shared), ready));
+    let pacer = shared.transport.is_some().then(|| {
+        let shared = Arc::clone(&shared);
+        supervisor.spawn_thread("pacer", TaskPolicy::MayEnd, move || {
+            if let Some(transport) = &shared.transport {
+                shared.egress.run(&shared.plane, &transport.dds);
+            }
+        })
+    });
+    Ok(RunningFlow { shared, supervisor, admin: admin.address(), draining, pacer })
+}
+
+impl RunningFlow {
+    /// The admin port that was bound.
+    #[must_use]
+    pub fn admin(&self) -> SocketAddr {
+        self.admin
+    }
+
+    /// Layer and node.
+    #[must_use]
+    pub fn id(&self) -> &FlowId {
+        &self.shared.me
+    }
+
+    /// Waits until all checks of `/readyz` are well.
+    pub async fn ready(&self) {
+        self.shared.readiness.wait_ready().await;
+    }
+
+    /// Whether all checks of `/readyz` are well.
+    #[must_use]
+    pub fn readiness(&self) -> &Readiness {
+        &self.shared.readiness
+    }
+
+    /// Takes new limits and rules.
+    pub fn reload(&self, live: LiveSettings) {
+        let now = Instant::now();
+        self.shared.egress.set_budget(live.budget_bytes_per_s());
+        self.shared.plane.read(|state| state.core.set_large_bytes(live.large_bytes));
+        self.shared.control.lock().set_rules(now, live.rules.clone());
+        *self.shared.live.lock() = live;
+    }
+
+    /// Drains: takes in nothing more, lets out what is queued, says good-bye, ends.
+    pub async fn shutdown(mut self) {
+        self.shared.readiness.set_draining();
+        self.draining.cancel();
+        let until = Instant::now() + DRAIN;
+        let still_draining = || {
+            self.shared.plane.with(|state| {
+                state.run_timers(Instant::now());
+                state.core.is_draining()
+            })
+        };
+        while Instant::now() < until && still_draining() {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        self.shared.plane.with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
+        if self.shared.transport.is_some() {
+            tokio::time::sleep(GOODBYE).await;
+        }
+        self.shared.routes.stop();
+        self.shared.egress.stop();
+        self.shared.plane.wake();
+        if let Some(pacer) = self.pacer.take() {
+            pacer.join().await;
+        }
+        self.supervisor.shutdown(Duration::from_secs(1)).await;
+    }
+}
+
+fn connect(
+    inter: &InterSettings,
+    me: &FlowId,
+    epoch: u64,
+    epochs: &Arc<Epochs>,
+    plane: &Arc<Plane>,
+) -> anyhow::Result<InterTransport> {
+    let sink = Arc::clone(plane);
+    let epochs = Arc::clone(epochs);
+    let dds = DdsTransport::start(DdsConfig {
+        domain: inter.domain,
+        listen: inter.listen_address(),
+        peers: inter.peers.iter().map(ToString::to_string).collect(),
+        peer_slots: inter.peer_slots,
+        mtu: inter.mtu.into(),
+        chunking: inter.chunking,
+        local: Endpoint { flow: me.clone(), epoch },
+        next_epoch: Arc::new(move || epochs.next().unwrap_or_else(|_| wall_ns() / 1_000_000)),
+        sink: Arc::new(move |event| sink.transport_event(event)),
+    })
+    .context("brokers.inter.dds")?;
+    Ok(InterTransport { dds })
+}
+
+/// Gives this flow's epochs: the clock in milliseconds, and always larger than the last.
+struct Epochs {
+    me: FlowId,
+    state_dir: Option<PathBuf>,
+}
+
+impl Epochs {
+    fn next(&self) -> std::io::Result<u64> {
+        match &self.state_dir {
+            Some(dir) => blaze_runtime::state::next_epoch(dir, self.me.layer.as_str(), self.me.node.as_str()),
+            None => Ok(wall_ns() / 1_000_000),
+        }
+    }
+}
+
+fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {
+    let mut checks = Vec::new();
+    if brokers.node.is_some() {
+        checks.push("node_broker");
+    }
+    if brokers.layer.is_some() {
+        checks.push("layer_broker");
+    }
+    if inter {
+        checks.push("inter");
+    }
+    Readiness::new(&checks, &["config"])
+}
+
+/// Keeps the checks of `/readyz` true to brokers and link.
+async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>) {
+    let mut listened = false;
+    loop {
+        for (check, broker) in [("node_broker", &shared.brokers.node), ("layer_broker", &shared.brokers.layer)] {
+            let Some(broker) = broker else { continue };
+            let status = broker.status().borrow().clone();
+            let state = if status.health == Health::Up { CheckState::Ok } else { CheckState::Failed };
+            shared.readiness.set(check, state, &status.detail);
+        }
+        if let Some(transport) = &shared.transport {
+            let status = transport.status();
+            let (state, detail) = match (status.ready, listened) {
+                (true, true) => (CheckState::Ok, status.detail),
+                (true, false) => (CheckState::Failed, "listening for other flows".to_owned()),
+                (false, _) => (CheckState::Failed, status.detail),
+            };
+            shared.readiness.set("inter", state, &detail);
+        }
+        tokio::select! {
+            () = tokio::time::sleep(HEALTH) => {}
+            () = ready.notified() => listened = true,
+        }
+    }
+}
+
+/// Classes in the order of [`Priority::ALL`], for labels.
+pub(crate) fn class_label(index: usize) -> &'static str {
+    Priority::ALL.get(index).map_or("", |class| class.as_str())
+}
