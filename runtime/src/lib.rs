@@ -1,1 +1,21 @@
-//! Placeholder.
+//! What every process of BlazeAIoT needs and no domain logic: configuration, supervised tasks, an orderly shutdown,
+//! logs, the admin port, small state on disk.
+//!
+//! ```text
+//! main: config ▶ logs ▶ Supervisor ▶ AdminServer ▶ (the program's parts) ▶ ready_line ▶ Supervisor::run ▶ exit code
+//! ```
+
+pub mod admin;
+pub mod config;
+pub mod environment;
+pub mod logs;
+mod ready;
+pub mod state;
+pub mod supervisor;
+
+pub use admin::{AdminServer, CheckStatus, Gate, Readiness};
+pub use ready::ready_line;
+pub use supervisor::{
+    ShutdownPhase, ShutdownReport, ShutdownSteps, StopOnDrop, Supervisor, TaskEnd, TaskHandle, TaskInfo, TaskPolicy,
+    block_on, exit_code,
+};

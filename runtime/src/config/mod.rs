@@ -1,0 +1,80 @@
+//! The configuration of a process: from files, environment and options to a typed value, and again when it changes.
+//!
+//! ```text
+//! file ─┐
+//! BLAZE__… ─┼─▶ Document (tree + place of every value) ──[schema]──▶ Loaded<T>  or  every fault, each FILE:LINE
+//! --set ─┘                                                   ▲
+//!                 directory events, SIGHUP, polling ──[watch]─┘ a faulty change changes nothing
+//! ```
+//!
+//! This module knows no key of any section: the schema is a function that its caller brings.
+
+mod document;
+mod place;
+#[cfg(test)]
+mod tests;
+mod watch;
+mod yaml;
+
+use std::sync::Arc;
+
+use serde_json::Value;
+
+pub use document::{Document, MAX_FILE_BYTES, Sources, parse_override};
+pub use place::{LocatedFault, Place};
+pub use watch::{Current, WatchSettings, watch};
+
+/// A path and what is to be said of it.
+pub type Remark = (String, String);
+
+/// Reads a tree into a type: the value and warnings, or every fault.
+pub type Schema<T> = Arc<dyn Fn(&Value) -> Result<(T, Vec<Remark>), Vec<Remark>> + Send + Sync>;
+
+/// A configuration that has no fault.
+#[derive(Debug, Clone)]
+pub struct Loaded<T> {
+    /// What it says.
+    pub value: T,
+    /// The tree that it was read from.
+    pub document: Document,
+    /// What is allowed and should be known, in the order of the lines.
+    pub warnings: Vec<LocatedFault>,
+}
+
+/// Reads all sources by a schema.
+///
+/// # Errors
+/// Every fault of form and of the schema, in the order of the lines.
+pub fn load_typed<T>(sources: &Sources, schema: &Schema<T>) -> Result<Loaded<T>, Vec<LocatedFault>> {
+    judge(Document::load_with_faults(sources), schema)
+}
+
+fn judge<T>(
+    (document, mut faults): (Option<Document>, Vec<LocatedFault>),
+    schema: &Schema<T>,
+) -> Result<Loaded<T>, Vec<LocatedFault>> {
+    let read = document.map(|document| (schema(document.value()), document));
+    match read {
+        Some((Ok((value, remarks)), document)) if faults.is_empty() => {
+            let mut warnings = located(&document, remarks);
+            warnings.sort();
+            return Ok(Loaded {
+                value,
+                document,
+                warnings,
+            });
+        }
+        Some((Err(remarks), document)) => faults.extend(located(&document, remarks)),
+        Some((Ok(_), _)) | None => {}
+    }
+    faults.sort();
+    faults.dedup();
+    Err(faults)
+}
+
+fn located(document: &Document, remarks: Vec<Remark>) -> Vec<LocatedFault> {
+    remarks
+        .into_iter()
+        .map(|(path, detail)| document.fault(path, detail))
+        .collect()
+}

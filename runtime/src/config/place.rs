@@ -1,0 +1,145 @@
+//! Where a value of the configuration comes from, and faults that say so.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::Arc;
+
+/// Where a value comes from.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Place {
+    /// Nowhere in particular: there is no file.
+    Nowhere,
+    /// A line of a file, counted from 1; 0: the file as a whole.
+    File {
+        /// The file as it was named.
+        file: Arc<str>,
+        /// The line.
+        line: usize,
+    },
+    /// A variable of the environment.
+    Environment(Arc<str>),
+    /// An override on the command line: its path, without the value.
+    Override(Arc<str>),
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Nowhere => f.write_str("configuration"),
+            Self::File { file, line: 0 } => f.write_str(file),
+            Self::File { file, line } => write!(f, "{file}:{line}"),
+            Self::Environment(name) => write!(f, "environment {name}"),
+            Self::Override(path) => write!(f, "--set {path}"),
+        }
+    }
+}
+
+/// A fault or a warning, with its place: `FILE:LINE: flow.bandwidth.limit_mbps: …`.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct LocatedFault {
+    /// Where it stands.
+    pub place: Place,
+    /// Which value, such as `flow.topics[0].match`; empty: the whole.
+    pub path: String,
+    /// What is wrong with it.
+    pub detail: String,
+}
+
+impl fmt::Display for LocatedFault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: ", self.place)?;
+        if !self.path.is_empty() {
+            write!(f, "{}: ", self.path)?;
+        }
+        f.write_str(&self.detail)
+    }
+}
+
+impl std::error::Error for LocatedFault {}
+
+/// The place of every value of a document, by its path.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Places {
+    by_path: BTreeMap<String, Place>,
+}
+
+impl Places {
+    pub(super) fn set(&mut self, path: &str, place: Place) {
+        self.by_path.insert(path.to_owned(), place);
+    }
+
+    pub(super) fn knows(&self, path: &str) -> bool {
+        self.by_path.contains_key(path)
+    }
+
+    /// Forgets what stands below a path, for its value is replaced.
+    pub(super) fn forget_below(&mut self, path: &str) {
+        let below = |key: &str| key.strip_prefix(path).is_some_and(|rest| rest.starts_with(['.', '[']));
+        self.by_path.retain(|key, _| !below(key));
+    }
+
+    /// The place of a path, or of the nearest ancestor that has one.
+    pub(super) fn locate(&self, path: &str) -> Place {
+        let mut path = path;
+        loop {
+            if let Some(place) = self.by_path.get(path) {
+                return place.clone();
+            }
+            if path.is_empty() {
+                return Place::Nowhere;
+            }
+            path = path.rfind(['.', '[']).map_or("", |end| &path[..end]);
+        }
+    }
+}
+
+/// The path of a key below a path.
+pub(super) fn join(path: &str, key: &str) -> String {
+    if path.is_empty() {
+        key.to_owned()
+    } else {
+        format!("{path}.{key}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn missing_paths_have_the_place_of_their_ancestor() {
+        let line = |line| Place::File {
+            file: Arc::from("a.yaml"),
+            line,
+        };
+        let mut places = Places::default();
+        assert_eq!(places.locate("flow"), Place::Nowhere);
+        places.set("", line(1));
+        places.set("flow", line(2));
+        places.set("flow.topics[0]", line(5));
+        places.set("flower", line(9));
+        assert_eq!(places.locate("node.name"), line(1));
+        assert_eq!(places.locate("flow.bandwidth.links.cloud"), line(2));
+        assert_eq!(places.locate("flow.topics[0].match"), line(5));
+        assert_eq!(places.locate("flow.topics[10].match"), line(2));
+        places.forget_below("flow");
+        assert_eq!(places.locate("flow.topics[0]"), line(2));
+        assert_eq!(places.locate("flower"), line(9));
+    }
+
+    #[test]
+    fn a_fault_reads_as_documented() {
+        let fault = LocatedFault {
+            place: Place::File {
+                file: Arc::from("blaze.yaml"),
+                line: 12,
+            },
+            path: "flow.bandwidth.limit_mbps".to_owned(),
+            detail: "expected a number".to_owned(),
+        };
+        assert_eq!(
+            fault.to_string(),
+            "blaze.yaml:12: flow.bandwidth.limit_mbps: expected a number"
+        );
+    }
+}

@@ -1,0 +1,282 @@
+//! Reads the configuration again when its file changes.
+//!
+//! Three triggers, each enough alone: events of the file's directory (a Kubernetes ConfigMap swaps a symlink there, so
+//! the file itself is never written), SIGHUP, and a slow poll of the content that repairs what an event missed.
+
+use std::collections::BTreeMap;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use notify::event::{AccessKind, AccessMode, EventKind};
+use notify::{RecommendedWatcher, RecursiveMode, Watcher};
+use serde_json::Value;
+use tokio::sync::{mpsc, watch as channel};
+use tokio::time::{Instant, MissedTickBehavior};
+
+use super::{Document, Loaded, LocatedFault, Schema, Sources, judge};
+use crate::supervisor::{Supervisor, TaskPolicy};
+
+/// How changes are noticed.
+#[derive(Debug, Clone)]
+pub struct WatchSettings {
+    /// Quiet time after an event before the file is read: an editor writes in several steps.
+    pub debounce: Duration,
+    /// Between two looks at the content.
+    pub poll: Duration,
+    /// Whether events of the directory are used.
+    pub directory_events: bool,
+    /// Whether SIGHUP reads the file again; at most one watch of a process needs it.
+    pub hangup: bool,
+}
+
+impl Default for WatchSettings {
+    fn default() -> Self {
+        Self {
+            debounce: Duration::from_millis(100),
+            poll: Duration::from_secs(2),
+            directory_events: true,
+            hangup: true,
+        }
+    }
+}
+
+/// The configuration that holds now.
+#[derive(Debug)]
+pub struct Current<T> {
+    /// The last one without faults.
+    pub loaded: Arc<Loaded<T>>,
+    /// Why what the file says now does not hold; `None`: it does.
+    pub faults: Option<Arc<[LocatedFault]>>,
+    /// Counts the readings that were told, from 0 for the first.
+    pub serial: u64,
+}
+
+impl<T> Clone for Current<T> {
+    fn clone(&self) -> Self {
+        Self {
+            loaded: Arc::clone(&self.loaded),
+            faults: self.faults.clone(),
+            serial: self.serial,
+        }
+    }
+}
+
+/// Watches the file of `sources` (which the caller has [pinned](Sources::pinned)) from `initial` on. Each change of the
+/// content and each SIGHUP is told to the receiver once, faulty or not; the last good value stays.
+#[must_use]
+pub fn watch<T: Send + Sync + 'static>(
+    supervisor: &Supervisor,
+    sources: Sources,
+    schema: Schema<T>,
+    initial: Loaded<T>,
+    settings: WatchSettings,
+) -> channel::Receiver<Current<T>> {
+    let seen = Ok(initial
+        .document
+        .file()
+        .zip(initial.document.text())
+        .map(|(file, text)| (Arc::from(file.display().to_string()), Arc::clone(text))));
+    let (tell, told) = channel::channel(Current {
+        loaded: Arc::new(initial),
+        faults: None,
+        serial: 0,
+    });
+    let stop = supervisor.shutdown_token();
+    let task = Task {
+        sources,
+        schema,
+        tell,
+        seen,
+    };
+    supervisor.spawn("configuration watch", TaskPolicy::Essential, async move {
+        tokio::select! {
+            () = task.run(settings) => {}
+            () = stop.cancelled() => {}
+        }
+    });
+    told
+}
+
+/// Name and text of the file, or why it could not be read.
+type Seen = Result<Option<(Arc<str>, Arc<str>)>, LocatedFault>;
+
+struct Task<T> {
+    sources: Sources,
+    schema: Schema<T>,
+    tell: channel::Sender<Current<T>>,
+    seen: Seen,
+}
+
+impl<T: Send + Sync + 'static> Task<T> {
+    async fn run(mut self, settings: WatchSettings) {
+        let (events, mut changed) = mpsc::channel(1);
+        let mut directories = Directories::new(settings.directory_events.then(|| events.clone()));
+        let mut hangup = Hangup::new(settings.hangup);
+        let mut poll = tokio::time::interval(settings.poll);
+        poll.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            let mut forced = false;
+            tokio::select! {
+                Some(()) = changed.recv() => quiet(&mut changed, settings.debounce).await,
+                () = hangup.recv() => forced = true,
+                // The first tick comes at once: what changed since the first reading is found.
+                _ = poll.tick() => {}
+            }
+            let sources = self.sources.clone();
+            let looked = tokio::task::spawn_blocking(move || {
+                // Watched before it is read, so that no change falls between.
+                if let Some(file) = sources.resolve_file() {
+                    directories.arm(&file);
+                }
+                (sources.read_file(), directories)
+            });
+            // The blocking task ends early only when the runtime goes away.
+            let Ok((seen, back)) = looked.await else { return };
+            directories = back;
+            if forced || seen != self.seen {
+                self.seen = seen;
+                self.reload();
+            }
+        }
+    }
+
+    fn reload(&mut self) {
+        let read = match &self.seen {
+            Ok(text) => self.judge(text.clone()),
+            Err(fault) => Err(vec![fault.clone()]),
+        };
+        self.tell.send_modify(|current| {
+            current.serial += 1;
+            match read {
+                Ok(loaded) => {
+                    current.loaded = Arc::new(loaded);
+                    current.faults = None;
+                }
+                Err(faults) => current.faults = Some(faults.into()),
+            }
+        });
+    }
+
+    fn judge(&self, text: Option<(Arc<str>, Arc<str>)>) -> Result<Loaded<T>, Vec<LocatedFault>> {
+        // A file that is being written is empty for a moment. It would be valid and reset everything to its default.
+        let emptied = text.as_ref().is_some_and(|(_, text)| text.trim().is_empty());
+        let before = &self.tell.borrow().loaded.document;
+        if emptied && *before.value() != Value::Null {
+            return Err(vec![before.fault("", "has become empty")]);
+        }
+        judge(Document::from_text(&self.sources, text), &self.schema)
+    }
+}
+
+/// Waits until nothing has changed for a while, but not for ever.
+async fn quiet(changed: &mut mpsc::Receiver<()>, debounce: Duration) {
+    let latest = Instant::now() + debounce * 10;
+    while Instant::now() < latest {
+        if tokio::time::timeout(debounce, changed.recv()).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// SIGHUP, or nothing at all.
+struct Hangup(Option<tokio::signal::unix::Signal>);
+
+impl Hangup {
+    fn new(wanted: bool) -> Self {
+        let register = || tokio::signal::unix::signal(tokio::signal::unix::SignalKind::hangup());
+        let failed = |error: &std::io::Error| tracing::warn!(%error, "SIGHUP will not reload the configuration");
+        Self(wanted.then(register).and_then(|signal| signal.inspect_err(failed).ok()))
+    }
+
+    async fn recv(&mut self) {
+        if let Some(signal) = &mut self.0
+            && signal.recv().await.is_some()
+        {
+            return;
+        }
+        std::future::pending().await
+    }
+}
+
+/// The directories that are watched: that of the file as it is named, and that of the file that it leads to.
+struct Directories {
+    watcher: Option<RecommendedWatcher>,
+    /// Device and inode of each: another directory under the same name must be watched anew.
+    armed: BTreeMap<PathBuf, (u64, u64)>,
+}
+
+impl Directories {
+    fn new(events: Option<mpsc::Sender<()>>) -> Self {
+        let make = |events: mpsc::Sender<()>| {
+            notify::recommended_watcher(move |event: notify::Result<notify::Event>| {
+                if event.map_or(true, |event| tells_of_a_change(event.kind)) {
+                    // Full means that one is waiting already.
+                    let _ = events.try_send(());
+                }
+            })
+        };
+        let failed = |error: &notify::Error| {
+            tracing::warn!(%error, "no directory events: changes of the configuration are found by polling");
+        };
+        Self {
+            watcher: events.and_then(|events| make(events).inspect_err(failed).ok()),
+            armed: BTreeMap::new(),
+        }
+    }
+
+    fn arm(&mut self, file: &Path) {
+        let Some(watcher) = &mut self.watcher else { return };
+        let named = Some(directory_of(file).to_owned());
+        let real = std::fs::canonicalize(file)
+            .ok()
+            .map(|real| directory_of(&real).to_owned());
+        let wanted: BTreeMap<PathBuf, (u64, u64)> = [named, real]
+            .into_iter()
+            .flatten()
+            .filter_map(|path| Some((path.clone(), identity(&path)?)))
+            .collect();
+        for path in self
+            .armed
+            .iter()
+            .filter(|(path, id)| wanted.get(*path) != Some(*id))
+            .map(|(path, _)| path)
+        {
+            // It may be gone, and its watch with it.
+            let _ = watcher.unwatch(path);
+        }
+        self.armed.retain(|path, id| wanted.get(path) == Some(id));
+        for (path, id) in wanted {
+            if self.armed.contains_key(&path) {
+                continue;
+            }
+            match watcher.watch(&path, RecursiveMode::NonRecursive) {
+                Ok(()) => {
+                    self.armed.insert(path, id);
+                }
+                Err(error) => tracing::debug!(%error, path = %path.display(), "directory is not watched, only polled"),
+            }
+        }
+    }
+}
+
+/// Our own reading of the file is an event too and must not lead to the next one.
+fn tells_of_a_change(kind: EventKind) -> bool {
+    match kind {
+        EventKind::Access(kind) => kind == AccessKind::Close(AccessMode::Write),
+        _ => true,
+    }
+}
+
+fn directory_of(file: &Path) -> &Path {
+    match file.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    }
+}
+
+fn identity(path: &Path) -> Option<(u64, u64)> {
+    let metadata = std::fs::metadata(path).ok()?;
+    Some((metadata.dev(), metadata.ino()))
+}

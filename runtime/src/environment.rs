@@ -1,0 +1,38 @@
+//! The environment of the process. Nothing else in the workspace reads it.
+
+/// A variable; `None` if it is absent, empty or not UTF-8.
+#[must_use]
+#[allow(clippy::disallowed_methods, reason = "the one place that reads the environment")]
+pub fn variable(name: &str) -> Option<String> {
+    std::env::var(name).ok().filter(|value| !value.is_empty())
+}
+
+/// All variables whose name starts with `prefix`, by name. Those that are not UTF-8 are left out.
+#[must_use]
+#[allow(clippy::disallowed_methods, reason = "the one place that reads the environment")]
+pub fn variables(prefix: &str) -> Vec<(String, String)> {
+    // `vars` would panic at the first one that is not UTF-8.
+    let text = |(name, value): (std::ffi::OsString, std::ffi::OsString)| {
+        Some((name.into_string().ok()?, value.into_string().ok()?))
+    };
+    let mut found: Vec<_> = std::env::vars_os()
+        .filter_map(text)
+        .filter(|(name, _)| name.starts_with(prefix))
+        .collect();
+    found.sort();
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn variables_are_found_by_prefix() {
+        // Cargo gives these to every test process.
+        let found = variables("CARGO_PKG_N");
+        assert_eq!(found, [("CARGO_PKG_NAME".to_owned(), "blaze-runtime".to_owned())]);
+        assert_eq!(variable("CARGO_PKG_NAME").as_deref(), Some("blaze-runtime"));
+        assert_eq!(variable("BLAZE_NO_SUCH_VARIABLE"), None);
+    }
+}
