@@ -1,0 +1,540 @@
+//! The link of one flow to all others: a state machine without input, output or clock.
+//!
+//! ```text
+//! submit, send_control ─►┌────────┐─► poll_transmit ─► pacer ─► transport
+//! transport ─► receive ─►│ Engine │─► poll_event: deliveries, peers, what became of each message
+//! clock ─► handle_timeout►└────────┘─► next_timeout
+//! ```
+//!
+//! Who drives it takes all events after each call, and calls [`Engine::handle_timeout`] when
+//! [`Engine::next_timeout`] has come.
+
+use std::collections::HashMap;
+use std::hash::RandomState;
+use std::time::{Duration, Instant};
+
+use blaze_domain::{DropReason, FlowId, LayerKind, Priority};
+use blaze_proto::link::LinkControl;
+use blaze_proto::link::link_control::{Body, Egress, LayerScope, State};
+use bytes::Bytes;
+use prost::Message as _;
+
+use super::addresses::Addresses;
+use super::clock::Clocks;
+use super::event::{DownReason, LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit};
+use super::peer::{FORGET_AFTER, HELLO_EVERY, MAX_CONTROLS, Peer, Phase};
+use super::receiver::Inbox;
+use super::sender::{SendClass, SendContext, SendLimits};
+use super::transport::Endpoint;
+use super::wire::{HEADER_BYTES, RECORD_BYTES, SenderId, class_index};
+
+/// Smallest datagram size that an engine uses, in bytes.
+pub const MIN_DATAGRAM_BYTES: usize = 1024;
+/// Most GUID prefixes that a Hello announces.
+const MAX_GUID_PREFIXES: usize = 4;
+
+/// Bounds of an engine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limits {
+    /// Bytes per destination and class (control, state, bulk) that wait or may have to be repaired; one message always
+    /// fits besides.
+    pub queue_bytes: [usize; 3],
+    /// Bytes of unfinished and waiting messages of all peers.
+    pub reassembly_bytes: usize,
+    /// Peers.
+    pub peers: usize,
+    /// Streams whose order is remembered, per peer and class.
+    pub streams: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        const MIB: usize = 1024 * 1024;
+        Self {
+            queue_bytes: [MIB, 4 * MIB, 16 * MIB],
+            reassembly_bytes: 64 * MIB,
+            peers: 64,
+            streams: 16_384,
+        }
+    }
+}
+
+/// Who the engine speaks for.
+#[derive(Debug, Clone)]
+pub struct EngineConfig {
+    /// The own flow.
+    pub me: FlowId,
+    /// Kind of its layer.
+    pub kind: LayerKind,
+    /// Its life on the link; larger is newer.
+    pub epoch: u64,
+    /// Layer broker that it uses, and that broker's identity; 0 = shared with nobody.
+    pub layer_scope: (LayerScope, u64),
+    /// Largest datagram in bytes, at least [`MIN_DATAGRAM_BYTES`].
+    pub max_datagram: usize,
+    /// Bounds.
+    pub limits: Limits,
+}
+
+/// Place of a peer, to find it without its name; invalid once the peer is forgotten or begins a new life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct PeerIndex {
+    pub(super) at: usize,
+    sender: SenderId,
+}
+
+/// See the module.
+#[derive(Debug)]
+pub struct Engine {
+    pub(super) config: EngineConfig,
+    pub(super) clocks: Clocks,
+    pub(super) sender: SenderId,
+    pub(super) state: State,
+    pub(super) registry: (u64, u64),
+    pub(super) addresses: Addresses,
+    pub(super) guid_prefixes: Vec<Bytes>,
+    pub(super) egress: Option<Egress>,
+    pub(super) peers: Vec<Option<Peer>>,
+    by_flow: HashMap<FlowId, usize>,
+    pub(super) by_sender: HashMap<SenderId, usize>,
+    next_link_epoch: u32,
+    /// Peer that was served last, for LinkControl and per class.
+    pub(super) cursors: [usize; 4],
+    pub(super) ledger: Ledger,
+    pub(super) counters: LinkCounters,
+    pub(super) hasher: RandomState,
+}
+
+impl Engine {
+    /// An engine without peers. `wall_ns` is the time since 1970 at `now`.
+    #[must_use]
+    pub fn new(config: EngineConfig, now: Instant, wall_ns: u64) -> Self {
+        let config = EngineConfig {
+            max_datagram: config.max_datagram.max(MIN_DATAGRAM_BYTES),
+            ..config
+        };
+        Self {
+            clocks: Clocks::new(now, wall_ns),
+            sender: SenderId::of(&config.me, config.epoch),
+            state: State::Starting,
+            registry: (0, 0),
+            addresses: Addresses::default(),
+            guid_prefixes: Vec::new(),
+            egress: None,
+            peers: Vec::new(),
+            by_flow: HashMap::new(),
+            by_sender: HashMap::new(),
+            next_link_epoch: 1,
+            cursors: [0; 4],
+            ledger: Ledger::default(),
+            counters: LinkCounters::default(),
+            hasher: RandomState::new(),
+            config,
+        }
+    }
+
+    /// The own endpoint: flow and life.
+    #[must_use]
+    pub fn endpoint(&self) -> Endpoint {
+        Endpoint {
+            flow: self.config.me.clone(),
+            epoch: self.config.epoch,
+        }
+    }
+
+    /// Tells the wall clock anew, in nanoseconds since 1970.
+    pub fn set_wall_clock(&mut self, now: Instant, wall_ns: u64) {
+        self.clocks.set_wall(now, wall_ns);
+    }
+
+    /// What the next Hellos say of this flow.
+    pub fn set_state(&mut self, now: Instant, state: State) {
+        if self.state != state {
+            self.state = state;
+            self.hello_soon(now);
+        }
+    }
+
+    /// Version and digest of the announced registry state, for the next Hellos.
+    pub fn set_registry(&mut self, _now: Instant, version: u64, digest: u64) {
+        self.registry = (version, digest);
+    }
+
+    /// Layer broker for the next Hellos, and its identity.
+    pub fn set_layer_scope(&mut self, now: Instant, scope: LayerScope, id: u64) {
+        if self.config.layer_scope != (scope, id) {
+            self.config.layer_scope = (scope, id);
+            self.hello_soon(now);
+        }
+    }
+
+    /// Own addresses for the next Hellos.
+    pub fn set_addresses(&mut self, addresses: Vec<String>) {
+        self.addresses.set_own(addresses);
+    }
+
+    /// GUID prefixes of the own DDS participants, at most 4, for the next Hellos.
+    pub fn set_guid_prefixes(&mut self, prefixes: Vec<Bytes>) {
+        self.guid_prefixes = prefixes;
+        self.guid_prefixes.retain(|prefix| prefix.len() <= 12);
+        self.guid_prefixes.truncate(MAX_GUID_PREFIXES);
+    }
+
+    /// Demand and limit of the own egress, for the next Hellos.
+    pub fn set_egress(&mut self, egress: Egress) {
+        self.egress = Some(egress);
+    }
+
+    fn hello_soon(&mut self, now: Instant) {
+        for peer in self.peers.iter_mut().flatten().filter(|peer| peer.is_connected()) {
+            peer.hello_due = true;
+            peer.hello_at = now + HELLO_EVERY;
+        }
+    }
+
+    /// The transport can write to an endpoint.
+    pub fn peer_discovered(&mut self, now: Instant, endpoint: Endpoint) {
+        if let Some(at) = self.place_of(now, endpoint)
+            && let Some(peer) = &mut self.peers[at]
+            && peer.phase != Phase::Gone
+        {
+            peer.hello_due = true;
+            peer.hello_at = now + HELLO_EVERY;
+        }
+    }
+
+    /// The transport no longer sees an endpoint. One that says Hello stays; one that never did is forgotten.
+    pub fn peer_lost(&mut self, _now: Instant, endpoint: &Endpoint) {
+        if let Some(&at) = self.by_flow.get(&endpoint.flow)
+            && let Some(peer) = &self.peers[at]
+            && peer.endpoint == *endpoint
+            && peer.phase == Phase::Connecting
+        {
+            self.remove(at);
+        }
+    }
+
+    /// The place of an endpoint, made if it is new; a newer life replaces an older one. `None`: an older life, this flow
+    /// itself, or no room.
+    pub(super) fn place_of(&mut self, now: Instant, endpoint: Endpoint) -> Option<usize> {
+        if endpoint.flow == self.config.me {
+            return None;
+        }
+        if let Some(&at) = self.by_flow.get(&endpoint.flow) {
+            let known = self.peers[at].as_ref().map_or(0, |peer| peer.endpoint.epoch);
+            if endpoint.epoch == known {
+                return Some(at);
+            }
+            if endpoint.epoch < known {
+                self.counters.stale += 1;
+                return None;
+            }
+            self.take_down(now, at, DownReason::NewEpoch);
+            self.remove(at);
+        }
+        let at = self.free_place()?;
+        let limits = [0, 1, 2].map(|class| SendLimits {
+            queue_bytes: self.config.limits.queue_bytes[class],
+            streams: self.config.limits.streams,
+            max_datagram: self.config.max_datagram,
+        });
+        let peer = Peer::new(now, endpoint, self.next_link_epoch, limits, self.config.limits.streams);
+        self.next_link_epoch = self.next_link_epoch.saturating_add(3);
+        self.by_flow.insert(peer.endpoint.flow.clone(), at);
+        self.by_sender.insert(peer.sender, at);
+        self.peers[at] = Some(peer);
+        Some(at)
+    }
+
+    fn free_place(&mut self) -> Option<usize> {
+        if let Some(at) = self.peers.iter().position(Option::is_none) {
+            return Some(at);
+        }
+        if self.peers.len() < self.config.limits.peers {
+            self.peers.push(None);
+            return Some(self.peers.len() - 1);
+        }
+        let idle = self.peers.iter().enumerate().filter_map(|(at, peer)| {
+            let peer = peer.as_ref().filter(|peer| !peer.is_connected())?;
+            Some((peer.last_hello.unwrap_or(peer.since), at))
+        });
+        let Some((_, at)) = idle.min() else {
+            self.counters.peers_refused += 1;
+            return None;
+        };
+        self.forget(at);
+        Some(at)
+    }
+
+    /// This flow begins a new life: peers are dropped and have to be found again.
+    pub fn restart(&mut self, now: Instant, epoch: u64) {
+        for at in 0..self.peers.len() {
+            self.take_down(now, at, DownReason::Restarted);
+            self.remove(at);
+        }
+        self.config.epoch = epoch;
+        self.sender = SenderId::of(&self.config.me, epoch);
+    }
+
+    /// Drops what waits for a peer, hands out what waits from it, and says so if it was up.
+    pub(super) fn take_down(&mut self, now: Instant, at: usize, reason: DownReason) {
+        let Some(peer) = self.peers.get_mut(at).and_then(Option::as_mut) else {
+            return;
+        };
+        let was_connected = peer.is_connected();
+        self.next_link_epoch = peer.drop_outgoing(self.next_link_epoch, &mut self.ledger);
+        let half_round_trip = peer.round_trip.measured().unwrap_or_default() / 2;
+        let mut inbox = Inbox {
+            now,
+            from: &peer.endpoint.flow,
+            half_round_trip,
+            events: &mut self.ledger.events,
+            counters: &mut self.counters,
+            hasher: &self.hasher,
+        };
+        for class in &mut peer.receive {
+            class.release_all(&mut inbox);
+        }
+        if peer.phase != Phase::Gone {
+            peer.phase = Phase::Down;
+        }
+        peer.since = now;
+        if was_connected {
+            self.ledger.events.push_back(LinkEvent::PeerDown {
+                flow: peer.endpoint.flow.clone(),
+                epoch: peer.endpoint.epoch,
+                reason,
+            });
+        }
+    }
+
+    fn remove(&mut self, at: usize) {
+        if let Some(peer) = self.peers.get_mut(at).and_then(Option::take) {
+            self.by_flow.remove(&peer.endpoint.flow);
+            self.by_sender.remove(&peer.sender);
+        }
+    }
+
+    /// Removes a peer that is not connected, and says so if it was known by name.
+    fn forget(&mut self, at: usize) {
+        let Some(peer) = self.peers.get(at).and_then(Option::as_ref) else {
+            return;
+        };
+        if peer.phase == Phase::Down {
+            self.ledger.events.push_back(LinkEvent::PeerForgotten {
+                flow: peer.endpoint.flow.clone(),
+                epoch: peer.endpoint.epoch,
+            });
+        }
+        self.remove(at);
+    }
+
+    /// Place of a flow, for [`Engine::submit_to`].
+    #[must_use]
+    pub fn peer_index(&self, flow: &FlowId) -> Option<PeerIndex> {
+        let at = *self.by_flow.get(flow)?;
+        let sender = self.peers[at].as_ref()?.sender;
+        Some(PeerIndex { at, sender })
+    }
+
+    /// Takes a message for a peer. From then on it ends in exactly one [`LinkEvent::LaneOut`] or
+    /// [`LinkEvent::LaneDropped`], or in what [`Engine::drop_lane`] returns. Older ones that wait give way if the queue is
+    /// full.
+    ///
+    /// # Errors
+    /// The reason why it was not taken, for the caller to count: `no_destination` (the flow is not known), `link_down` (it
+    /// is not up), `lifespan` (too old already).
+    pub fn submit(&mut self, now: Instant, submit: Submit<'_>) -> Result<(), DropReason> {
+        let index = self.peer_index(submit.to).ok_or(DropReason::NoDestination)?;
+        self.submit_to(now, index, submit)
+    }
+
+    /// As [`Engine::submit`], without looking at `submit.to`.
+    ///
+    /// # Errors
+    /// As [`Engine::submit`].
+    pub fn submit_to(&mut self, now: Instant, to: PeerIndex, submit: Submit<'_>) -> Result<(), DropReason> {
+        let peer = self.peers.get_mut(to.at).and_then(Option::as_mut);
+        let peer = peer
+            .filter(|peer| peer.sender == to.sender)
+            .ok_or(DropReason::NoDestination)?;
+        if !peer.is_connected() {
+            return Err(DropReason::LinkDown);
+        }
+        let residence = now.saturating_duration_since(submit.arrived);
+        let age = Duration::from_micros(submit.frame.age_us()).saturating_add(residence);
+        if submit.lifespan.is_some_and(|lifespan| age >= lifespan) {
+            return Err(DropReason::Lifespan);
+        }
+        peer.send[class_index(submit.class)].submit(submit, &mut self.ledger);
+        Ok(())
+    }
+
+    /// Queues a Delta, SnapshotRequest or Snapshot for a peer.
+    ///
+    /// # Errors
+    /// `no_destination`, `link_down`, `too_large` (it must fit one datagram) or `queue_full`.
+    pub fn send_control(&mut self, _now: Instant, to: &FlowId, body: Body) -> Result<(), DropReason> {
+        let at = *self.by_flow.get(to).ok_or(DropReason::NoDestination)?;
+        let peer = self.peers[at].as_mut().ok_or(DropReason::NoDestination)?;
+        if !peer.is_connected() {
+            return Err(DropReason::LinkDown);
+        }
+        let control = LinkControl { body: Some(body) };
+        if control.encoded_len() > self.config.max_datagram - HEADER_BYTES - RECORD_BYTES {
+            return Err(DropReason::TooLarge);
+        }
+        if peer.controls.len() >= MAX_CONTROLS {
+            self.counters.control_refused += 1;
+            return Err(DropReason::QueueFull);
+        }
+        peer.controls.push_back(control.encode_to_vec().into());
+        Ok(())
+    }
+
+    /// Says Goodbye to every peer with the next datagrams.
+    pub fn goodbye(&mut self, _now: Instant) {
+        for peer in self.peers.iter_mut().flatten() {
+            peer.goodbye_due = peer.phase != Phase::Gone;
+        }
+    }
+
+    /// What happened, oldest first.
+    pub fn poll_event(&mut self) -> Option<LinkEvent> {
+        self.ledger.events.pop_front()
+    }
+
+    /// When [`Engine::handle_timeout`] has something to do next.
+    #[must_use]
+    pub fn next_timeout(&self) -> Option<Instant> {
+        self.peers.iter().flatten().filter_map(Peer::next_timeout).min()
+    }
+
+    /// Does what time has made due.
+    pub fn handle_timeout(&mut self, now: Instant) {
+        for at in 0..self.peers.len() {
+            self.advance_phase(now, at);
+            self.advance_classes(now, at);
+        }
+    }
+
+    fn advance_phase(&mut self, now: Instant, at: usize) {
+        let Some(peer) = &mut self.peers[at] else { return };
+        if peer.hello_at <= now && peer.phase != Phase::Gone {
+            peer.hello_due = true;
+            peer.hello_at = now + HELLO_EVERY;
+        }
+        if peer.silent_at().is_some_and(|silent| silent <= now) {
+            if peer.is_connected() {
+                self.take_down(now, at, DownReason::Silent);
+            } else {
+                self.forget(at);
+            }
+        } else if peer.suspect_at().is_some_and(|suspect| suspect <= now) {
+            peer.phase = Phase::Suspect;
+            self.ledger.events.push_back(LinkEvent::PeerSuspect {
+                flow: peer.endpoint.flow.clone(),
+            });
+        }
+    }
+
+    fn advance_classes(&mut self, now: Instant, at: usize) {
+        let Some(peer) = &mut self.peers[at] else { return };
+        let connected = peer.is_connected();
+        let mut ctx = SendContext {
+            now,
+            send_ns: self.clocks.monotonic_ns(now),
+            sender: self.sender,
+            round_trip: peer.round_trip.get(),
+            ledger: &mut self.ledger,
+            counters: &mut self.counters,
+        };
+        for class in &mut peer.send {
+            if class.next_timeout().is_some_and(|due| due <= now) {
+                class.handle_timeout(&mut ctx);
+            }
+        }
+        let mut inbox = Inbox {
+            now,
+            from: &peer.endpoint.flow,
+            half_round_trip: peer.round_trip.measured().unwrap_or_default() / 2,
+            events: &mut self.ledger.events,
+            counters: &mut self.counters,
+            hasher: &self.hasher,
+        };
+        for class in &mut peer.receive {
+            if class.next_timeout(connected).is_some_and(|due| due <= now) {
+                class.handle_timeout(&mut inbox);
+            }
+        }
+    }
+
+    /// Drops what a lane has waiting; what is on its way goes on and ends in an event. The caller counts what is returned.
+    pub fn drop_lane(&mut self, lane: LaneId) -> Tally {
+        let mut dropped = Tally::default();
+        for class in self.peers.iter_mut().flatten().flat_map(|peer| &mut peer.send) {
+            SendClass::drop_lane(class, lane, &mut dropped, &mut self.ledger);
+        }
+        dropped
+    }
+
+    /// What a lane has waiting or on its way.
+    #[must_use]
+    pub fn lane_queued(&self, lane: LaneId) -> Tally {
+        self.ledger.queued(lane)
+    }
+
+    /// All peers but those that said Goodbye.
+    #[must_use]
+    pub fn peers(&self) -> Vec<PeerInfo> {
+        let peers = self.peers.iter().flatten();
+        peers.filter(|peer| peer.phase != Phase::Gone).map(Peer::info).collect()
+    }
+
+    /// One peer.
+    #[must_use]
+    pub fn peer(&self, flow: &FlowId) -> Option<PeerInfo> {
+        let peer = self.peers[*self.by_flow.get(flow)?].as_ref()?;
+        (peer.phase != Phase::Gone).then(|| peer.info())
+    }
+
+    /// Counts since the start.
+    #[must_use]
+    pub fn counters(&self) -> LinkCounters {
+        self.counters
+    }
+
+    /// Bytes of memory that unfinished and waiting messages of all peers hold.
+    #[must_use]
+    pub fn reassembly_bytes(&self) -> usize {
+        self.peers.iter().flatten().map(Peer::reserved).sum()
+    }
+
+    /// How long a peer that is down is remembered.
+    #[must_use]
+    pub fn forgets_after() -> Duration {
+        FORGET_AFTER
+    }
+
+    /// Whether nothing waits to be sent to anybody but LinkControl.
+    #[must_use]
+    pub fn is_drained(&self) -> bool {
+        let mut classes = self.peers.iter().flatten().flat_map(|peer| &peer.send);
+        classes.all(|class| class.queue_bytes() == 0)
+    }
+
+    /// What waits for peers of a class, in bytes.
+    #[must_use]
+    pub fn queued_bytes(&self, class: Priority) -> usize {
+        let peers = self.peers.iter().flatten();
+        peers.map(|peer| peer.send[class_index(class)].queue_bytes()).sum()
+    }
+
+    /// The next datagram, most urgent first: LinkControl and probes, then control, state and bulk, each in turn over the
+    /// peers. `None`: nothing to send now.
+    pub fn poll_transmit(&mut self, now: Instant) -> Option<Transmit> {
+        self.transmit_control(now)
+            .or_else(|| self.transmit_messages(now))
+            .or_else(|| self.transmit_control(now))
+    }
+}

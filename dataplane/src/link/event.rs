@@ -1,0 +1,331 @@
+//! What the engine is given, tells and reports.
+
+use std::collections::{HashMap, VecDeque};
+use std::time::{Duration, Instant};
+
+use blaze_domain::{DropReason, FlowId, LayerKind, Priority, WriterId};
+use blaze_proto::Frame;
+use blaze_proto::link::link_control::{Body, Hello, LayerScope, State};
+use bytes::Bytes;
+
+use super::transport::Endpoint;
+
+/// A lane of the flow; the engine only counts by it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct LaneId(pub u32);
+
+/// What must stay in order: one writer of one topic.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct StreamKey {
+    /// The flow's number of the topic.
+    pub topic: u32,
+    /// The writer.
+    pub writer: WriterId,
+}
+
+/// A message for another flow.
+#[derive(Debug, Clone)]
+pub struct Submit<'a> {
+    /// Its destination.
+    pub to: &'a FlowId,
+    /// Its class.
+    pub class: Priority,
+    /// Whom it is counted for.
+    pub lane: LaneId,
+    /// What it stays in order with.
+    pub stream: StreamKey,
+    /// The message. It travels with one hop more than the frame has.
+    pub frame: Frame,
+    /// When the flow took it in; its age grows from then on.
+    pub arrived: Instant,
+    /// Repair it when it is lost; messages of several parts are always repaired.
+    pub reliable: bool,
+    /// Age (that of the frame included) at which it is of no use; `None` = never.
+    pub lifespan: Option<Duration>,
+}
+
+/// A datagram to hand to the transport.
+#[derive(Debug, Clone)]
+pub struct Transmit {
+    /// Its destination.
+    pub to: Endpoint,
+    /// The class whose topic it goes on.
+    pub class: Priority,
+    /// The datagram.
+    pub datagram: Bytes,
+    /// Bytes of messages in it; the rest is the link's own.
+    pub user_bytes: usize,
+    /// It carries no message: LinkControl or a probe.
+    pub control: bool,
+}
+
+/// Why a peer went down.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum DownReason {
+    /// No Hello for 2.5 s.
+    Silent,
+    /// It said Goodbye.
+    Goodbye,
+    /// A newer life of it was seen.
+    NewEpoch,
+    /// This flow began a new life.
+    Restarted,
+}
+
+/// What happened on the link. The caller takes all events after each call.
+#[derive(Debug, Clone)]
+pub enum LinkEvent {
+    /// A message came; hops and age are set.
+    Deliver {
+        /// The flow that sent it.
+        from: FlowId,
+        /// The message.
+        frame: Frame,
+        /// When it was handed out.
+        at: Instant,
+    },
+    /// A Delta, SnapshotRequest or Snapshot for the registry.
+    Control {
+        /// The flow that sent it.
+        from: FlowId,
+        /// What it says.
+        body: Body,
+    },
+    /// A Hello, each one.
+    Hello {
+        /// The flow that sent it.
+        from: FlowId,
+        /// What it says.
+        hello: Box<Hello>,
+    },
+    /// A peer can be written to: first heard, or back.
+    PeerUp {
+        /// The peer.
+        flow: FlowId,
+        /// Its life.
+        epoch: u64,
+    },
+    /// A peer does not acknowledge: nothing is sent to it for the moment, what waits stays.
+    PeerSuspect {
+        /// The peer.
+        flow: FlowId,
+    },
+    /// A suspect peer acknowledges again.
+    PeerRecovered {
+        /// The peer.
+        flow: FlowId,
+    },
+    /// A peer is gone; what waited for it was dropped.
+    PeerDown {
+        /// The peer.
+        flow: FlowId,
+        /// The life that ended.
+        epoch: u64,
+        /// Why.
+        reason: DownReason,
+    },
+    /// A peer that was down is not waited for any more.
+    PeerForgotten {
+        /// The peer.
+        flow: FlowId,
+        /// Its life.
+        epoch: u64,
+    },
+    /// Addresses that were not known before.
+    Addresses(Vec<String>),
+    /// The last byte of a message was sent for the first time: for rates. Each message has at most one of these.
+    LaneSent {
+        /// Its lane.
+        lane: LaneId,
+        /// Bytes of the frame.
+        bytes: usize,
+        /// Since it arrived at this flow.
+        wait: Duration,
+    },
+    /// A message has left for good: best-effort ones of one part when sent, others when they are known to have arrived.
+    LaneOut {
+        /// Its lane.
+        lane: LaneId,
+        /// Messages, 1.
+        messages: u64,
+        /// Bytes of the frame.
+        bytes: usize,
+        /// Since it arrived at this flow.
+        wait: Duration,
+    },
+    /// A message was dropped.
+    LaneDropped {
+        /// Its lane.
+        lane: LaneId,
+        /// Why.
+        reason: DropReason,
+        /// Messages, 1.
+        messages: u64,
+        /// Bytes of the frame.
+        bytes: usize,
+    },
+    /// Something that came over the link was dropped here.
+    ReceiverDropped {
+        /// Its topic, at most 200 bytes; empty if that is not known.
+        topic: String,
+        /// Why.
+        reason: DropReason,
+        /// Messages.
+        messages: u64,
+    },
+}
+
+/// Messages and their bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Tally {
+    /// Messages.
+    pub messages: u64,
+    /// Bytes of their frames.
+    pub bytes: u64,
+}
+
+impl Tally {
+    pub(crate) fn add(&mut self, bytes: usize) {
+        self.messages += 1;
+        self.bytes += bytes as u64;
+    }
+
+    pub(crate) fn remove(&mut self, bytes: usize) {
+        self.messages = self.messages.saturating_sub(1);
+        self.bytes = self.bytes.saturating_sub(bytes as u64);
+    }
+}
+
+/// Events that wait to be taken, and what each lane has waiting.
+#[derive(Debug, Default)]
+pub(crate) struct Ledger {
+    pub events: VecDeque<LinkEvent>,
+    lanes: HashMap<LaneId, Tally>,
+}
+
+impl Ledger {
+    pub(crate) fn submitted(&mut self, lane: LaneId, bytes: usize) {
+        self.lanes.entry(lane).or_default().add(bytes);
+    }
+
+    fn left(&mut self, lane: LaneId, bytes: usize) {
+        if let Some(tally) = self.lanes.get_mut(&lane) {
+            tally.remove(bytes);
+            if tally.messages == 0 {
+                self.lanes.remove(&lane);
+            }
+        }
+    }
+
+    pub(crate) fn sent(&mut self, lane: LaneId, bytes: usize, wait: Duration) {
+        self.events.push_back(LinkEvent::LaneSent { lane, bytes, wait });
+    }
+
+    pub(crate) fn out(&mut self, lane: LaneId, bytes: usize, wait: Duration) {
+        self.left(lane, bytes);
+        self.events.push_back(LinkEvent::LaneOut {
+            lane,
+            messages: 1,
+            bytes,
+            wait,
+        });
+    }
+
+    pub(crate) fn dropped(&mut self, lane: LaneId, bytes: usize, reason: DropReason) {
+        self.left(lane, bytes);
+        self.events.push_back(LinkEvent::LaneDropped {
+            lane,
+            reason,
+            messages: 1,
+            bytes,
+        });
+    }
+
+    /// Dropped at the caller's wish, who counts it.
+    pub(crate) fn withdrawn(&mut self, lane: LaneId, bytes: usize) {
+        self.left(lane, bytes);
+    }
+
+    pub(crate) fn queued(&self, lane: LaneId) -> Tally {
+        self.lanes.get(&lane).copied().unwrap_or_default()
+    }
+}
+
+/// Whether a peer can be written to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum PeerState {
+    /// It says Hello and acknowledges.
+    Up,
+    /// It does not acknowledge.
+    Suspect,
+    /// It does not say Hello (any more).
+    Down,
+}
+
+/// What the engine knows of one peer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PeerInfo {
+    /// The peer.
+    pub flow: FlowId,
+    /// Kind of its layer, once it said Hello.
+    pub kind: Option<LayerKind>,
+    /// Its life.
+    pub epoch: u64,
+    /// Version of its announced registry state.
+    pub version: u64,
+    /// Digest of its announced registry state.
+    pub digest: u64,
+    /// Whether it can be written to.
+    pub state: PeerState,
+    /// What it says of itself, once it said Hello.
+    pub hello_state: Option<State>,
+    /// Layer broker that it uses, and its identity.
+    pub layer_scope: (LayerScope, u64),
+    /// When its last Hello came.
+    pub last_heard: Option<Instant>,
+    /// Round trip, once measured.
+    pub rtt: Option<Duration>,
+    /// Its wall clock minus ours in nanoseconds, once measured.
+    pub clock_offset_ns: Option<i64>,
+    /// How far `clock_offset_ns` may be off.
+    pub clock_error: Option<Duration>,
+    /// Share of samples to it that were lost of late, 0 to 1.
+    pub loss: f64,
+    /// Bytes of datagrams per second that it receives from us.
+    pub receiving_bytes_per_s: f64,
+    /// Queueing on the way, as far as the round trip shows.
+    pub queueing_delay: Duration,
+    /// Bytes that it will take, per class (control, state, bulk).
+    pub window_bytes: [u64; 3],
+    /// Bytes on the way, per class.
+    pub outstanding_bytes: [usize; 3],
+    /// Bytes that wait or may have to be repaired, per class.
+    pub queue_bytes: [usize; 3],
+}
+
+/// Things that happened, since the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LinkCounters {
+    /// Datagrams, records or LinkControl that do not follow the format.
+    pub decode_errors: u64,
+    /// Datagrams of a sender that has not said Hello.
+    pub unknown_senders: u64,
+    /// Datagrams of a link epoch or a life that is over.
+    pub stale: u64,
+    /// Samples or messages that came again, or too late.
+    pub duplicates: u64,
+    /// Unfinished messages whose parts never came.
+    pub reassembly_timeouts: u64,
+    /// Unfinished messages that gave way because memory was full.
+    pub reassembly_evicted: u64,
+    /// Samples that were refused because too many before them are missing.
+    pub overrun: u64,
+    /// Peers that found no place.
+    pub peers_refused: u64,
+    /// LinkControl that found no place in its queue.
+    pub control_refused: u64,
+    /// Parts that were sent again.
+    pub repairs: u64,
+    /// Probes sent.
+    pub probes: u64,
+}

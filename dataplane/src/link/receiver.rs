@@ -1,0 +1,625 @@
+//! The receiving half of one class of one peer.
+//!
+//! ```text
+//! sample → seen before? → records → whole, or assembled → waits for the message that it must follow → delivered
+//!             │
+//!             └→ Feedback: highest sequence, what is missing
+//! ```
+//!
+//! Each message is settled once: delivered, dropped or given up. A settled one is never looked at again.
+
+use std::collections::{BTreeMap, HashMap};
+use std::hash::{BuildHasher, RandomState};
+use std::time::{Duration, Instant};
+
+use blaze_domain::{DropReason, FlowId};
+use blaze_proto::Frame;
+use blaze_proto::link::link_control::Feedback;
+use bytes::Bytes;
+use lru::LruCache;
+use smallvec::SmallVec;
+
+use super::assembly::Assembly;
+use super::clock::microseconds;
+use super::event::{LinkCounters, LinkEvent};
+use super::ranges::RangeSet;
+use super::wire::{LinkHeader, Record};
+
+/// An unfinished message is given up that long after its last part, and so is the one that another waits for. Time in
+/// which nothing of the class comes does not count: the sender may have been cut off, or have more urgent things to send.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// … but that long at most.
+const LONGEST_PATIENCE: Duration = Duration::from_secs(30);
+/// A longer silence of the class counts as that much.
+const ACTIVE_GAP: Duration = Duration::from_millis(250);
+/// How often unfinished and waiting messages are looked at.
+const SWEEP: Duration = Duration::from_millis(100);
+const FEEDBACK_EVERY: Duration = Duration::from_millis(50);
+const FEEDBACK_IDLE: Duration = Duration::from_millis(500);
+const FEEDBACK_SAMPLES: u32 = 64;
+const MISSING_RANGES: usize = 32;
+/// Gaps in the sequence that are kept; a sample that would make more is refused.
+const MAX_SEQUENCE_RANGES: usize = 8_192;
+/// Gaps between settled messages that are kept; the oldest is given up.
+const MAX_MESSAGE_RANGES: usize = 4_096;
+/// Unfinished messages of one class; the oldest gives way.
+const MAX_UNFINISHED: usize = 1_024;
+/// Messages of one class that wait for another; the oldest is not waited for any more.
+const MAX_HELD: usize = 16_384;
+/// A frame that waits is handed out so long before its lifespan ends.
+const LIFESPAN_RESERVE: Duration = Duration::from_millis(1);
+/// What a message costs in memory besides its bytes.
+pub(crate) const MESSAGE_OVERHEAD: usize = 256;
+
+/// A complete message that waits for the one before it.
+#[derive(Debug)]
+struct Held {
+    message: Complete,
+    before: u32,
+    since: Instant,
+    active: Duration,
+    /// Bytes of memory that it holds.
+    bytes: usize,
+}
+
+/// A complete message and what its records said.
+#[derive(Debug)]
+struct Complete {
+    frame: Frame,
+    hops: u8,
+    age_us: u32,
+    first_part: Instant,
+    /// Half the round trip when its first part came.
+    lag: Duration,
+}
+
+/// Where deliveries and drops of a receiving half go.
+pub(crate) struct Inbox<'a> {
+    pub now: Instant,
+    pub from: &'a FlowId,
+    pub half_round_trip: Duration,
+    pub events: &'a mut std::collections::VecDeque<LinkEvent>,
+    pub counters: &'a mut LinkCounters,
+    /// Keyed anew at each start, so that nobody chooses collisions.
+    pub hasher: &'a RandomState,
+}
+
+impl Inbox<'_> {
+    fn dropped(&mut self, topic: &str, reason: DropReason) {
+        if reason == DropReason::ReassemblyTimeout {
+            self.counters.reassembly_timeouts += 1;
+        }
+        self.events.push_back(LinkEvent::ReceiverDropped {
+            topic: topic.chars().take(200).collect(),
+            reason,
+            messages: 1,
+        });
+    }
+}
+
+/// What became of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Admission {
+    /// New: its records are to be taken.
+    New,
+    /// Known or too late.
+    Repeated,
+    /// Of a link epoch that is over.
+    Stale,
+    /// Too many before it are missing.
+    Overrun,
+}
+
+#[derive(Debug)]
+pub(crate) struct ReceiveClass {
+    link_epoch: u32,
+    sequences: RangeSet,
+    sequence_floor: u64,
+    received_bytes: u64,
+    echo: Option<(u64, Instant)>,
+    samples: u32,
+    last_feedback: Option<Instant>,
+    feedback_at: Option<Instant>,
+    feedback_due: bool,
+    /// Messages below are settled.
+    message_floor: u64,
+    settled: RangeSet,
+    assemblies: HashMap<u32, Assembly>,
+    held: BTreeMap<u32, Held>,
+    /// Who waits for a message.
+    waiters: HashMap<u32, SmallVec<[u32; 1]>>,
+    reserved: usize,
+    /// No held message has to be handed out before.
+    hand_out_at: Option<Instant>,
+    /// Time in which samples came.
+    active: Duration,
+    last_sample: Option<Instant>,
+    sweep_at: Option<Instant>,
+    /// The newest message of each stream that was delivered.
+    streams: LruCache<u64, u32>,
+    max_streams: usize,
+}
+
+impl ReceiveClass {
+    pub(crate) fn new(max_streams: usize) -> Self {
+        Self {
+            link_epoch: 0,
+            sequences: RangeSet::default(),
+            sequence_floor: 0,
+            received_bytes: 0,
+            echo: None,
+            samples: 0,
+            last_feedback: None,
+            feedback_at: None,
+            feedback_due: false,
+            message_floor: 1,
+            settled: RangeSet::default(),
+            assemblies: HashMap::new(),
+            held: BTreeMap::new(),
+            waiters: HashMap::new(),
+            reserved: 0,
+            hand_out_at: None,
+            active: Duration::ZERO,
+            last_sample: None,
+            sweep_at: None,
+            streams: LruCache::unbounded(),
+            max_streams,
+        }
+    }
+
+    /// Bytes of memory that unfinished and waiting messages hold.
+    pub(crate) fn reserved(&self) -> usize {
+        self.reserved
+    }
+
+    /// Bytes that are reserved and have not come yet.
+    fn expected(&self) -> usize {
+        self.assemblies.values().map(Assembly::missing_bytes).sum()
+    }
+
+    /// Takes note of a sample. Its records count only if it is [`Admission::New`].
+    pub(crate) fn admit(&mut self, inbox: &mut Inbox<'_>, header: &LinkHeader, bytes: usize) -> Admission {
+        if header.link_epoch < self.link_epoch {
+            return Admission::Stale;
+        }
+        if header.link_epoch > self.link_epoch {
+            self.release_all(inbox);
+            let (max_streams, link_epoch) = (self.max_streams, header.link_epoch);
+            *self = Self::new(max_streams);
+            self.link_epoch = link_epoch;
+        }
+        let now = inbox.now;
+        if let Some(last) = self.last_sample {
+            self.active += now.saturating_duration_since(last).min(ACTIVE_GAP);
+        }
+        self.last_sample = Some(now);
+        if header.records == 0 {
+            self.feedback_due = true;
+        }
+        let sequence = header.link_sequence;
+        if sequence <= self.sequence_floor || self.sequences.contains(sequence) {
+            return Admission::Repeated;
+        }
+        if self.sequences.len() >= MAX_SEQUENCE_RANGES {
+            return Admission::Overrun;
+        }
+        self.sequences.insert(sequence, sequence);
+        self.received_bytes += bytes as u64;
+        self.echo = Some((header.send_ns, now));
+        if header.records > 0 {
+            self.samples += 1;
+        }
+        let floor = sequence.saturating_sub(u64::from(header.unsettled));
+        if floor > self.sequence_floor {
+            self.sequence_floor = floor;
+            self.sequences.remove_through(floor);
+        }
+        self.give_up_below(inbox, u64::from(header.message_floor));
+        if self.samples >= FEEDBACK_SAMPLES {
+            self.feedback_due = true;
+        } else if self.feedback_at.is_none() {
+            self.feedback_at = Some(self.last_feedback.map_or(now, |last| (last + FEEDBACK_EVERY).max(now)));
+        }
+        Admission::New
+    }
+
+    fn is_settled(&self, message: u32) -> bool {
+        u64::from(message) < self.message_floor || self.settled.contains(u64::from(message))
+    }
+
+    /// Memory that a record would newly hold, at most.
+    pub(crate) fn needs(&self, record: &Record, datagram_bytes: usize) -> usize {
+        if record.is_whole() {
+            let waits = record.behind != 0 && !self.is_settled(record.message - u32::from(record.behind));
+            return if waits { datagram_bytes + MESSAGE_OVERHEAD } else { 0 };
+        }
+        if self.assemblies.contains_key(&record.message) || self.is_settled(record.message) {
+            return 0;
+        }
+        Assembly::memory(record.total as usize)
+    }
+
+    /// Takes a record of a new sample.
+    pub(crate) fn record(&mut self, inbox: &mut Inbox<'_>, record: &Record, bytes: Bytes, datagram_bytes: usize) {
+        let number = record.message;
+        if self.is_settled(number) || self.held.contains_key(&number) {
+            inbox.counters.duplicates += 1;
+            return;
+        }
+        if record.is_whole() {
+            let message = Frame::parse(bytes).map(|frame| Complete {
+                frame,
+                hops: record.hops,
+                age_us: record.age_us,
+                first_part: inbox.now,
+                lag: inbox.half_round_trip,
+            });
+            self.remove_assembly(number);
+            self.complete(
+                inbox,
+                number,
+                record.behind,
+                message.ok(),
+                datagram_bytes + MESSAGE_OVERHEAD,
+            );
+            return;
+        }
+        if self.assemblies.len() >= MAX_UNFINISHED && !self.assemblies.contains_key(&number) {
+            self.evict(inbox);
+        }
+        let active = self.active;
+        let assembly = self.assemblies.entry(number).or_insert_with(|| {
+            self.reserved += Assembly::memory(record.total as usize);
+            Assembly::new(record, inbox.now, inbox.half_round_trip, active)
+        });
+        if !assembly.take(record, &bytes, inbox.now, active) {
+            inbox.counters.decode_errors += 1;
+            return;
+        }
+        self.sweep_at.get_or_insert(inbox.now + SWEEP);
+        if !assembly.is_complete() {
+            return;
+        }
+        let Some(assembly) = self.remove_assembly(number) else {
+            return;
+        };
+        let (behind, hops, age_us) = (assembly.behind, assembly.hops, assembly.age_us);
+        let (first_part, lag) = (assembly.first_part, assembly.half_round_trip);
+        let memory = Assembly::memory(assembly.total());
+        let message = assembly.into_frame().map(|frame| Complete {
+            frame,
+            hops,
+            age_us,
+            first_part,
+            lag,
+        });
+        self.complete(inbox, number, behind, message, memory);
+    }
+
+    fn remove_assembly(&mut self, number: u32) -> Option<Assembly> {
+        let assembly = self.assemblies.remove(&number)?;
+        self.reserved = self.reserved.saturating_sub(Assembly::memory(assembly.total()));
+        Some(assembly)
+    }
+
+    /// A message is complete: deliver it, or keep it until the one before it is settled.
+    fn complete(&mut self, inbox: &mut Inbox<'_>, number: u32, behind: u16, message: Option<Complete>, memory: usize) {
+        let Some(message) = message else {
+            inbox.counters.decode_errors += 1;
+            inbox.dropped("", DropReason::DecodeError);
+            self.settle(inbox, number);
+            return;
+        };
+        let before = number.saturating_sub(u32::from(behind));
+        if behind == 0 || self.is_settled(before) {
+            self.deliver(inbox, number, message);
+            self.settle(inbox, number);
+            return;
+        }
+        self.reserved += memory;
+        self.waiters.entry(before).or_default().push(number);
+        self.sweep_at.get_or_insert(inbox.now + SWEEP);
+        let held = Held {
+            message,
+            before,
+            since: inbox.now,
+            active: self.active,
+            bytes: memory,
+        };
+        if let Some(at) = held.hand_out_at() {
+            self.hand_out_at = Some(self.hand_out_at.map_or(at, |next| next.min(at)));
+        }
+        self.held.insert(number, held);
+        if self.held.len() > MAX_HELD
+            && let Some((&oldest, _)) = self.held.first_key_value()
+        {
+            self.give_up_before(inbox, oldest);
+        }
+    }
+
+    /// Hands a message out, unless it is too old or a newer one of its stream was first.
+    fn deliver(&mut self, inbox: &mut Inbox<'_>, number: u32, message: Complete) {
+        let Complete {
+            frame,
+            hops,
+            age_us,
+            first_part,
+            lag,
+        } = message;
+        let here = inbox.now.saturating_duration_since(first_part) + lag;
+        let age_us = u64::from(age_us).saturating_add(microseconds(here));
+        if frame.lifespan_ms() != 0 && age_us > u64::from(frame.lifespan_ms()) * 1000 {
+            inbox.dropped(frame.topic(), DropReason::Lifespan);
+            return;
+        }
+        let stream = inbox.hasher.hash_one((frame.topic(), frame.writer()));
+        match self.streams.get_mut(&stream) {
+            Some(newest) if *newest > number => {
+                inbox.dropped(frame.topic(), DropReason::Duplicate);
+                return;
+            }
+            Some(newest) => *newest = number,
+            None => {
+                self.streams.put(stream, number);
+                if self.streams.len() > self.max_streams {
+                    self.streams.pop_lru();
+                }
+            }
+        }
+        inbox.events.push_back(LinkEvent::Deliver {
+            from: inbox.from.clone(),
+            frame: frame.with_hops_and_age(u32::from(hops), age_us),
+            at: inbox.now,
+        });
+    }
+
+    /// Notes that a message is delivered or given up, and hands out what waited for it.
+    fn settle(&mut self, inbox: &mut Inbox<'_>, number: u32) {
+        let mut next: SmallVec<[u32; 4]> = SmallVec::from_slice(&[number]);
+        while let Some(number) = next.pop() {
+            self.note_settled(number);
+            let Some(mut waiting) = self.waiters.remove(&number) else {
+                continue;
+            };
+            waiting.sort_unstable();
+            for number in waiting {
+                if let Some(held) = self.held.remove(&number) {
+                    self.reserved = self.reserved.saturating_sub(held.bytes);
+                    self.deliver(inbox, number, held.message);
+                    next.push(number);
+                }
+            }
+        }
+        if self.settled.len() > MAX_MESSAGE_RANGES
+            && let Some((_, end)) = self.settled.first()
+        {
+            self.give_up_below(inbox, end + 1);
+        }
+    }
+
+    fn note_settled(&mut self, number: u32) {
+        self.settled.insert(u64::from(number), u64::from(number));
+        while let Some((first, last)) = self.settled.first()
+            && first <= self.message_floor
+        {
+            self.message_floor = self.message_floor.max(last + 1);
+            self.settled.remove_through(last);
+        }
+    }
+
+    /// Everything below `floor` that has not come is given up.
+    fn give_up_below(&mut self, inbox: &mut Inbox<'_>, floor: u64) {
+        if floor <= self.message_floor {
+            return;
+        }
+        self.message_floor = floor;
+        self.settled.remove_through(floor - 1);
+        if let Some((first, last)) = self.settled.first()
+            && first <= floor
+        {
+            self.message_floor = last + 1;
+            self.settled.remove_through(last);
+        }
+        if !self.assemblies.is_empty() {
+            let floor = self.message_floor;
+            let gone: Vec<u32> = self
+                .assemblies
+                .keys()
+                .copied()
+                .filter(|n| u64::from(*n) < floor)
+                .collect();
+            for number in gone {
+                self.drop_assembly(inbox, number, DropReason::ReassemblyTimeout);
+            }
+        }
+        self.release_ready(inbox);
+    }
+
+    /// Hands out what waits for something that is settled by now, in order.
+    fn release_ready(&mut self, inbox: &mut Inbox<'_>) {
+        if self.held.is_empty() {
+            return;
+        }
+        let numbers: Vec<u32> = self.held.keys().copied().collect();
+        for number in numbers {
+            if let Some(before) = self.held.get(&number).map(|held| held.before)
+                && self.is_settled(before)
+            {
+                self.settle_held(inbox, number);
+            }
+        }
+    }
+
+    /// Hands out one held message and what waited for it.
+    fn settle_held(&mut self, inbox: &mut Inbox<'_>, number: u32) {
+        let Some(held) = self.held.remove(&number) else { return };
+        self.reserved = self.reserved.saturating_sub(held.bytes);
+        if let Some(waiting) = self.waiters.get_mut(&held.before) {
+            waiting.retain(|waiter| *waiter != number);
+            if waiting.is_empty() {
+                self.waiters.remove(&held.before);
+            }
+        }
+        self.deliver(inbox, number, held.message);
+        self.settle(inbox, number);
+    }
+
+    fn drop_assembly(&mut self, inbox: &mut Inbox<'_>, number: u32, reason: DropReason) {
+        if let Some(assembly) = self.remove_assembly(number) {
+            inbox.dropped(assembly.topic(), reason);
+        }
+    }
+
+    /// Stops waiting for the message that is behind all that this held one waits for.
+    fn give_up_before(&mut self, inbox: &mut Inbox<'_>, number: u32) {
+        let mut at = number;
+        while let Some(held) = self.held.get(&at) {
+            at = held.before;
+        }
+        if at != number {
+            self.drop_assembly(inbox, at, DropReason::ReassemblyTimeout);
+            self.settle(inbox, at);
+        }
+    }
+
+    /// Hands out all complete messages in order and drops the unfinished ones: nothing more is expected.
+    pub(crate) fn release_all(&mut self, inbox: &mut Inbox<'_>) {
+        let unfinished: Vec<u32> = self.assemblies.keys().copied().collect();
+        for number in unfinished {
+            self.drop_assembly(inbox, number, DropReason::ReassemblyTimeout);
+            self.settle(inbox, number);
+        }
+        while let Some((&number, _)) = self.held.first_key_value() {
+            self.give_up_before(inbox, number);
+        }
+    }
+
+    /// Frees memory: drops the oldest unfinished message, or stops waiting. Returns whether there was anything to free.
+    pub(crate) fn evict(&mut self, inbox: &mut Inbox<'_>) -> bool {
+        let oldest = self.assemblies.iter().min_by_key(|(_, assembly)| assembly.first_part);
+        if let Some(number) = oldest.map(|(number, _)| *number) {
+            inbox.counters.reassembly_evicted += 1;
+            self.drop_assembly(inbox, number, DropReason::QueueFull);
+            self.settle(inbox, number);
+            return true;
+        }
+        let Some((&number, _)) = self.held.first_key_value() else {
+            return false;
+        };
+        self.give_up_before(inbox, number);
+        true
+    }
+
+    /// When something has to be done: report, or give up.
+    pub(crate) fn next_timeout(&self, connected: bool) -> Option<Instant> {
+        let idle = self.last_feedback.map(|last| last + FEEDBACK_IDLE);
+        let feedback = if self.feedback_due || !connected {
+            None
+        } else {
+            self.feedback_at.or(idle)
+        };
+        [feedback, self.sweep_at, self.hand_out_at].into_iter().flatten().min()
+    }
+
+    /// Does what time has made due.
+    pub(crate) fn handle_timeout(&mut self, inbox: &mut Inbox<'_>) {
+        let now = inbox.now;
+        let idle = self.last_feedback.map(|last| last + FEEDBACK_IDLE);
+        if self.feedback_at.or(idle).is_some_and(|at| at <= now) {
+            self.feedback_due = true;
+        }
+        if self.hand_out_at.is_some_and(|at| at <= now) {
+            self.hand_out(inbox, |_, held| held.hand_out_at().is_some_and(|at| at <= now));
+            self.hand_out_at = self.held.values().filter_map(Held::hand_out_at).min();
+        }
+        if self.sweep_at.is_some_and(|at| at <= now) {
+            self.sweep(inbox);
+        }
+    }
+
+    fn is_overdue(&self, now: Instant, since: Instant, active: Duration) -> bool {
+        self.active.saturating_sub(active) >= PATIENCE || now.saturating_duration_since(since) >= LONGEST_PATIENCE
+    }
+
+    /// Hands out the held messages that must not wait any longer.
+    fn hand_out(&mut self, inbox: &mut Inbox<'_>, must: impl Fn(&Self, &Held) -> bool) {
+        let numbers = (self.held.iter())
+            .filter(|(_, held)| must(self, held))
+            .map(|(number, _)| *number);
+        for number in numbers.collect::<Vec<_>>() {
+            self.give_up_before(inbox, number);
+        }
+    }
+
+    fn sweep(&mut self, inbox: &mut Inbox<'_>) {
+        let now = inbox.now;
+        self.hand_out(inbox, |class, held| class.is_overdue(now, held.since, held.active));
+        let mut gone = Vec::new();
+        for (number, assembly) in &self.assemblies {
+            if assembly.expires.is_some_and(|at| at <= now) {
+                gone.push((*number, DropReason::Lifespan));
+            } else if self.is_overdue(now, assembly.last_part, assembly.active) {
+                gone.push((*number, DropReason::ReassemblyTimeout));
+            }
+        }
+        for (number, reason) in gone {
+            self.drop_assembly(inbox, number, reason);
+            self.settle(inbox, number);
+        }
+        let idle = self.assemblies.is_empty() && self.held.is_empty();
+        self.sweep_at = (!idle).then(|| now + SWEEP);
+    }
+
+    /// Whether a Feedback is to be sent.
+    pub(crate) fn feedback_due(&self) -> bool {
+        self.feedback_due && self.link_epoch != 0
+    }
+
+    /// What to report now. `share` is how much memory this peer may still take.
+    pub(crate) fn feedback(&mut self, now: Instant, class_code: u8, share: u64) -> Feedback {
+        self.feedback_due = false;
+        self.feedback_at = None;
+        self.samples = 0;
+        self.last_feedback = Some(now);
+        let mut highest = self.sequences.last().unwrap_or(self.sequence_floor);
+        let mut missing = Vec::new();
+        let mut gaps = self.sequences.gaps(self.sequence_floor);
+        for (first, last) in gaps.by_ref().take(MISSING_RANGES) {
+            missing.extend([first, last - first + 1]);
+        }
+        // What lies beyond the last range that fits is not told yet.
+        if let (Some((next, _)), true) = (gaps.next(), missing.len() >= 2) {
+            let end = missing[missing.len() - 2] + missing[missing.len() - 1] - 1;
+            debug_assert!(end < next);
+            highest = end;
+        }
+        let (echo_send_ns, echo_held_ns) = self.echo.map_or((0, 0), |(sent, at)| {
+            let held = now.saturating_duration_since(at);
+            (sent, u64::try_from(held.as_nanos()).unwrap_or(u64::MAX))
+        });
+        Feedback {
+            link_epoch: self.link_epoch,
+            link_class: u32::from(class_code),
+            highest_sequence: highest,
+            missing,
+            received_bytes: self.received_bytes,
+            window_bytes: share + self.expected() as u64,
+            delivered_message: u32::try_from(self.message_floor - 1).unwrap_or(u32::MAX),
+            echo_send_ns,
+            echo_held_ns,
+        }
+    }
+}
+
+impl Held {
+    /// When it must not wait any longer.
+    fn hand_out_at(&self) -> Option<Instant> {
+        let lifespan = self.message.frame.lifespan_ms();
+        if lifespan == 0 {
+            return None;
+        }
+        let age = Duration::from_micros(u64::from(self.message.age_us)) + self.message.lag;
+        let left = Duration::from_millis(u64::from(lifespan)).saturating_sub(age + LIFESPAN_RESERVE);
+        self.message.first_part.checked_add(left)
+    }
+}
