@@ -19,7 +19,7 @@ use blaze_proto::link::link_control::{Body, RouteState};
 use bytes::Bytes;
 
 use crate::lane::path::TopicInfo;
-use crate::link::engine::LinkEvent;
+use crate::link::LinkEvent;
 use crate::plan::{Destination, PlanRules, Target, TopicPlan, plan_topic};
 use crate::registry::{EventDraft, Registry, RegistryConfig};
 use crate::world::{FlowState, FlowView, LayerScopeId, Reach, World};
@@ -209,7 +209,7 @@ impl ControlCore {
             }
             LinkEvent::PeerSuspect { flow } => self.registry.set_reach(now, &flow, Reach::Suspect),
             LinkEvent::PeerDown { flow, .. } => self.registry.set_reach(now, &flow, Reach::Down),
-            LinkEvent::PeerForgotten { flow } => self.registry.forget(&flow),
+            LinkEvent::PeerForgotten { flow, .. } => self.registry.forget(&flow),
             _ => BTreeSet::new(),
         };
         self.touch(now, changed);

@@ -10,15 +10,16 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use blaze_domain::control::{LeaseKind, rfc3339_millis};
-use blaze_domain::{Durability, Priority, Reliability, Scope, TopicName};
+use blaze_domain::{Priority, Scope, TopicName};
 use serde_json::{Map, Value, json};
 
 use super::plane::wall_ns;
-use super::{Shared, class_label};
+use super::Shared;
+use crate::link::PeerState;
 use crate::lane::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use crate::plan::Target;
 use crate::registry::{LeaseView, Terms};
-use crate::world::{Advertise, Request, World};
+use crate::world::{Advertise, Request};
 
 type App = State<Arc<Shared>>;
 
@@ -238,26 +239,36 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
 
 async fn peers(State(shared): App) -> Json<Value> {
     let now = Instant::now();
-    let peers = shared.plane.read(|state| state.engine.as_ref().map(|engine| engine.peers(now)).unwrap_or_default());
+    let peers = shared.plane.read(|state| state.engine.as_ref().map(|engine| engine.peers()).unwrap_or_default());
     let control = shared.control.lock();
     let rows: Vec<Value> = peers
         .iter()
         .map(|peer| {
             json!({
                 "flow": peer.flow, "layer": peer.flow.layer, "kind": peer.kind, "epoch": peer.epoch,
-                "version": peer.registry_version, "state": peer.state.as_str(),
+                "version": peer.version, "state": peer_state(peer.state),
                 "last_heard_ms": peer.last_heard.map(|at| rounded(now.saturating_duration_since(at).as_secs_f64() * 1e3)),
                 "rtt_ms": peer.rtt.map(|rtt| rounded(rtt.as_secs_f64() * 1e3)),
                 "clock_offset_ms": peer.clock_offset_ns.map(|ns| rounded(ns as f64 / 1e6)),
-                "clock_error_ms": peer.clock_error_ns.map(|ns| rounded(ns as f64 / 1e6)),
-                "loss": rounded(peer.loss), "address": peer.address,
+                "clock_error_ms": peer.clock_error.map(|error| rounded(error.as_secs_f64() * 1e3)),
+                "loss": rounded(peer.loss), "address": null,
                 "in_step": control.registry().is_in_step_with(&peer.flow),
-                "outstanding_bytes": peer.outstanding_bytes, "window_bytes": peer.window_bytes,
+                "outstanding_bytes": peer.outstanding_bytes, "window_bytes": peer.window_bytes, "queue_bytes": peer.queue_bytes,
+                "receiving_bytes_per_s": peer.receiving_bytes_per_s.round(),
+                "queueing_delay_ms": rounded(peer.queueing_delay.as_secs_f64() * 1e3),
             })
         })
         .collect();
     drop(control);
     answer(&shared, json!({"peers": rows}))
+}
+
+fn peer_state(state: PeerState) -> &'static str {
+    match state {
+        PeerState::Up => "up",
+        PeerState::Suspect => "suspect",
+        PeerState::Down => "down",
+    }
 }
 
 async fn allocation(State(shared): App) -> Json<Value> {
@@ -329,22 +340,4 @@ const MAX_QUERY: usize = 1024;
 /// `topic` and `to` of a question, checked for length.
 pub(super) fn query_text(query: &Query<BTreeMap<String, String>>, key: &str) -> Option<String> {
     query.get(key).filter(|text| text.len() <= MAX_QUERY).cloned()
-}
-
-/// What an advertise says about quality, for steps of `why`.
-pub(super) fn describe(advertise: &Advertise) -> String {
-    let durable = if advertise.durability == Durability::TransientLocal { ", transient_local" } else { "" };
-    let reliable = if advertise.reliability == Reliability::Reliable { "reliable" } else { "best_effort" };
-    let sources: Vec<_> = advertise.sources.iter().map(|source| source.service.as_str()).collect();
-    format!("{} ({reliable}{durable})", sources.join(", "))
-}
-
-/// Whether any flow knows the topic.
-pub(super) fn known(world: &World, topic: &TopicName) -> bool {
-    world.flows.values().any(|flow| flow.topics.contains_key(topic))
-}
-
-/// The class labels, for metrics.
-pub(super) fn classes() -> [&'static str; 3] {
-    [class_label(0), class_label(1), class_label(2)]
 }

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use blaze_brokers::{Broker, BrokerError, Content, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription};
 use blaze_domain::Scope;
 use blaze_domain::names::ChannelName;
+use blaze_proto::link::link_control::State as HelloState;
 use bytes::Bytes;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
@@ -14,7 +15,6 @@ use tokio_util::sync::CancellationToken;
 use super::Shared;
 use super::plane::wall_ns;
 use crate::control::Output;
-use crate::link::engine::HelloState;
 use crate::world::FlowState;
 
 /// How often what is due is looked for.
@@ -87,7 +87,7 @@ impl ControlTask {
         {
             let mut control = self.shared.control.lock();
             for event in self.shared.plane.take_news() {
-                if let crate::link::engine::LinkEvent::Addresses(addresses) = &event {
+                if let crate::link::LinkEvent::Addresses(addresses) = &event {
                     if let Some(transport) = &self.shared.transport {
                         transport.learn(addresses);
                     }

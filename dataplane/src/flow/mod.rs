@@ -15,6 +15,7 @@ pub mod pacing;
 pub mod plane;
 mod routes;
 pub mod settings;
+mod why;
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -23,10 +24,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use blaze_brokers::{Broker, Health};
+use blaze_brokers::{Broker, BrokerKind, Health};
 use blaze_domain::{FlowId, Priority};
-use blaze_runtime::admin::{AdminServer, CheckState, Readiness};
-use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
+use blaze_proto::link::link_control::LayerScope;
+use blaze_runtime::admin::{AdminServer, CheckStatus, Gate, Readiness};
+use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
@@ -34,7 +36,7 @@ use tokio_util::sync::CancellationToken;
 use crate::control::{ControlConfig, ControlCore};
 use crate::lane::core::{DataConfig, DataCore};
 use crate::link::dds::{DdsConfig, DdsStatus, DdsTransport};
-use crate::link::engine::{Engine, EngineConfig};
+use crate::link::{Engine, EngineConfig, Limits};
 use crate::link::transport::{Endpoint, Transport};
 use crate::world::LayerScopeId;
 use pacing::Egress;
@@ -99,7 +101,7 @@ pub struct RunningFlow {
     supervisor: Supervisor,
     admin: SocketAddr,
     draining: CancellationToken,
-    pacer: Option<blaze_runtime::supervisor::ThreadHandle>,
+    pacer: Option<TaskHandle>,
 }
 
 /// How long a flow takes at most to let out what is queued.
@@ -128,7 +130,14 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
     });
     let engine = settings.inter.as_ref().map(|inter| {
         let max_datagram = crate::link::dds::max_datagram_bytes(inter.mtu.into(), inter.chunking, inter.listen_address());
-        let config = EngineConfig::new(settings.me.clone(), settings.kind, epoch, layer_scope, max_datagram);
+        let config = EngineConfig {
+            me: settings.me.clone(),
+            kind: settings.kind,
+            epoch,
+            layer_scope: said_layer_scope(layer.as_ref()),
+            max_datagram,
+            limits: Limits::default(),
+        };
         Engine::new(config, now, wall_ns())
     });
     let plane = Plane::new(core, engine);
@@ -173,10 +182,10 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         admin::router(Arc::clone(&shared)),
         readiness,
         Arc::new(move || metrics::render(&metrics_of)),
-        &supervisor,
     )
-    .await
-    .with_context(|| format!("admin port {}", settings.admin))?;
+    .await?;
+    let address = admin.address();
+    admin.serve(&supervisor);
 
     let ready = Arc::new(Notify::new());
     let draining = CancellationToken::new();
@@ -188,15 +197,18 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
     };
     supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
     supervisor.spawn("health", TaskPolicy::Essential, watch_health(Arc::clone(&shared), ready));
-    let pacer = shared.transport.is_some().then(|| {
+    let pacer = if shared.transport.is_some() {
         let shared = Arc::clone(&shared);
-        supervisor.spawn_thread("pacer", TaskPolicy::MayEnd, move || {
+        let run = move || {
             if let Some(transport) = &shared.transport {
                 shared.egress.run(&shared.plane, &transport.dds);
             }
-        })
-    });
-    Ok(RunningFlow { shared, supervisor, admin: admin.address(), draining, pacer })
+        };
+        Some(supervisor.spawn_thread("pacer", TaskPolicy::MayEnd, run)?)
+    } else {
+        None
+    };
+    Ok(RunningFlow { shared, supervisor, admin: address, draining, pacer })
 }
 
 impl RunningFlow {
@@ -214,7 +226,7 @@ impl RunningFlow {
 
     /// Waits until all checks of `/readyz` are well.
     pub async fn ready(&self) {
-        self.shared.readiness.wait_ready().await;
+        self.shared.readiness.ready().await;
     }
 
     /// Whether all checks of `/readyz` are well.
@@ -234,7 +246,7 @@ impl RunningFlow {
 
     /// Drains: takes in nothing more, lets out what is queued, says good-bye, ends.
     pub async fn shutdown(mut self) {
-        self.shared.readiness.set_draining();
+        self.shared.readiness.stop();
         self.draining.cancel();
         let until = Instant::now() + DRAIN;
         let still_draining = || {
@@ -254,7 +266,7 @@ impl RunningFlow {
         self.shared.egress.stop();
         self.shared.plane.wake();
         if let Some(pacer) = self.pacer.take() {
-            pacer.join().await;
+            pacer.finished().await;
         }
         self.supervisor.shutdown(Duration::from_secs(1)).await;
     }
@@ -299,18 +311,26 @@ impl Epochs {
     }
 }
 
+/// What Hello says of the layer broker. One that only this process sees is none to others, and has an identity all the
+/// same: flows of this process share it.
+fn said_layer_scope(layer: Option<&LayerBroker>) -> (LayerScope, u64) {
+    let Some(layer) = layer else { return (LayerScope::None, 0) };
+    let kind = match layer.broker.kind() {
+        BrokerKind::Kafka => LayerScope::Kafka,
+        BrokerKind::Dds | BrokerKind::Ros2 => LayerScope::Dds,
+        BrokerKind::Memory | BrokerKind::Redis => LayerScope::None,
+    };
+    (kind, layer.id.0)
+}
+
 fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {
-    let mut checks = Vec::new();
-    if brokers.node.is_some() {
-        checks.push("node_broker");
+    let readiness = Readiness::new();
+    let there = [("node_broker", brokers.node.is_some()), ("layer_broker", brokers.layer.is_some()), ("inter", inter)];
+    for (check, _) in there.into_iter().filter(|(_, there)| *there) {
+        readiness.add(check, Gate::Decides, CheckStatus::Failed, "starting");
     }
-    if brokers.layer.is_some() {
-        checks.push("layer_broker");
-    }
-    if inter {
-        checks.push("inter");
-    }
-    Readiness::new(&checks, &["config"])
+    readiness.add("config", Gate::Shows, CheckStatus::Ok, "");
+    readiness
 }
 
 /// Keeps the checks of `/readyz` true to brokers and link.
@@ -320,17 +340,17 @@ async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>) {
         for (check, broker) in [("node_broker", &shared.brokers.node), ("layer_broker", &shared.brokers.layer)] {
             let Some(broker) = broker else { continue };
             let status = broker.status().borrow().clone();
-            let state = if status.health == Health::Up { CheckState::Ok } else { CheckState::Failed };
-            shared.readiness.set(check, state, &status.detail);
+            let state = if status.health == Health::Up { CheckStatus::Ok } else { CheckStatus::Failed };
+            shared.readiness.set(check, state, status.detail);
         }
         if let Some(transport) = &shared.transport {
             let status = transport.status();
             let (state, detail) = match (status.ready, listened) {
-                (true, true) => (CheckState::Ok, status.detail),
-                (true, false) => (CheckState::Failed, "listening for other flows".to_owned()),
-                (false, _) => (CheckState::Failed, status.detail),
+                (true, true) => (CheckStatus::Ok, status.detail),
+                (true, false) => (CheckStatus::Failed, "listening for other flows".to_owned()),
+                (false, _) => (CheckStatus::Failed, status.detail),
             };
-            shared.readiness.set("inter", state, &detail);
+            shared.readiness.set("inter", state, detail);
         }
         tokio::select! {
             () = tokio::time::sleep(HEALTH) => {}

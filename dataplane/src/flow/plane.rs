@@ -13,9 +13,9 @@ use blaze_domain::{DropReason, Scope};
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::Notify;
 
-use crate::lane::core::{DataCore, LaneLink, Submit};
-use crate::lane::path::{LaneId, TopicId};
-use crate::link::engine::{Engine, LinkEvent, Transmit};
+use crate::lane::core::{DataCore, LaneLink};
+use crate::lane::path::TopicId;
+use crate::link::{Engine, LaneId, LinkEvent, Submit, Transmit};
 use crate::link::transport::TransportEvent;
 
 /// Link events that wait for the control core; Hellos and registry messages beyond it are dropped and repaired by the
@@ -47,7 +47,9 @@ impl LaneLink for NoLink {
     fn queued(&self, _lane: LaneId) -> u64 {
         0
     }
-    fn drop_lane(&mut self, _lane: LaneId) {}
+    fn drop_lane(&mut self, _lane: LaneId) -> u64 {
+        0
+    }
 }
 
 impl PlaneState {
@@ -65,9 +67,8 @@ impl PlaneState {
         while let Some(event) = engine.poll_event() {
             match event {
                 LinkEvent::Deliver { frame, .. } => self.core.deliver(now, frame, engine),
-                LinkEvent::LaneOut { lane, messages, bytes, age, .. } => {
-                    self.core.lane_out(now, lane, messages, bytes, crate::lane::measure::micros(age));
-                }
+                LinkEvent::LaneSent { lane, bytes, wait } => self.core.lane_sent(now, lane, bytes as u64, wait),
+                LinkEvent::LaneOut { lane, messages, bytes, .. } => self.core.lane_out(lane, messages, bytes as u64),
                 LinkEvent::LaneDropped { lane, reason, messages, .. } => self.core.lane_dropped(lane, reason, messages),
                 LinkEvent::ReceiverDropped { topic, reason, messages } => {
                     self.core.receiver_dropped(&topic, reason, messages);

@@ -20,10 +20,11 @@ use bytes::Bytes;
 use lru::LruCache;
 
 use super::measure::{RateMeter, micros};
-use super::path::{BridgeState, LaneId, Phase, Sink, TopicId, TopicInfo, TopicPath};
+use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
 use super::stats::{BridgeStats, Drops};
 use super::window::DuplicateWindow;
 use crate::limit::bucket::TokenBucket;
+use crate::link::{Engine, LaneId, StreamKey, Submit};
 use crate::plan::{Bridge, Target, TopicPlan};
 
 /// Writers whose duplicate window a flow keeps; the least recently used go first.
@@ -32,24 +33,6 @@ pub const MAX_WRITERS: usize = 65_536;
 pub const MAX_TOPICS: usize = 10_000;
 /// How long a bridge whose pair has vanished may empty its queue.
 pub const DRAIN: Duration = Duration::from_millis(500);
-
-/// A message for the link.
-pub struct Submit<'a> {
-    /// Receiving flow.
-    pub to: &'a FlowId,
-    /// Class on the link.
-    pub class: Priority,
-    /// Lane, for accounting.
-    pub lane: LaneId,
-    /// Order is kept within topic and writer.
-    pub topic: TopicId,
-    /// The message; its age is right at `now`.
-    pub frame: Frame,
-    /// Send again what is lost.
-    pub reliable: bool,
-    /// Milliseconds of age after which it is of no use; 0 = none.
-    pub lifespan_ms: u32,
-}
 
 /// The link, as the data plane sees it.
 pub trait LaneLink {
@@ -60,8 +43,20 @@ pub trait LaneLink {
     fn submit(&mut self, now: Instant, message: Submit<'_>) -> Result<(), DropReason>;
     /// Messages of a lane that are queued or not yet acknowledged.
     fn queued(&self, lane: LaneId) -> u64;
-    /// Drops what is queued of a lane; the drops come back as events.
-    fn drop_lane(&mut self, lane: LaneId);
+    /// Drops what is queued of a lane, and gives how many messages that were; the caller counts them.
+    fn drop_lane(&mut self, lane: LaneId) -> u64;
+}
+
+impl LaneLink for Engine {
+    fn submit(&mut self, now: Instant, message: Submit<'_>) -> Result<(), DropReason> {
+        Engine::submit(self, now, message)
+    }
+    fn queued(&self, lane: LaneId) -> u64 {
+        self.lane_queued(lane).messages
+    }
+    fn drop_lane(&mut self, lane: LaneId) -> u64 {
+        Engine::drop_lane(self, lane).messages
+    }
 }
 
 /// What a data plane is told at its start, and what may change while it runs.
@@ -95,6 +90,8 @@ struct Admitted {
     frame: Frame,
     born_here: bool,
     age_us: u64,
+    /// Since it came to this flow.
+    here_us: u64,
 }
 
 impl DataCore {
@@ -279,12 +276,18 @@ impl DataCore {
         );
     }
 
-    /// What the link says of a lane.
-    pub fn lane_out(&mut self, now: Instant, lane: LaneId, messages: u64, bytes: u64, age_us: u64) {
+    /// The link has sent the last byte of a message for the first time.
+    pub fn lane_sent(&mut self, now: Instant, lane: LaneId, bytes: u64, wait: Duration) {
+        if let Some(bridge) = self.lane_bridge(lane) {
+            bridge.out_rate.add(now, bytes);
+            bridge.stats.latency.record(micros(wait));
+        }
+    }
+
+    /// Messages of a lane have left for good.
+    pub fn lane_out(&mut self, lane: LaneId, messages: u64, bytes: u64) {
         if let Some(bridge) = self.lane_bridge(lane) {
             bridge.stats.out.add_many(messages, bytes);
-            bridge.out_rate.add(now, bytes);
-            bridge.stats.latency.record(age_us);
         }
     }
 
@@ -316,7 +319,7 @@ impl DataCore {
             };
             if lane.is_none_or(|lane| link.queued(lane) == 0) || now >= until {
                 if let Some(lane) = lane {
-                    link.drop_lane(lane);
+                    bridge.stats.dropped.add(DropReason::NoDestination, link.drop_lane(lane));
                 }
                 bridge.phase = Phase::Ended;
             } else {
@@ -339,7 +342,8 @@ impl DataCore {
         from: Scope,
         received: Received,
     ) -> Result<Admitted, DropReason> {
-        let waited_us = received.broker_age_us + micros(now.saturating_duration_since(received.at));
+        let at = received.at;
+        let waited_us = received.broker_age_us + micros(now.saturating_duration_since(at));
         let (frame, bare) = match received.content {
             Content::Malformed { .. } => return Err(DropReason::DecodeError),
             Content::Frame(frame) => (frame, false),
@@ -531,7 +535,7 @@ impl BridgeState {
                 match outcome {
                     PublishOutcome::Taken => {
                         self.stats.out.add(bytes);
-                        self.stats.latency.record(message.age_us);
+                        self.stats.latency.record(message.here_us);
                         self.out_rate.add(now, bytes);
                     }
                     PublishOutcome::Dropped => self.stats.dropped.add(DropReason::BrokerError, 1),
@@ -555,10 +559,11 @@ impl BridgeState {
                     to: receiver,
                     class: *class,
                     lane: *lane,
-                    topic,
+                    stream: StreamKey { topic: topic.0, writer: frame.writer() },
                     frame: frame.clone().with_hops_and_age(frame.hops(), message.age_us),
+                    arrived: now,
                     reliable: self.lane.reliable,
-                    lifespan_ms,
+                    lifespan: (lifespan_ms > 0).then(|| Duration::from_millis(lifespan_ms.into())),
                 };
                 if let Err(reason) = link.submit(now, submit) {
                     self.stats.dropped.add(reason, 1);

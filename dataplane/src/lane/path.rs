@@ -10,15 +10,12 @@ use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WriterId};
 use super::measure::RateMeter;
 use super::stats::{BridgeStats, Drops};
 use crate::limit::bucket::TokenBucket;
+use crate::link::LaneId;
 use crate::plan::{LaneSpec, Target};
 
 /// A topic, interned: its place in the data plane.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct TopicId(pub u32);
-
-/// A lane of the link, interned.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct LaneId(pub u32);
 
 /// What local advertisements say of a topic: the ground for headers of bare messages and for its class.
 #[derive(Debug, Clone, PartialEq, Default)]

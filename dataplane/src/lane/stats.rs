@@ -66,7 +66,7 @@ pub struct BridgeStats {
     pub out: Count,
     /// Dropped, by reason.
     pub dropped: Drops,
-    /// Age of the messages when they were written.
+    /// Time that the messages spent in this flow until they were written; on the link until their last byte was sent.
     pub latency: LatencyHistogram,
 }
 

@@ -36,15 +36,10 @@ const MAX_HEARD: usize = 1024;
 const TOPIC_PREFIX: &str = "blaze/link/";
 const CLASSES: usize = Priority::ALL.len();
 
-/// How large datagrams are made.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Chunking {
-    /// `Mtu`, but large ones between flows of one host (loopback), which lose nothing and cost less CPU.
-    Auto,
-    /// One packet of the path each.
-    Mtu,
-    /// Large ones, for clean networks: one lost packet of them costs the whole datagram.
-    Whole,
+/// Largest datagram that a transport with these settings takes, in bytes.
+#[must_use]
+pub fn max_datagram_bytes(mtu: usize, chunking: Chunking, listen: IpAddr) -> usize {
+    Wire::new(mtu, chunking, listen.is_loopback()).max_datagram_bytes()
 }
 
 /// Called with everything that happens. It runs in the threads of the transport and must not wait for long.

@@ -10,10 +10,11 @@ use blaze_domain::{FlowId, LayerKind, Origin, Priority, Scope, TopicName, Writer
 use blaze_flow::control::{ControlConfig, ControlCore, Output};
 use blaze_flow::flow::plane::PlaneState;
 use blaze_flow::lane::core::{DataConfig, DataCore};
-use blaze_flow::link::engine::{Engine, EngineConfig};
+use blaze_flow::link::{Engine, EngineConfig, Limits};
 use blaze_flow::link::transport::Endpoint;
 use blaze_flow::plan::{PlanRules, Target};
 use blaze_flow::world::{FlowState, LayerScopeId};
+use blaze_proto::link::link_control::{LayerScope, State};
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
 use parking_lot::Mutex;
@@ -188,7 +189,15 @@ impl<'a> Simulation<'a> {
             self.now,
         );
         let core = DataCore::new(DataConfig { me: id.clone(), epoch, large_bytes: 65_536, salt: index as u32 });
-        let engine = Engine::new(EngineConfig::new(id.clone(), kind, epoch, Some(layer_scope), 1300), self.now, self.wall());
+        let engine_config = EngineConfig {
+            me: id.clone(),
+            kind,
+            epoch,
+            layer_scope: (LayerScope::Kafka, layer_scope.0),
+            max_datagram: 1300,
+            limits: Limits::default(),
+        };
+        let engine = Engine::new(engine_config, self.now, self.wall());
         let plane = PlaneState { core, engine: Some(engine) };
         Flow { id, epoch, alive: true, control, plane, subscribed: BTreeSet::new() }
     }
@@ -448,9 +457,9 @@ impl<'a> Simulation<'a> {
             let Some(engine) = &mut flow.plane.engine else { continue };
             match output {
                 Output::Publish { .. } => {}
-                Output::Link { to, body } => engine.send_control(now, &to, body),
+                Output::Link { to, body } => drop(engine.send_control(now, &to, body)),
                 Output::Announce { version, digest } => engine.set_registry(now, version, digest),
-                Output::State(state) => engine.set_state(now, state),
+                Output::State(state) => engine.set_state(now, hello_state(state)),
                 Output::Plan { topic, plan, info } => {
                     let Some(id) = flow.plane.core.intern(&topic, now) else { continue };
                     flow.plane.core.apply(now, id, *info, &plan, |target| {
@@ -577,5 +586,13 @@ impl<'a> Simulation<'a> {
             text.push_str("not all flows are ready");
         }
         text
+    }
+}
+
+fn hello_state(state: FlowState) -> State {
+    match state {
+        FlowState::Starting => State::Starting,
+        FlowState::Ready => State::Ready,
+        FlowState::Draining => State::Draining,
     }
 }

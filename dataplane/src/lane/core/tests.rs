@@ -27,7 +27,9 @@ impl LaneLink for NotingLink {
     fn queued(&self, lane: LaneId) -> u64 {
         self.waiting.get(&lane).copied().unwrap_or(0)
     }
-    fn drop_lane(&mut self, _lane: LaneId) {}
+    fn drop_lane(&mut self, lane: LaneId) -> u64 {
+        self.waiting.remove(&lane).unwrap_or(0)
+    }
 }
 
 #[derive(Default)]
