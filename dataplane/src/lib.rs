@@ -2,4 +2,5 @@
 
 pub mod link;
 pub mod plan;
+pub mod why;
 pub mod world;

@@ -17,14 +17,15 @@ mod rules;
 mod view;
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::collections::BTreeMap;
 
 use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WhyCode};
 
+pub(crate) use lane::asks_too_much;
 pub use rules::{PlanRules, TopicRule};
-pub(crate) use view::{Publisher, Requester, TopicView};
+pub(crate) use view::{Group, Pairing, Publisher, Requester, TopicView, meets_directly, type_detail};
 
 use crate::world::{FlowState, OriginFilter, World};
 use lane::LaneBuilder;
