@@ -1,11 +1,12 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
-use blaze_domain::{Durability, Reliability};
+use blaze_domain::{DropReason, Durability, Reliability};
 
 use super::*;
 use crate::plan::tests::generate::{Dice, System};
 use crate::plan::tests::worlds::{ask, entry, filter, id, offer, topic, world};
-use crate::plan::{PlanRules, plan_topic};
+use crate::plan::{PlanRules, TopicPlan, plan_topic};
+use crate::world::World;
 
 /// A question, with everything well: each planned bridge is up and carried ten messages.
 struct Setup {

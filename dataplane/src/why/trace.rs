@@ -209,11 +209,7 @@ impl<'w> Tracer<'_, 'w> {
                 .bridges
                 .iter()
                 .filter(|bridge| bridge.from == publisher.scope);
-            let receiver = |to| match to {
-                &Target::Inter { ref receiver, .. } => Some(receiver),
-                Target::Node { .. } | Target::Layer => None,
-            };
-            targets.filter_map(|bridge| receiver(&bridge.to)).collect()
+            targets.filter_map(|bridge| bridge.to.receiver()).collect()
         } else {
             let routes = self.input.routes.iter().filter(|route| route.flow == *sender);
             routes.filter_map(|route| route.receiver.as_ref()).collect()
@@ -223,9 +219,9 @@ impl<'w> Tracer<'_, 'w> {
 
     fn hop(&self, trace: &mut Trace, hop: &Hop<'w>) {
         if hop.flow == self.view.me {
-            self.own_hop(trace, hop)
+            self.own_hop(trace, hop);
         } else {
-            self.other_hop(trace, hop)
+            self.other_hop(trace, hop);
         }
     }
 
