@@ -7,4 +7,5 @@ pub mod limit;
 pub mod link;
 pub mod plan;
 pub mod registry;
+pub mod why;
 pub mod world;

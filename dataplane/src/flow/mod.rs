@@ -108,6 +108,8 @@ pub struct RunningFlow {
 const DRAIN: Duration = Duration::from_millis(600);
 /// How long its good-bye may take to leave.
 const GOODBYE: Duration = Duration::from_millis(100);
+/// `why` looks at what happened during the last one to two of these.
+const MARK: Duration = Duration::from_secs(2);
 /// How often the health of brokers and link is looked at.
 const HEALTH: Duration = Duration::from_millis(200);
 
@@ -336,7 +338,12 @@ fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {
 /// Keeps the checks of `/readyz` true to brokers and link.
 async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>) {
     let mut listened = false;
+    let mut marked = Instant::now();
     loop {
+        if marked.elapsed() >= MARK {
+            marked = Instant::now();
+            shared.plane.read(|state| state.core.mark());
+        }
         for (check, broker) in [("node_broker", &shared.brokers.node), ("layer_broker", &shared.brokers.layer)] {
             let Some(broker) = broker else { continue };
             let status = broker.status().borrow().clone();

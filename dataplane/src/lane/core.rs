@@ -146,6 +146,13 @@ impl DataCore {
         bridges.any(|bridge| matches!(bridge.phase, Phase::Draining { .. }))
     }
 
+    /// Puts a mark into the counters of every bridge: what happened since the one before is "lately".
+    pub fn mark(&mut self) {
+        for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
+            bridge.stats.mark();
+        }
+    }
+
     /// Changes what counts as large, from the next message on.
     pub fn set_large_bytes(&mut self, bytes: u64) {
         self.config.large_bytes = bytes;
@@ -271,6 +278,7 @@ impl DataCore {
                 frame,
                 born_here: false,
                 age_us,
+                here_us: 0,
             },
             link,
         );
@@ -319,7 +327,10 @@ impl DataCore {
             };
             if lane.is_none_or(|lane| link.queued(lane) == 0) || now >= until {
                 if let Some(lane) = lane {
-                    bridge.stats.dropped.add(DropReason::NoDestination, link.drop_lane(lane));
+                    bridge
+                        .stats
+                        .dropped
+                        .add(DropReason::NoDestination, link.drop_lane(lane));
                 }
                 bridge.phase = Phase::Ended;
             } else {
@@ -383,10 +394,12 @@ impl DataCore {
         let bytes = frame.payload().len() as u64;
         path.largest_bytes = path.largest_bytes.max(bytes);
         path.in_rate.add(now, bytes);
+        let here_us = micros(now.saturating_duration_since(at));
         Ok(Admitted {
             frame,
             born_here,
             age_us,
+            here_us,
         })
     }
 
@@ -559,7 +572,10 @@ impl BridgeState {
                     to: receiver,
                     class: *class,
                     lane: *lane,
-                    stream: StreamKey { topic: topic.0, writer: frame.writer() },
+                    stream: StreamKey {
+                        topic: topic.0,
+                        writer: frame.writer(),
+                    },
                     frame: frame.clone().with_hops_and_age(frame.hops(), message.age_us),
                     arrived: now,
                     reliable: self.lane.reliable,

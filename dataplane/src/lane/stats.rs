@@ -57,6 +57,25 @@ impl Drops {
     }
 }
 
+/// Counters of a bridge at one moment, so that what happened lately can be told.
+#[derive(Debug, Clone, Default)]
+pub struct Mark {
+    taken: u64,
+    out: u64,
+    dropped: Drops,
+}
+
+/// What happened lately.
+#[derive(Debug, Clone, Default)]
+pub struct Lately {
+    /// Messages taken in.
+    pub taken: u64,
+    /// Messages written.
+    pub out: u64,
+    /// Messages dropped, by reason.
+    pub dropped: Vec<(DropReason, u64)>,
+}
+
 /// What went through one bridge since it was first made.
 #[derive(Debug, Clone, Default)]
 pub struct BridgeStats {
@@ -68,9 +87,35 @@ pub struct BridgeStats {
     pub dropped: Drops,
     /// Time that the messages spent in this flow until they were written; on the link until their last byte was sent.
     pub latency: LatencyHistogram,
+    marks: [Mark; 2],
 }
 
 impl BridgeStats {
+    /// Puts a mark, from which [`BridgeStats::lately`] counts once the next one is put.
+    pub fn mark(&mut self) {
+        let mark = Mark {
+            taken: self.taken.messages,
+            out: self.out.messages,
+            dropped: self.dropped.clone(),
+        };
+        self.marks = [std::mem::take(&mut self.marks[1]), mark];
+    }
+
+    /// What happened since the mark before the last.
+    #[must_use]
+    pub fn lately(&self) -> Lately {
+        let before = &self.marks[0];
+        let dropped = self
+            .dropped
+            .iter()
+            .map(|(reason, count)| (reason, count - before.dropped.get(reason)));
+        Lately {
+            taken: self.taken.messages - before.taken,
+            out: self.out.messages - before.out,
+            dropped: dropped.filter(|(_, count)| *count > 0).collect(),
+        }
+    }
+
     /// Messages that are inside: taken in, neither written nor dropped.
     #[must_use]
     pub fn queued(&self) -> u64 {

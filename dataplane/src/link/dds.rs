@@ -21,6 +21,7 @@ use std::thread::JoinHandle;
 use std::time::Instant;
 
 use blaze_brokers::dds::{DdsError, GuidPrefix, Profile, Relay, RelayConfig, Writer};
+use blaze_domain::node_file::Chunking;
 use blaze_domain::{FlowId, Priority};
 use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};

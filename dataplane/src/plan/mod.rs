@@ -17,14 +17,15 @@ mod rules;
 mod view;
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::collections::BTreeMap;
 
 use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WhyCode};
 
+pub(crate) use lane::asks_too_much;
 pub use rules::{PlanRules, TopicRule};
-pub(crate) use view::{Publisher, Requester, TopicView};
+pub(crate) use view::{Group, Pairing, Publisher, Requester, TopicView, meets_directly, type_detail};
 
 use crate::world::{FlowState, OriginFilter, World};
 use lane::LaneBuilder;
@@ -66,6 +67,17 @@ pub enum Target {
         /// The flow that takes it in for its group.
         receiver: FlowId,
     },
+}
+
+impl Target {
+    /// The other flow, of a target on the inter scope.
+    #[must_use]
+    pub fn receiver(&self) -> Option<&FlowId> {
+        match self {
+            Self::Inter { receiver, .. } => Some(receiver),
+            Self::Node { .. } | Self::Layer => None,
+        }
+    }
 }
 
 /// What the requesters behind a bridge ask of it, within what is offered.
@@ -144,9 +156,9 @@ pub fn plan_topic(world: &World, topic: &TopicName, rules: &PlanRules, previous:
         bridges: BTreeMap::new(),
     };
     if world.own().is_some_and(|own| own.state == FlowState::Ready) {
-        plan.from_node(previous);
-        plan.from_layer(previous);
-        plan.from_inter();
+        plan.read_node(previous);
+        plan.read_layer(previous);
+        plan.read_inter();
     }
     TopicPlan {
         bridges: plan
@@ -193,7 +205,7 @@ struct Planner<'a, 'w> {
 
 impl Planner<'_, '_> {
     /// What services of the own node publish: a bare copy beside it, to the own layer, to every other group.
-    fn from_node(&mut self, previous: Option<&TopicPlan>) {
+    fn read_node(&mut self, previous: Option<&TopicPlan>) {
         let Some(publisher) = self.view.own_node_publisher() else {
             return;
         };
@@ -204,11 +216,11 @@ impl Planner<'_, '_> {
             .lanes
             .lane(self.view.pairs([publisher], self.view.requesters_over_own_layer()));
         self.put(Scope::Node, Target::Layer, lane);
-        self.to_other_groups(publisher, previous);
+        self.send_to_other_groups(publisher, previous);
     }
 
     /// What is on the own layer scope: to the own node, and what was born there to every other group.
-    fn from_layer(&mut self, previous: Option<&TopicPlan>) {
+    fn read_layer(&mut self, previous: Option<&TopicPlan>) {
         if let Some(own) = self.view.own_node_requester() {
             let sources = self.view.publishers_over_own_layer(own);
             let lane = self.lanes.lane(self.view.pairs(sources, [own]));
@@ -216,12 +228,12 @@ impl Planner<'_, '_> {
         }
         let publisher = self.view.own_layer_publisher();
         if let Some(publisher) = publisher.filter(|_| self.view.owner() == Some(self.view.me)) {
-            self.to_other_groups(publisher, previous);
+            self.send_to_other_groups(publisher, previous);
         }
     }
 
     /// What other groups publish, where their senders choose this flow.
-    fn from_inter(&mut self) {
+    fn read_inter(&mut self) {
         let delivery = deliver(self.view, self.lanes);
         let mine: Vec<_> = self
             .view
@@ -242,15 +254,12 @@ impl Planner<'_, '_> {
     }
 
     /// One copy to one flow of each other group that asks for it.
-    fn to_other_groups(&mut self, publisher: &Publisher<'_>, previous: Option<&TopicPlan>) {
+    fn send_to_other_groups(&mut self, publisher: &Publisher<'_>, previous: Option<&TopicPlan>) {
         let kept: Vec<&FlowId> = previous
             .iter()
             .flat_map(|plan| &plan.bridges)
             .filter(|bridge| bridge.from == publisher.scope)
-            .filter_map(|bridge| match &bridge.to {
-                Target::Inter { receiver, .. } => Some(receiver),
-                Target::Node { .. } | Target::Layer => None,
-            })
+            .filter_map(|bridge| bridge.to.receiver())
             .collect();
         for (group, requesters) in self.view.requesters_outside() {
             let lane = self

@@ -256,10 +256,15 @@ impl<'w> TopicView<'w> {
 
     /// The flow of the own group that carries what is published on the layer scope to other groups.
     pub(crate) fn owner(&self) -> Option<&'w FlowId> {
-        let sees_it = |publisher: &&Publisher<'_>| publisher.group == self.group && publisher.scope == Scope::Layer;
+        self.owner_in(self.group)
+    }
+
+    /// The same of any group.
+    pub(crate) fn owner_in(&self, group: Group<'w>) -> Option<&'w FlowId> {
+        let on_layer = |publisher: &&Publisher<'_>| publisher.group == group && publisher.scope == Scope::Layer;
         rendezvous::choose(
             self.topic.as_str(),
-            self.publishers.iter().filter(sees_it).map(|publisher| publisher.flow),
+            self.publishers.iter().filter(on_layer).map(|publisher| publisher.flow),
         )
     }
 
@@ -313,7 +318,7 @@ impl<'w> TopicView<'w> {
 }
 
 /// Whether the services share a scope, so that no flow is between them (a bare copy is made by one).
-fn meets_directly(publisher: &Publisher<'_>, requester: &Requester<'_>) -> bool {
+pub(crate) fn meets_directly(publisher: &Publisher<'_>, requester: &Requester<'_>) -> bool {
     publisher.scope == requester.scope
         && match publisher.scope {
             Scope::Node | Scope::Inter => publisher.flow == requester.flow && !requester.request.bare,

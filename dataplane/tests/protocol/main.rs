@@ -11,7 +11,11 @@ use world::{Chaos, Simulation};
 
 /// Seeds of the default run and of `scripts/test --long`.
 fn seeds() -> u64 {
-    if std::env::var_os("BLAZE_LONG").is_some() { 1000 } else { 120 }
+    if std::env::var_os("BLAZE_LONG").is_some() {
+        1000
+    } else {
+        120
+    }
 }
 
 fn run_seeds(name: &str, chaos: &Chaos) {
@@ -26,15 +30,35 @@ fn run_seeds(name: &str, chaos: &Chaos) {
             }
         }
     }
-    assert!(failures.is_empty(), "{name} (BLAZE_SEED=n repeats one):\n{}", failures.join("\n"));
+    assert!(
+        failures.is_empty(),
+        "{name} (BLAZE_SEED=n repeats one):\n{}",
+        failures.join("\n")
+    );
 }
 
 #[test]
 fn after_quiet_everybody_gets_everything_once() {
-    run_seeds("everything", &Chaos { loss: 0.05, partitions: true, restarts: true, churn: true });
+    run_seeds(
+        "everything",
+        &Chaos {
+            loss: 0.05,
+            partitions: true,
+            restarts: true,
+            churn: true,
+        },
+    );
 }
 
 #[test]
 fn a_calm_network_loses_nothing_reliable() {
-    run_seeds("calm", &Chaos { loss: 0.0, partitions: false, restarts: false, churn: false });
+    run_seeds(
+        "calm",
+        &Chaos {
+            loss: 0.0,
+            partitions: false,
+            restarts: false,
+            churn: false,
+        },
+    );
 }

@@ -10,8 +10,8 @@ use blaze_domain::{FlowId, LayerKind, Origin, Priority, Scope, TopicName, Writer
 use blaze_flow::control::{ControlConfig, ControlCore, Output};
 use blaze_flow::flow::plane::PlaneState;
 use blaze_flow::lane::core::{DataConfig, DataCore};
-use blaze_flow::link::{Engine, EngineConfig, Limits};
 use blaze_flow::link::transport::Endpoint;
+use blaze_flow::link::{Engine, EngineConfig, Limits};
 use blaze_flow::plan::{PlanRules, Target};
 use blaze_flow::world::{FlowState, LayerScopeId};
 use blaze_proto::link::link_control::{LayerScope, State};
@@ -62,7 +62,9 @@ impl Publisher for ScopeWriter {
         }
         scope.delivered.push(key);
         // What a flow writes comes back to it, as on Redis.
-        scope.pending.push(((&self.topic).into(), Content::from_bytes(frame.to_bytes())));
+        scope
+            .pending
+            .push(((&self.topic).into(), Content::from_bytes(frame.to_bytes())));
         PublishOutcome::Taken
     }
     fn publish_bare(&self, _payload: &Bytes) -> PublishOutcome {
@@ -159,8 +161,11 @@ impl<'a> Simulation<'a> {
         };
         for index in 0..count {
             let id: FlowId = format!("layer-{index}/node-{index}").parse().unwrap();
-            let scopes: BTreeMap<Scope, ScopeBroker> =
-                [(Scope::Node, ScopeBroker::default()), (Scope::Layer, ScopeBroker::default())].into();
+            let scopes: BTreeMap<Scope, ScopeBroker> = [
+                (Scope::Node, ScopeBroker::default()),
+                (Scope::Layer, ScopeBroker::default()),
+            ]
+            .into();
             simulation.scopes.push(scopes);
             let flow = simulation.make_flow(index, id, 1);
             simulation.flows.push(flow);
@@ -188,7 +193,12 @@ impl<'a> Simulation<'a> {
             },
             self.now,
         );
-        let core = DataCore::new(DataConfig { me: id.clone(), epoch, large_bytes: 65_536, salt: index as u32 });
+        let core = DataCore::new(DataConfig {
+            me: id.clone(),
+            epoch,
+            large_bytes: 65_536,
+            salt: index as u32,
+        });
         let engine_config = EngineConfig {
             me: id.clone(),
             kind,
@@ -198,8 +208,18 @@ impl<'a> Simulation<'a> {
             limits: Limits::default(),
         };
         let engine = Engine::new(engine_config, self.now, self.wall());
-        let plane = PlaneState { core, engine: Some(engine) };
-        Flow { id, epoch, alive: true, control, plane, subscribed: BTreeSet::new() }
+        let plane = PlaneState {
+            core,
+            engine: Some(engine),
+        };
+        Flow {
+            id,
+            epoch,
+            alive: true,
+            control,
+            plane,
+            subscribed: BTreeSet::new(),
+        }
     }
 
     fn add_service(&mut self, number: usize) {
@@ -209,7 +229,11 @@ impl<'a> Simulation<'a> {
         self.random.fill(&mut writer);
         let service = Service {
             flow,
-            scope: if self.random.random_bool(0.5) { Scope::Node } else { Scope::Layer },
+            scope: if self.random.random_bool(0.5) {
+                Scope::Node
+            } else {
+                Scope::Layer
+            },
             name: format!("service-{number}"),
             topic,
             publishes: self.random.random_bool(0.5),
@@ -284,7 +308,8 @@ impl<'a> Simulation<'a> {
         let wall_ms = self.wall() / 1_000_000;
         let flow = &mut self.flows[service.flow];
         if flow.alive {
-            flow.control.control(self.now, wall_ms, service.scope, message.to_string().as_bytes());
+            flow.control
+                .control(self.now, wall_ms, service.scope, message.to_string().as_bytes());
         }
     }
 
@@ -348,7 +373,11 @@ impl<'a> Simulation<'a> {
         let flow = &self.flows[service.flow];
         let origin = Origin {
             layer: flow.id.layer.to_string(),
-            node: if service.scope == Scope::Node { flow.id.node.to_string() } else { String::new() },
+            node: if service.scope == Scope::Node {
+                flow.id.node.to_string()
+            } else {
+                String::new()
+            },
             service: service.name.clone(),
             ..Origin::default()
         };
@@ -358,7 +387,10 @@ impl<'a> Simulation<'a> {
         };
         let frame = Frame::new(&header, Bytes::from(vec![7; bytes])).unwrap();
         let scope = &self.scopes[service.flow][&service.scope];
-        scope.lock().pending.push(((&service.topic).into(), Content::Frame(frame)));
+        scope
+            .lock()
+            .pending
+            .push(((&service.topic).into(), Content::Frame(frame)));
         service.sequence
     }
 
@@ -394,12 +426,16 @@ impl<'a> Simulation<'a> {
     fn discover(&mut self) {
         for a in 0..self.flows.len() {
             for b in 0..self.flows.len() {
-                let joined = a != b && self.flows[a].alive && self.flows[b].alive && self.joined(a, b) && self.joined(b, a);
+                let joined =
+                    a != b && self.flows[a].alive && self.flows[b].alive && self.joined(a, b) && self.joined(b, a);
                 let epoch = self.flows[b].epoch;
                 let life = self.flows[a].epoch * 1_000_000 + epoch;
                 if joined && self.known.get(&(a, b)) != Some(&life) && self.random.random_bool(0.05) {
                     self.known.insert((a, b), life);
-                    let endpoint = Endpoint { flow: self.flows[b].id.clone(), epoch };
+                    let endpoint = Endpoint {
+                        flow: self.flows[b].id.clone(),
+                        epoch,
+                    };
                     let now = self.now;
                     if let Some(engine) = &mut self.flows[a].plane.engine {
                         engine.peer_discovered(now, endpoint);
@@ -416,7 +452,10 @@ impl<'a> Simulation<'a> {
     fn arrive(&mut self) {
         while self.network.peek().is_some_and(|packet| packet.due <= self.now) {
             let Some(packet) = self.network.pop() else { break };
-            let reader = self.flows.iter_mut().find(|f| f.alive && f.id == packet.to.flow && f.epoch == packet.to.epoch);
+            let reader = self
+                .flows
+                .iter_mut()
+                .find(|f| f.alive && f.id == packet.to.flow && f.epoch == packet.to.epoch);
             if let Some(flow) = reader
                 && let Some(engine) = &mut flow.plane.engine
             {
@@ -431,12 +470,20 @@ impl<'a> Simulation<'a> {
             let pending = std::mem::take(&mut broker.lock().pending);
             let flow = &mut self.flows[index];
             for (channel, content) in pending {
-                let Ok(topic) = channel.as_str().parse::<TopicName>() else { continue };
+                let Ok(topic) = channel.as_str().parse::<TopicName>() else {
+                    continue;
+                };
                 if !flow.subscribed.contains(&(topic.clone(), *scope)) {
                     continue;
                 }
-                let Some(id) = flow.plane.core.find(topic.as_str()) else { continue };
-                let mut batch = vec![Received { content, at: now, broker_age_us: 0 }];
+                let Some(id) = flow.plane.core.find(topic.as_str()) else {
+                    continue;
+                };
+                let mut batch = vec![Received {
+                    content,
+                    at: now,
+                    broker_age_us: 0,
+                }];
                 flow.plane.ingest(now, wall, id, *scope, &mut batch);
             }
         }
@@ -461,14 +508,19 @@ impl<'a> Simulation<'a> {
                 Output::Announce { version, digest } => engine.set_registry(now, version, digest),
                 Output::State(state) => engine.set_state(now, hello_state(state)),
                 Output::Plan { topic, plan, info } => {
-                    let Some(id) = flow.plane.core.intern(&topic, now) else { continue };
+                    let Some(id) = flow.plane.core.intern(&topic, now) else {
+                        continue;
+                    };
                     flow.plane.core.apply(now, id, *info, &plan, |target| {
                         let scope = match target {
                             Target::Layer => Scope::Layer,
                             _ => Scope::Node,
                         };
                         let scope = Arc::clone(&scopes[&scope]);
-                        Some(Arc::new(ScopeWriter { scope, topic: topic.clone() }) as Arc<dyn Publisher>)
+                        Some(Arc::new(ScopeWriter {
+                            scope,
+                            topic: topic.clone(),
+                        }) as Arc<dyn Publisher>)
                     });
                     for scope in [Scope::Node, Scope::Layer] {
                         if flow.plane.core.path(id).reads(scope) {
@@ -485,15 +537,26 @@ impl<'a> Simulation<'a> {
     fn transmit(&mut self, index: usize) {
         for _ in 0..40 {
             let now = self.now;
-            let Some(transmit) = self.flows[index].plane.engine.as_mut().and_then(|engine| engine.poll_transmit(now)) else {
+            let Some(transmit) = self.flows[index]
+                .plane
+                .engine
+                .as_mut()
+                .and_then(|engine| engine.poll_transmit(now))
+            else {
                 break;
             };
-            let Some(to) = self.flows.iter().position(|flow| flow.id == transmit.to.flow) else { continue };
+            let Some(to) = self.flows.iter().position(|flow| flow.id == transmit.to.flow) else {
+                continue;
+            };
             let loss = if self.calm { 0.0 } else { self.chaos.loss };
             if self.cut.contains(&(index, to)) || self.random.random_bool(loss) {
                 continue;
             }
-            let copies = if !self.calm && loss > 0.0 && self.random.random_bool(0.02) { 2 } else { 1 };
+            let copies = if !self.calm && loss > 0.0 && self.random.random_bool(0.02) {
+                2
+            } else {
+                1
+            };
             for _ in 0..copies {
                 let jitter = self.jitter.mul_f64(self.random.random());
                 self.packets += 1;
@@ -518,7 +581,9 @@ impl<'a> Simulation<'a> {
         for (index, scopes) in self.scopes.iter().enumerate() {
             for (scope, broker) in scopes {
                 if let Some((topic, writer, sequence)) = broker.lock().twice.first() {
-                    return Err(format!("{topic} {writer} {sequence} was written twice into {scope} of layer-{index}"));
+                    return Err(format!(
+                        "{topic} {writer} {sequence} was written twice into {scope} of layer-{index}"
+                    ));
                 }
             }
         }
@@ -527,7 +592,9 @@ impl<'a> Simulation<'a> {
 
     fn delivered_counts(&self) -> HashMap<(usize, Scope), usize> {
         let counts = self.scopes.iter().enumerate().flat_map(|(index, scopes)| {
-            scopes.iter().map(move |(scope, broker)| ((index, *scope), broker.lock().delivered.len()))
+            scopes
+                .iter()
+                .map(move |(scope, broker)| ((index, *scope), broker.lock().delivered.len()))
         });
         counts.collect()
     }
@@ -535,8 +602,15 @@ impl<'a> Simulation<'a> {
     fn everybody_has(&self, sent: &[(usize, u64)], before: &HashMap<(usize, Scope), usize>) -> Result<(), String> {
         let mut expected: BTreeMap<(usize, Scope), BTreeSet<(TopicName, WriterId, u64)>> = BTreeMap::new();
         let mut wanted: BTreeMap<(usize, Scope), BTreeSet<&TopicName>> = BTreeMap::new();
-        for request in self.services.iter().filter(|service| service.active && !service.publishes) {
-            wanted.entry((request.flow, request.scope)).or_default().insert(&request.topic);
+        for request in self
+            .services
+            .iter()
+            .filter(|service| service.active && !service.publishes)
+        {
+            wanted
+                .entry((request.flow, request.scope))
+                .or_default()
+                .insert(&request.topic);
         }
         for (place, topics) in &wanted {
             for (publisher, sequence) in sent {
@@ -563,9 +637,13 @@ impl<'a> Simulation<'a> {
                     ));
                 }
                 let fresh: BTreeSet<_> = sent.iter().map(|(s, n)| (self.services[*s].writer, *n)).collect();
-                let needless = got.iter().find(|key| fresh.contains(&(key.1, key.2)) && !want.contains(*key));
+                let needless = got
+                    .iter()
+                    .find(|key| fresh.contains(&(key.1, key.2)) && !want.contains(*key));
                 if let Some(needless) = needless {
-                    return Err(format!("{needless:?} reached {scope} of layer-{index} and nobody asked for it"));
+                    return Err(format!(
+                        "{needless:?} reached {scope} of layer-{index} and nobody asked for it"
+                    ));
                 }
             }
         }
@@ -578,7 +656,12 @@ impl<'a> Simulation<'a> {
             let states = flow.control.state();
             text.push_str(&format!("[{} epoch {} {states:?}", flow.id, flow.epoch));
             for (other, view) in &flow.control.world().flows {
-                text.push_str(&format!(" {other}:{:?}/{:?}/{} topics", view.reach, view.state, view.topics.len()));
+                text.push_str(&format!(
+                    " {other}:{:?}/{:?}/{} topics",
+                    view.reach,
+                    view.state,
+                    view.topics.len()
+                ));
             }
             text.push_str("] ");
         }

@@ -12,7 +12,7 @@ use crate::world::{
 const SERVICES: [&str; 3] = ["driver", "filter", "logger"];
 
 /// SplitMix64: the same worlds everywhere for the same seed.
-pub(super) struct Dice(pub(super) u64);
+pub(crate) struct Dice(pub(crate) u64);
 
 impl Dice {
     fn next(&mut self) -> u64 {
@@ -24,30 +24,30 @@ impl Dice {
     }
 
     /// `0..count`
-    pub(super) fn below(&mut self, count: usize) -> usize {
+    pub(crate) fn below(&mut self, count: usize) -> usize {
         (self.next() % count as u64) as usize
     }
 
-    pub(super) fn percent(&mut self, chance: usize) -> bool {
+    pub(crate) fn percent(&mut self, chance: usize) -> bool {
         self.below(100) < chance
     }
 
-    pub(super) fn pick<'a, T>(&mut self, from: &'a [T]) -> &'a T {
+    pub(crate) fn pick<'a, T>(&mut self, from: &'a [T]) -> &'a T {
         &from[self.below(from.len())]
     }
 }
 
 /// A system: what all flows know, and who really publishes.
 #[derive(Clone)]
-pub(super) struct System {
+pub(crate) struct System {
     /// The view of all flows; `me` is set by whoever plans.
-    pub(super) world: World,
+    pub(crate) world: World,
     /// Names of nodes that a source or a filter may name.
-    pub(super) nodes: Vec<String>,
+    pub(crate) nodes: Vec<String>,
 }
 
 impl System {
-    pub(super) fn random(dice: &mut Dice) -> Self {
+    pub(crate) fn random(dice: &mut Dice) -> Self {
         let mut flows = BTreeMap::new();
         for l in 0..3 + dice.below(4) {
             let kind = *dice.pick(LayerKind::ALL);
@@ -81,12 +81,12 @@ impl System {
         system
     }
 
-    pub(super) fn ids(&self) -> Vec<FlowId> {
+    pub(crate) fn ids(&self) -> Vec<FlowId> {
         self.world.flows.keys().cloned().collect()
     }
 
     /// Something happens somewhere.
-    pub(super) fn change(&mut self, dice: &mut Dice) {
+    pub(crate) fn change(&mut self, dice: &mut Dice) {
         let id = dice.pick(&self.ids()).clone();
         match dice.below(3) {
             0 => self.reroll_flow(dice, &id),
@@ -180,7 +180,7 @@ impl System {
     }
 
     /// Who really publishes behind an advertisement: what it lists, and everybody that it may have left out.
-    pub(super) fn sources(&self, advertise: &Advertise, node: Option<&str>) -> Vec<Source> {
+    pub(crate) fn sources(&self, advertise: &Advertise, node: Option<&str>) -> Vec<Source> {
         let mut sources = advertise.sources.clone();
         if advertise.more_sources {
             let nodes: Vec<&str> = match node {
@@ -205,6 +205,6 @@ fn type_name(dice: &mut Dice) -> String {
 }
 
 /// Whether two flows use one layer broker.
-pub(super) fn share_broker(a: (&FlowId, Option<LayerScopeId>), b: (&FlowId, Option<LayerScopeId>)) -> bool {
+pub(crate) fn share_broker(a: (&FlowId, Option<LayerScopeId>), b: (&FlowId, Option<LayerScopeId>)) -> bool {
     a.0 == b.0 || (a.0.layer == b.0.layer && a.1.is_some() && a.1 == b.1)
 }

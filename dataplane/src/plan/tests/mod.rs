@@ -1,6 +1,6 @@
 //! The planner against tables of its rules, and against a simulated system of random shape.
 
-mod generate;
+pub(crate) mod generate;
 mod property;
 mod simulate;
 mod table;

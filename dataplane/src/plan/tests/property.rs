@@ -159,3 +159,20 @@ fn what_happens_elsewhere_changes_nothing() {
         assert_eq!(before, after, "seed {seed}");
     }
 }
+
+/// A thousand robots that each publish and request one topic, two fog replicas that want all of it.
+#[test]
+fn a_topic_of_a_thousand_flows_is_planned_soon() {
+    let robot = |n: usize| format!("edge/robot-{n}@{} node+ node-", n / 10);
+    let mut lines: Vec<String> = (0..1000).map(robot).collect();
+    lines.extend(["fog/a@1 layer- layer+".to_owned(), "fog/b@1 layer- layer+".to_owned()]);
+    let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
+    let world = super::worlds::world(&lines);
+    let started = std::time::Instant::now();
+    let plan = plan_topic(&world, &topic(), &PlanRules::default(), None);
+    let took = started.elapsed();
+    println!("{} bridges in {took:?}", plan.bridges.len());
+    // Its own layer, 99 others at the edge, the fog, and what comes in: to the layer, or by it, to the node.
+    assert!((102..106).contains(&plan.bridges.len()), "{}", plan.bridges.len());
+    assert!(took.as_millis() < 1000, "{took:?}");
+}

@@ -404,23 +404,31 @@ impl<'a> Simulation<'a> {
     }
 
     /// A bridge from the layer to the node of a flow that takes the same from the inter scope, while another flow of the
-    /// layer asks for it too, so that a sender may have chosen that one.
+    /// layer asks for something of the same publishing scope too, so that its sender may have chosen that one.
     fn stands_by(&self, flow: &FlowId, from: Scope, to: &Target) -> bool {
         let takes_it = self.useful.contains(&(flow.clone(), Scope::Inter, to.clone()));
         let Some(layer) = self.layer_of(flow).filter(|_| from == Scope::Layer && takes_it) else {
             return false;
         };
-        let mut messages = self.messages().into_iter();
-        messages.any(|message| {
-            let wanted = |requests: Vec<&Request>| requests.iter().any(|request| wants(request, &message));
-            let shared = wanted(self.requests_at(&layer));
-            let mut others = self.readers(&layer).into_iter().filter(|other| *other != flow);
-            let outside = match &message.born {
+        let messages = self.messages();
+        let wanted = |requests: &[&Request], from: &Place| {
+            let mut sent = messages.iter().filter(|message| message.born == *from);
+            sent.any(|message| requests.iter().any(|request| wants(request, message)))
+        };
+        let shared = self.requests_at(&layer);
+        let others: Vec<_> = self
+            .readers(&layer)
+            .into_iter()
+            .filter(|other| *other != flow)
+            .collect();
+        messages.iter().map(|message| &message.born).any(|born| {
+            let outside = match born {
                 Place::Node(born) | Place::Bare(born) => self.layer_of(born).as_ref() != Some(&layer),
-                born @ Place::Layer(_) => *born != layer,
+                Place::Layer(_) => *born != layer,
             };
-            let sent = outside && !self.readers(&message.born).is_empty();
-            sent && wanted(self.node_requests(flow)) && others.any(|other| shared || wanted(self.node_requests(other)))
+            let could = |other: &FlowId| wanted(&shared, born) || wanted(&self.node_requests(other), born);
+            let sent = outside && !self.readers(born).is_empty();
+            sent && wanted(&self.node_requests(flow), born) && others.iter().any(|other| could(other))
         })
     }
 }

@@ -1,0 +1,269 @@
+//! `/metrics`: the counters of the flow in Prometheus' words. Made anew for each scrape from the state under its lock.
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use blaze_domain::{Priority, Scope};
+use prometheus::core::Collector;
+use prometheus::{CounterVec, Encoder, GaugeVec, Opts, Registry, TextEncoder};
+
+use super::{Shared, class_label};
+use crate::lane::path::{BridgeState, Phase, TopicPath};
+use crate::registry::Terms;
+
+/// Topics that have label values of their own; the rest share one.
+const MAX_TOPICS: usize = 1000;
+const OTHER: &str = "_other";
+/// Upper bounds of the latency buckets in seconds.
+const BUCKETS: [f64; 14] = [0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0];
+
+/// The text of one scrape.
+pub(super) fn render(shared: &Shared) -> String {
+    let page = Page::new();
+    match page.and_then(|page| {
+        page.fill(shared);
+        page.text()
+    }) {
+        Ok(text) => text,
+        Err(error) => {
+            tracing::error!(%error, "metrics");
+            String::new()
+        }
+    }
+}
+
+struct Page {
+    registry: Registry,
+    messages: CounterVec,
+    bytes: CounterVec,
+    dropped: CounterVec,
+    bridges: GaugeVec,
+    queue_bytes: GaugeVec,
+    rate: GaugeVec,
+    budget: GaugeVec,
+    wire_bytes: CounterVec,
+    peer_up: GaugeVec,
+    peer_rtt: GaugeVec,
+    leases: GaugeVec,
+    link: CounterVec,
+    build: GaugeVec,
+    latency: parking_lot::Mutex<String>,
+}
+
+fn counter(registry: &Registry, name: &str, help: &str, labels: &[&str]) -> prometheus::Result<CounterVec> {
+    let metric = CounterVec::new(Opts::new(name, help), labels)?;
+    register(registry, metric)
+}
+
+fn gauge(registry: &Registry, name: &str, help: &str, labels: &[&str]) -> prometheus::Result<GaugeVec> {
+    let metric = GaugeVec::new(Opts::new(name, help), labels)?;
+    register(registry, metric)
+}
+
+fn register<M: Collector + Clone + 'static>(registry: &Registry, metric: M) -> prometheus::Result<M> {
+    registry.register(Box::new(metric.clone()))?;
+    Ok(metric)
+}
+
+impl Page {
+    fn new() -> prometheus::Result<Self> {
+        let r = Registry::new();
+        Ok(Self {
+            messages: counter(&r, "blaze_flow_messages_total", "Messages through a bridge.", &["topic", "from", "to", "direction"])?,
+            bytes: counter(&r, "blaze_flow_bytes_total", "Payload bytes through a bridge.", &["topic", "from", "to", "direction"])?,
+            dropped: counter(&r, "blaze_flow_dropped_total", "Messages dropped.", &["topic", "to", "reason"])?,
+            bridges: gauge(&r, "blaze_flow_bridges", "Bridges by state.", &["state"])?,
+            queue_bytes: gauge(&r, "blaze_flow_queue_bytes", "Bytes that wait for the link or may have to be repaired.", &["to", "class"])?,
+            rate: gauge(&r, "blaze_flow_rate_hertz", "Rates of a topic.", &["topic", "to", "kind"])?,
+            budget: gauge(&r, "blaze_flow_budget_bytes_per_second", "Wire bytes per second.", &["to", "kind"])?,
+            wire_bytes: counter(&r, "blaze_flow_wire_bytes_total", "IP bytes sent on the inter scope.", &["to", "class"])?,
+            peer_up: gauge(&r, "blaze_flow_peer_up", "1 while the peer says Hello and acknowledges.", &["peer"])?,
+            peer_rtt: gauge(&r, "blaze_flow_peer_rtt_seconds", "Round trip to the peer.", &["peer"])?,
+            leases: gauge(&r, "blaze_flow_leases", "Leases of local services.", &["kind"])?,
+            link: counter(&r, "blaze_flow_link_events_total", "Things that happened on the link.", &["event"])?,
+            build: gauge(&r, "blaze_build_info", "1, with the version as label.", &["version", "program"])?,
+            latency: parking_lot::Mutex::default(),
+            registry: r,
+        })
+    }
+
+    fn fill(&self, shared: &Shared) {
+        self.build.with_label_values(&[env!("CARGO_PKG_VERSION"), "blaze-flow"]).set(1.0);
+        self.fill_topics(shared);
+        self.fill_link(shared);
+        self.fill_control(shared);
+    }
+
+    fn fill_topics(&self, shared: &Shared) {
+        let now = Instant::now();
+        let mut histograms: BTreeMap<(String, String), Histogram> = BTreeMap::new();
+        shared.plane.read(|state| {
+            for (reason, count) in state.core.unattributed.iter() {
+                self.dropped.with_label_values(&["", "", reason.as_str()]).inc_by(count as f64);
+            }
+            for (index, path) in state.core.topics_mut().iter_mut().enumerate() {
+                let topic = if index < MAX_TOPICS { path.name.to_string() } else { OTHER.to_owned() };
+                self.fill_topic(now, &topic, path, &mut histograms);
+            }
+        });
+        let mut text = String::new();
+        if !histograms.is_empty() {
+            text.push_str("# HELP blaze_flow_bridge_latency_seconds Time of a message in this flow.\n");
+            text.push_str("# TYPE blaze_flow_bridge_latency_seconds histogram\n");
+        }
+        for ((topic, to), histogram) in histograms {
+            histogram.write(&topic, &to, &mut text);
+        }
+        *self.latency.lock() = text;
+    }
+
+    fn fill_topic(
+        &self,
+        now: Instant,
+        topic: &str,
+        path: &mut TopicPath,
+        histograms: &mut BTreeMap<(String, String), Histogram>,
+    ) {
+        for (reason, count) in path.ingress_drops.iter() {
+            self.dropped.with_label_values(&[topic, "", reason.as_str()]).inc_by(count as f64);
+        }
+        let advertised = path.info.rate_hz.unwrap_or_else(|| path.in_rate.rate(now).0);
+        for bridge in &mut path.bridges {
+            let to = bridge.to_label();
+            let from = bridge.from.as_str();
+            let stats = &bridge.stats;
+            for (direction, count) in [("in", stats.taken), ("out", stats.out)] {
+                self.messages.with_label_values(&[topic, from, &to, direction]).inc_by(count.messages as f64);
+                self.bytes.with_label_values(&[topic, from, &to, direction]).inc_by(count.bytes as f64);
+            }
+            for (reason, count) in stats.dropped.iter() {
+                self.dropped.with_label_values(&[topic, &to, reason.as_str()]).inc_by(count as f64);
+            }
+            histograms.entry((topic.to_owned(), to.clone())).or_default().add(bridge);
+            let state = match bridge.phase {
+                Phase::Up { .. } => "up",
+                Phase::Draining { .. } => "draining",
+                Phase::Ended => continue,
+            };
+            self.bridges.with_label_values(&[state]).inc();
+            if !matches!(bridge.from, Scope::Inter) {
+                self.rate.with_label_values(&[topic, &to, "advertised"]).set(advertised);
+            }
+            let actual = bridge.out_rate.rate(now).0;
+            self.rate.with_label_values(&[topic, &to, "actual"]).set(actual);
+            if let Some(allocated) = bridge.lane.max_rate_hz {
+                self.rate.with_label_values(&[topic, &to, "allocated"]).set(allocated);
+            }
+        }
+    }
+
+    fn fill_link(&self, shared: &Shared) {
+        let now = Instant::now();
+        let (peers, counters) = shared
+            .plane
+            .read(|state| state.engine.as_ref().map(|engine| (engine.peers(), engine.counters())).unwrap_or_default());
+        for peer in &peers {
+            let name = peer.flow.to_string();
+            let up = f64::from(u8::from(peer.state == crate::link::PeerState::Up));
+            self.peer_up.with_label_values(&[&name]).set(up);
+            if let Some(rtt) = peer.rtt {
+                self.peer_rtt.with_label_values(&[&name]).set(rtt.as_secs_f64());
+            }
+            let to = format!("inter/{}", peer.flow.layer);
+            for (index, bytes) in peer.queue_bytes.iter().enumerate() {
+                self.queue_bytes.with_label_values(&[&to, class_label(index)]).add(*bytes as f64);
+            }
+        }
+        for (event, count) in [
+            ("decode_error", counters.decode_errors),
+            ("unknown_sender", counters.unknown_senders),
+            ("stale", counters.stale),
+            ("duplicate", counters.duplicates),
+            ("reassembly_timeout", counters.reassembly_timeouts),
+            ("reassembly_evicted", counters.reassembly_evicted),
+            ("overrun", counters.overrun),
+            ("peer_refused", counters.peers_refused),
+            ("control_refused", counters.control_refused),
+            ("repair", counters.repairs),
+            ("probe", counters.probes),
+            ("news_dropped", shared.plane.news_dropped()),
+        ] {
+            self.link.with_label_values(&[event]).inc_by(count as f64);
+        }
+        if let Some(transport) = &shared.transport {
+            let status = transport.status();
+            self.link.with_label_values(&["participant_rebuilt"]).inc_by(status.rebuilds as f64);
+            self.link.with_label_values(&["not_sent"]).inc_by(status.not_sent as f64);
+            self.link.with_label_values(&["malformed_sample"]).inc_by(status.malformed as f64);
+        }
+        let mut traffic = shared.egress.traffic();
+        let mut used = 0.0;
+        for destination in &mut traffic.by_destination {
+            let to = format!("inter/{}", destination.flow.layer);
+            for (index, bytes) in destination.wire_bytes.iter().enumerate() {
+                self.wire_bytes.with_label_values(&[&to, class_label(index)]).inc_by(*bytes as f64);
+            }
+            let rate = destination.rate.rate(now).1;
+            used += rate;
+            self.budget.with_label_values(&[&to, "used"]).add(rate);
+        }
+        self.budget.with_label_values(&["inter", "limit"]).set(shared.egress.budget());
+        self.budget.with_label_values(&["inter", "used"]).set(used);
+    }
+
+    fn fill_control(&self, shared: &Shared) {
+        let control = shared.control.lock();
+        for kind in ["advertise", "request"] {
+            self.leases.with_label_values(&[kind]).set(0.0);
+        }
+        for lease in control.registry().leases() {
+            let kind = match lease.terms {
+                Terms::Advertise { .. } => "advertise",
+                Terms::Request { .. } => "request",
+            };
+            self.leases.with_label_values(&[kind]).inc();
+        }
+        self.link.with_label_values(&["control_message_refused"]).inc_by(control.refused as f64);
+    }
+
+    fn text(&self) -> prometheus::Result<String> {
+        let mut text = Vec::new();
+        TextEncoder::new().encode(&self.registry.gather(), &mut text)?;
+        let mut text = String::from_utf8_lossy(&text).into_owned();
+        text.push_str(&self.latency.lock());
+        Ok(text)
+    }
+}
+
+/// A latency histogram as Prometheus counts: cumulative, in seconds.
+#[derive(Default)]
+struct Histogram {
+    below: [u64; BUCKETS.len()],
+    count: u64,
+    sum_s: f64,
+}
+
+impl Histogram {
+    fn add(&mut self, bridge: &BridgeState) {
+        let latency = &bridge.stats.latency;
+        for (below, bound) in self.below.iter_mut().zip(BUCKETS) {
+            *below += latency.count_up_to_us((bound * 1e6) as u64);
+        }
+        self.count += latency.count();
+        self.sum_s += latency.sum_us() as f64 / 1e6;
+    }
+
+    fn write(&self, topic: &str, to: &str, text: &mut String) {
+        use std::fmt::Write as _;
+        let labels = format!("topic=\"{topic}\",to=\"{to}\"");
+        let name = "blaze_flow_bridge_latency_seconds";
+        for (below, bound) in self.below.iter().zip(BUCKETS) {
+            let _ = writeln!(text, "{name}_bucket{{{labels},le=\"{bound}\"}} {below}");
+        }
+        let _ = writeln!(text, "{name}_bucket{{{labels},le=\"+Inf\"}} {}", self.count);
+        let _ = writeln!(text, "{name}_sum{{{labels}}} {}", self.sum_s);
+        let _ = writeln!(text, "{name}_count{{{labels}}} {}", self.count);
+    }
+}
+
+const _: () = assert!(Priority::ALL.len() == 3, "classes have one label each");

@@ -1,0 +1,138 @@
+//! `GET /v1/why`: gathers what the flow knows of a topic and asks for the verdict.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use axum::extract::{Query, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use blaze_brokers::{Broker, BrokerKind, Health};
+use blaze_domain::control::LeaseKind;
+use blaze_domain::{Scope, TopicName, WhyCode};
+use blaze_proto::link::link_control::RouteState;
+use serde_json::Value;
+
+use super::Shared;
+use super::admin::{answer, query_text, refusal};
+use crate::control::ControlCore;
+use crate::lane::path::{BridgeState as Bridge, Phase, TopicId};
+use crate::plan::TopicPlan;
+use crate::why::{
+    BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, StepKind, WhyInput, WhyTarget, explain,
+};
+
+/// Lapsed leases that are looked at.
+const MAX_HINTS: usize = 16;
+
+pub(super) async fn why(State(shared): State<Arc<Shared>>, query: Query<BTreeMap<String, String>>) -> Response {
+    let Some(topic) = query_text(&query, "topic") else {
+        return refusal(StatusCode::BAD_REQUEST, "invalid_request", "the parameter topic is missing: /v1/why?topic=imu/data");
+    };
+    let topic: TopicName = match topic.parse() {
+        Ok(topic) => topic,
+        Err(error) => {
+            return refusal(StatusCode::BAD_REQUEST, "invalid_topic", &format!("topic {error}"));
+        }
+    };
+    let to: Option<WhyTarget> = match query_text(&query, "to").map(|text| text.parse()).transpose() {
+        Ok(to) => to,
+        Err(error) => {
+            return refusal(StatusCode::BAD_REQUEST, "invalid_request", &format!("to is layer[/node[/service]]: {error}"));
+        }
+    };
+    let bridges = bridge_facts(&shared, &topic);
+    let control = shared.control.lock();
+    let nothing = TopicPlan::default();
+    let verdict = explain(&WhyInput {
+        world: control.world(),
+        topic: &topic,
+        to,
+        plan: control.plans().get(&topic).unwrap_or(&nothing),
+        bridges,
+        node_broker: shared.brokers.node.as_deref().map(broker_facts),
+        layer_broker: shared.brokers.layer.as_deref().map(broker_facts),
+        routes: route_facts(&control, &topic),
+        leases: lease_hints(&shared, &control, &topic),
+    });
+    drop(control);
+    answer(&shared, serde_json::to_value(verdict).unwrap_or(Value::Null)).into_response()
+}
+
+fn bridge_facts(shared: &Shared, topic: &TopicName) -> Vec<BridgeFacts> {
+    let found = shared.plane.read(|state| {
+        let id = state.core.find(topic.as_str())?;
+        let live = |bridge: &&Bridge| matches!(bridge.phase, Phase::Up { .. });
+        Some((id, state.core.path(id).bridges.iter().filter(live).map(facts_of).collect::<Vec<_>>()))
+    });
+    let Some((id, mut facts)) = found else { return Vec::new() };
+    for fact in &mut facts {
+        fact.state = state_of(shared, id, fact.from);
+    }
+    facts
+}
+
+fn facts_of(bridge: &Bridge) -> BridgeFacts {
+    let lately = bridge.stats.lately();
+    BridgeFacts {
+        from: bridge.from,
+        to: bridge.target.clone(),
+        state: BridgeState::Up,
+        received: lately.taken,
+        sent: lately.out,
+        dropped: lately.dropped.into_iter().collect(),
+    }
+}
+
+fn state_of(shared: &Shared, topic: TopicId, from: Scope) -> BridgeState {
+    if shared.routes.is_subscribed(topic, from) { BridgeState::Up } else { BridgeState::Starting }
+}
+
+fn broker_facts(broker: &dyn Broker) -> BrokerFacts {
+    let status = broker.status().borrow().clone();
+    BrokerFacts {
+        name: if status.detail.is_empty() { broker.kind().to_string() } else { status.detail },
+        health: if status.health == Health::Up { BrokerHealth::Up } else { BrokerHealth::Down },
+        at_most_once: broker.kind() == BrokerKind::Redis,
+    }
+}
+
+fn route_facts(control: &ControlCore, topic: &TopicName) -> Vec<RouteFacts> {
+    let world = control.world();
+    let flows = world.flows.keys().filter(|flow| **flow != world.me);
+    let routes = flows.flat_map(|flow| {
+        let of_flow = control.registry().remote_routes(flow, topic).iter();
+        of_flow.filter_map(move |route| route_of(flow, route))
+    });
+    routes.collect()
+}
+
+/// A route as another flow told it; one with words that this version does not know says nothing.
+fn route_of(flow: &blaze_domain::FlowId, route: &RouteState) -> Option<RouteFacts> {
+    Some(RouteFacts {
+        flow: flow.clone(),
+        to_layer: route.to_layer.parse().ok()?,
+        receiver: route.receiver.parse().ok(),
+        step: match route.step.as_str() {
+            "plan" => StepKind::Plan,
+            "bridge" => StepKind::Bridge,
+            "deliver" => StepKind::Deliver,
+            _ => return None,
+        },
+        ok: route.ok,
+        code: route.code.parse::<WhyCode>().ok()?,
+    })
+}
+
+fn lease_hints(shared: &Shared, control: &ControlCore, topic: &TopicName) -> Vec<LeaseHint> {
+    let lapsed = control.registry().lapsed(topic).take(MAX_HINTS);
+    let hint = |lapsed: &crate::registry::LapsedLease| LeaseHint {
+        flow: shared.me.clone(),
+        kind: match lapsed.key.kind {
+            LeaseKind::Advertise => StepKind::Advertise,
+            LeaseKind::Request => StepKind::Request,
+        },
+        service: lapsed.key.service.to_string(),
+        code: WhyCode::LeaseExpired,
+    };
+    lapsed.map(hint).collect()
+}

@@ -1,0 +1,325 @@
+//! Why a topic does or does not arrive: a pure verdict over what one flow knows. It calls nobody.
+//!
+//! ```text
+//! each pair of publisher and requester ──► the hops between them ──► steps, one failing step at most per cause
+//!                                                                     worst pair first ──► verdict, code, remedy
+//! ```
+
+mod facts;
+mod remedy;
+mod trace;
+
+#[cfg(test)]
+mod tests;
+
+use blaze_domain::{FlowId, Scope, TopicName, WhyCode};
+use serde::Serialize;
+
+pub use facts::{BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, WhyInput, WhyTarget};
+
+use crate::plan::{Group, Pairing, Publisher, Requester, TopicView};
+use crate::world::{FlowState, FlowView, Reach};
+use trace::{Trace, Tracer};
+
+/// Pairs of publisher and requester that are looked at; those that the flow has a part in come first.
+const MAX_PAIRS: usize = 256;
+/// Steps in an answer.
+const MAX_STEPS: usize = 64;
+
+/// The answer, in the order of its keys on the wire.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Why {
+    /// The topic.
+    pub topic: TopicName,
+    /// Whom it should reach, as asked.
+    pub to: Option<WhyTarget>,
+    /// The verdict.
+    pub verdict: Verdict,
+    /// The first cause; `ok` if there is none.
+    pub code: WhyCode,
+    /// What to do about it.
+    pub remedy: &'static str,
+    /// What was looked at, the worst pair of publisher and requester first.
+    pub steps: Vec<Step>,
+}
+
+/// Whether the topic arrives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// Everywhere and as asked for.
+    Flowing,
+    /// Not everywhere, or not as asked for.
+    Degraded,
+    /// Not at all.
+    NotFlowing,
+}
+
+/// One thing that must be right for a message to arrive.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Step {
+    /// The flow that it is about.
+    pub flow: FlowId,
+    /// What it is.
+    pub step: StepKind,
+    /// Whether messages pass it.
+    pub ok: bool,
+    /// Why they do not; with `ok` what is not as asked for.
+    pub code: WhyCode,
+    /// The facts, for people.
+    pub detail: String,
+}
+
+/// The kinds of steps, in the order of a message's way.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum StepKind {
+    /// Somebody publishes it.
+    Advertise,
+    /// Somebody asks for it.
+    Request,
+    /// They match, and a flow carries it.
+    Plan,
+    /// The bridge exists and reads its scope.
+    Bridge,
+    /// It is let through.
+    Admit,
+    /// It crosses the inter scope.
+    Link,
+    /// It is written to the scope of the requester.
+    Deliver,
+}
+
+/// The verdict for a topic.
+#[must_use]
+pub fn explain(input: &WhyInput<'_>) -> Why {
+    let destinations = match TopicView::new(input.world, input.topic) {
+        Some(view) => Explainer { input, view }.destinations(),
+        None => Vec::new(),
+    };
+    let verdict = verdict(&destinations, input.to.is_some());
+    let mut traces: Vec<Trace> = destinations.into_iter().flatten().collect();
+    traces.sort_by_key(|trace| std::cmp::Reverse(trace.verdict()));
+    let code = traces.first().map_or(WhyCode::NoAdvertise, Trace::code);
+    let mut steps: Vec<Step> = Vec::new();
+    for step in traces.into_iter().flat_map(|trace| trace.steps) {
+        if steps.len() < MAX_STEPS && !steps.contains(&step) {
+            steps.push(step);
+        }
+    }
+    Why {
+        topic: input.topic.clone(),
+        to: input.to.clone(),
+        verdict,
+        code,
+        remedy: remedy::remedy(code),
+        steps,
+    }
+}
+
+/// The worst of those that were asked for; of everybody, degraded if some are served.
+fn verdict(destinations: &[Vec<Trace>], asked: bool) -> Verdict {
+    let served = destinations
+        .iter()
+        .map(|traces| together(traces.iter().map(Trace::verdict)));
+    if asked {
+        served.max().unwrap_or(Verdict::NotFlowing)
+    } else {
+        together(served)
+    }
+}
+
+/// All, some or none.
+fn together(parts: impl Iterator<Item = Verdict> + Clone) -> Verdict {
+    let worst = parts.clone().max().unwrap_or(Verdict::NotFlowing);
+    let best = parts.min().unwrap_or(Verdict::NotFlowing);
+    if best == worst { worst } else { Verdict::Degraded }
+}
+
+struct Explainer<'a, 'w> {
+    input: &'a WhyInput<'w>,
+    view: TopicView<'w>,
+}
+
+impl<'w> Explainer<'_, 'w> {
+    /// What was found for each requester that is asked about.
+    fn destinations(&self) -> Vec<Vec<Trace>> {
+        let advertised = self.advertise_side();
+        let requested = self.request_side();
+        let (Ok(publishers), Ok(requesters)) = (&advertised, &requested) else {
+            let failed = [advertised.err(), requested.err()].into_iter().flatten();
+            return vec![vec![Trace {
+                steps: failed.flat_map(|trace| trace.steps).collect(),
+            }]];
+        };
+        let tracer = Tracer {
+            input: self.input,
+            view: &self.view,
+        };
+        let mut left = MAX_PAIRS;
+        let mut destinations = Vec::new();
+        for requester in requesters {
+            let traces = pairs_of(&tracer, publishers, requester, left);
+            left -= traces.len().min(left);
+            destinations.push(traces);
+            if left == 0 {
+                break;
+            }
+        }
+        destinations
+    }
+
+    /// Publishers of flows that carry topics, each scope once, those next to this flow first; or what is wrong.
+    fn advertise_side(&self) -> Result<Vec<Publisher<'w>>, Trace> {
+        let mut found: Vec<Publisher<'w>> = Vec::new();
+        for publisher in &self.view.publishers {
+            let same = |other: &Publisher<'_>| {
+                publisher.scope == Scope::Layer && other.scope == Scope::Layer && other.group == publisher.group
+            };
+            match found.iter_mut().find(|other| same(other)) {
+                Some(other) if publisher.flow == self.view.me => *other = *publisher,
+                Some(_) => {}
+                None => found.push(*publisher),
+            }
+        }
+        found.sort_by_key(|publisher| (publisher.flow != self.view.me, publisher.group != self.view.group));
+        if !found.is_empty() {
+            return Ok(found);
+        }
+        let lost = self.input.world.flows.iter().find(|(_, flow)| {
+            let entry = flow.topics.get(self.input.topic);
+            entry.is_some_and(|entry| entry.node.advertise.is_some() || entry.layer.advertise.is_some())
+        });
+        let (flow, code, detail) = match lost {
+            Some((id, flow)) => (id, absent(flow), absence(id, flow)),
+            None => match self.hint(StepKind::Advertise) {
+                Some(hint) => (&hint.flow, hint.code, format!("{} of {}", hint.code, hint.service)),
+                None => (self.view.me, WhyCode::NoAdvertise, "nobody advertises it".to_owned()),
+            },
+        };
+        Err(Trace::failed(flow, StepKind::Advertise, code, detail))
+    }
+
+    /// Requesters that are asked about, of all flows, each scope once; or what is wrong.
+    fn request_side(&self) -> Result<Vec<Requester<'w>>, Trace> {
+        let mut found: Vec<Requester<'w>> = Vec::new();
+        let living = &self.view.requesters;
+        let all: Vec<Requester<'w>> = living.iter().copied().chain(self.silent_requesters()).collect();
+        for requester in all.iter().filter(|requester| self.is_asked(requester, &all)) {
+            let shared = |other: &Requester<'_>| {
+                requester.scope == Scope::Layer && other.scope == Scope::Layer && other.group == requester.group
+            };
+            match found.iter_mut().find(|other| shared(other)) {
+                Some(other) if requester.flow == self.view.me && self.carries(requester.flow) => *other = *requester,
+                Some(_) => {}
+                None => found.push(*requester),
+            }
+        }
+        found.sort_by_key(|requester| (requester.flow != self.view.me, requester.group != self.view.group));
+        if !found.is_empty() {
+            return Ok(found);
+        }
+        let (flow, code, detail) = match self.hint(StepKind::Request) {
+            Some(hint) => (&hint.flow, hint.code, format!("{} of {}", hint.code, hint.service)),
+            None => {
+                let place = self
+                    .input
+                    .to
+                    .as_ref()
+                    .map_or_else(String::new, |to| format!(" in {to}"));
+                (self.view.me, WhyCode::NoRequest, format!("nobody{place} requests it"))
+            }
+        };
+        Err(Trace::failed(flow, StepKind::Request, code, detail))
+    }
+
+    /// Requesters of flows that carry nothing.
+    fn silent_requesters(&self) -> Vec<Requester<'w>> {
+        let mut silent = Vec::new();
+        for (id, flow) in self.input.world.flows.iter().filter(|(id, _)| !self.carries(id)) {
+            let Some(entry) = flow.topics.get(self.input.topic) else {
+                continue;
+            };
+            for (scope, entry) in [(Scope::Node, &entry.node), (Scope::Layer, &entry.layer)] {
+                let group = Group::of(id, flow);
+                // What a lost flow said of a layer scope counts only while nobody else is there to know better.
+                let known = scope == Scope::Layer && self.has_living(group);
+                silent.extend(entry.request.as_ref().filter(|_| !known).map(|request| Requester {
+                    flow: id,
+                    group,
+                    scope,
+                    request,
+                }));
+            }
+        }
+        silent
+    }
+
+    fn has_living(&self, group: Group<'_>) -> bool {
+        let mut flows = self.input.world.flows.iter();
+        flows.any(|(id, flow)| self.carries(id) && Group::of(id, flow) == group)
+    }
+
+    fn carries(&self, id: &FlowId) -> bool {
+        let flow = self.input.world.flows.get(id);
+        flow.is_some_and(|flow| flow.state == FlowState::Ready && (flow.reach != Reach::Down || id == self.view.me))
+    }
+
+    /// Of a node its own requesters; if it has none, those of the layer scope that it is on.
+    fn is_asked(&self, requester: &Requester<'w>, all: &[Requester<'w>]) -> bool {
+        let Some(to) = &self.input.to else { return true };
+        let in_node = |requester: &Requester<'_>| {
+            requester.flow.layer == to.layer && to.node.as_ref().is_none_or(|node| requester.flow.node == *node)
+        };
+        let node_asks = || all.iter().any(|other| other.scope == Scope::Node && in_node(other));
+        in_node(requester) && (to.node.is_none() || requester.scope == Scope::Node || !node_asks())
+    }
+
+    fn hint(&self, kind: StepKind) -> Option<&LeaseHint> {
+        self.input.leases.iter().find(|hint| {
+            let to = self.input.to.as_ref().filter(|_| kind == StepKind::Request);
+            let fits = to.is_none_or(|to| {
+                hint.flow.layer == to.layer && to.node.as_ref().is_none_or(|node| hint.flow.node == *node)
+            });
+            hint.kind == kind && fits
+        })
+    }
+}
+
+/// One trace per publisher that the requester asks for; one that says so if it asks for none of them.
+fn pairs_of<'w>(
+    tracer: &Tracer<'_, 'w>,
+    publishers: &[Publisher<'w>],
+    requester: &Requester<'w>,
+    limit: usize,
+) -> Vec<Trace> {
+    let wanted = |publisher: &&Publisher<'w>| publisher.pairing(requester.request) != Pairing::OtherOrigin;
+    let wanted: Vec<_> = publishers.iter().filter(wanted).collect();
+    let all = if wanted.is_empty() {
+        publishers.iter().take(1).collect()
+    } else {
+        wanted
+    };
+    all.into_iter()
+        .take(limit)
+        .map(|publisher| tracer.trace(publisher, requester))
+        .collect()
+}
+
+/// Why a flow carries nothing.
+fn absent(flow: &FlowView) -> WhyCode {
+    match (flow.state, flow.reach) {
+        (FlowState::Starting, Reach::Up | Reach::Suspect) => WhyCode::BridgeStarting,
+        _ => WhyCode::PeerDown,
+    }
+}
+
+fn absence(id: &FlowId, flow: &FlowView) -> String {
+    let what = match (flow.state, flow.reach) {
+        (_, Reach::Down) => "is down",
+        (FlowState::Starting, _) => "is starting",
+        (FlowState::Draining, _) => "is going away",
+        (FlowState::Ready, _) => "has no such scope",
+    };
+    format!("{id} {what}")
+}

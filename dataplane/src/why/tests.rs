@@ -1,0 +1,346 @@
+use std::collections::{BTreeMap, BTreeSet};
+
+use blaze_domain::{DropReason, Durability, Reliability};
+
+use super::*;
+use crate::plan::tests::generate::{Dice, System};
+use crate::plan::tests::worlds::{ask, entry, filter, id, offer, topic, world};
+use crate::plan::{PlanRules, TopicPlan, plan_topic};
+use crate::world::World;
+
+/// A question, with everything well: each planned bridge is up and carried ten messages.
+struct Setup {
+    world: World,
+    to: Option<&'static str>,
+    plan: TopicPlan,
+    bridges: Vec<BridgeFacts>,
+    node_broker: BrokerFacts,
+    layer_broker: BrokerFacts,
+    routes: Vec<RouteFacts>,
+    leases: Vec<LeaseHint>,
+}
+
+impl Setup {
+    fn new(world: World) -> Self {
+        let broker = |name: &str, at_most_once| BrokerFacts {
+            name: name.to_owned(),
+            health: BrokerHealth::Up,
+            at_most_once,
+        };
+        let mut setup = Self {
+            world,
+            to: None,
+            plan: TopicPlan::default(),
+            bridges: Vec::new(),
+            node_broker: broker("redis 7.0.15", true),
+            layer_broker: broker("kafka", false),
+            routes: Vec::new(),
+            leases: Vec::new(),
+        };
+        setup.replan();
+        setup
+    }
+
+    /// After a change of the world: plan and bridges follow.
+    fn replan(&mut self) {
+        self.plan = plan_topic(&self.world, &topic(), &PlanRules::default(), None);
+        let up = |bridge: &crate::plan::Bridge| BridgeFacts {
+            from: bridge.from,
+            to: bridge.to.clone(),
+            state: BridgeState::Up,
+            received: 10,
+            sent: 10,
+            dropped: BTreeMap::new(),
+        };
+        self.bridges = self.plan.bridges.iter().map(up).collect();
+    }
+
+    fn drops(&mut self, reason: DropReason, sent: u64) {
+        self.bridges[0].sent = sent;
+        self.bridges[0].dropped.insert(reason, 10 - sent);
+    }
+
+    fn route(&mut self, flow: &str, receiver: Option<&str>, step: StepKind, code: WhyCode) {
+        let to = receiver.unwrap_or(flow);
+        self.routes.push(RouteFacts {
+            flow: id(flow),
+            to_layer: id(to).layer,
+            receiver: receiver.map(id),
+            step,
+            ok: code == WhyCode::Ok,
+            code,
+        });
+    }
+
+    fn hint(&mut self, kind: StepKind, code: WhyCode) {
+        self.leases.push(LeaseHint {
+            flow: self.world.me.clone(),
+            kind,
+            service: "driver".to_owned(),
+            code,
+        });
+    }
+
+    fn why(&self) -> Why {
+        explain(&WhyInput {
+            world: &self.world,
+            topic: &topic(),
+            to: self.to.map(|to| to.parse().unwrap()),
+            plan: &self.plan,
+            bridges: self.bridges.clone(),
+            node_broker: Some(self.node_broker.clone()),
+            layer_broker: Some(self.layer_broker.clone()),
+            routes: self.routes.clone(),
+            leases: self.leases.clone(),
+        })
+    }
+}
+
+struct Row {
+    name: &'static str,
+    flows: &'static [&'static str],
+    change: fn(&mut Setup),
+    verdict: Verdict,
+    code: WhyCode,
+    /// The step that carries the code.
+    step: Option<StepKind>,
+}
+
+/// An edge node publishes, a cloud node asks; the edge node is asked why.
+const PAIR: &[&str] = &["e/a@1 node+", "c/b@1 node-"];
+/// The same, seen from the cloud.
+const FROM_CLOUD: &[&str] = &["c/b@1 node-", "e/a@1 node+"];
+
+macro_rules! rows {
+    ($($name:literal: $flows:expr, $change:expr => $verdict:ident $code:ident $($step:ident)?;)+) => {
+        vec![$(Row { name: $name, flows: $flows, change: $change, verdict: Verdict::$verdict, code: WhyCode::$code,
+            step: rows!(@step $($step)?) }),+]
+    };
+    (@step) => { None };
+    (@step $step:ident) => { Some(StepKind::$step) };
+}
+
+#[rustfmt::skip]
+fn rows() -> Vec<Row> {
+    rows! {
+        "all is well": PAIR, |_| {} => Flowing Ok;
+        "seen from the receiver": FROM_CLOUD, |_| {} => Flowing Ok;
+        "one scope, no bridge": &["e/a node+ node-"], |_| {} => Flowing Ok;
+        "over the layer": &["e/a@1 node+", "e/b@1 node-"], |_| {} => Flowing Ok;
+        "two other flows": &["f/x@1", "e/a@1 node+", "c/b node-"], |_| {} => Flowing Ok;
+        "nobody knows it": &["e/a"], |_| {} => NotFlowing NoAdvertise Advertise;
+        "nobody advertises": &["e/a node-"], |_| {} => NotFlowing NoAdvertise Advertise;
+        "nobody requests": &["e/a node+"], |_| {} => NotFlowing NoRequest Request;
+        "nobody there requests": PAIR, |s| s.to = Some("f") => NotFlowing NoRequest Request;
+        "nobody on that node requests": PAIR, |s| s.to = Some("c/x") => NotFlowing NoRequest Request;
+        "that node requests": PAIR, |s| s.to = Some("c/b/logger") => Flowing Ok;
+        "a service of that node on the layer": &["e/a node+", "c/b@1 layer-"], |s| s.to = Some("c/b") => Flowing Ok;
+        "the advertise lapsed": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::LeaseExpired) => NotFlowing LeaseExpired Advertise;
+        "the request lapsed": &["e/a node+"], |s| s.hint(StepKind::Request, WhyCode::LeaseExpired) => NotFlowing LeaseExpired Request;
+        "a lapsed request is no lapsed advertise": &["e/a"], |s| s.hint(StepKind::Request, WhyCode::LeaseExpired) => NotFlowing NoAdvertise Advertise;
+        "a lease from elsewhere": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::SourceMismatch) => NotFlowing SourceMismatch Advertise;
+        "a name that the broker cannot express": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::NameNotExpressible) => NotFlowing NameNotExpressible Advertise;
+        "two names that are one on the broker": &["e/a node+"], |s| s.hint(StepKind::Request, WhyCode::NameCollision) => NotFlowing NameCollision Request;
+        "not allowed": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::AccessDenied) => NotFlowing AccessDenied Advertise;
+        "no such origin": PAIR, |s| { ask(&mut s.world, "c/b", "node").from = vec![filter("x/*/*")]; s.replan(); } => NotFlowing NoMatchingOrigin Plan;
+        "other types": PAIR, |s| {
+            offer(&mut s.world, "e/a", "node").type_name = "a/A".to_owned();
+            ask(&mut s.world, "c/b", "node").type_name = "b/B".to_owned();
+            s.replan();
+        } => NotFlowing TypeMismatch Plan;
+        "more asked than offered": PAIR, |s| { ask(&mut s.world, "c/b", "node").reliability = Reliability::Reliable; s.replan(); } => Degraded QosMismatch Plan;
+        "late joiners ask for more": PAIR, |s| { ask(&mut s.world, "c/b", "node").durability = Durability::TransientLocal; s.replan(); } => Degraded QosMismatch Plan;
+        "the requester is down": &["e/a node+", "c/b down node-"], |_| {} => NotFlowing PeerDown Link;
+        "the requester goes away": &["e/a node+", "c/b draining node-"], |_| {} => NotFlowing PeerDown Link;
+        "the requester starts": &["e/a node+", "c/b starting node-"], |_| {} => NotFlowing BridgeStarting Plan;
+        "the publisher is down": &["c/b node-", "e/a down node+"], |_| {} => NotFlowing PeerDown Advertise;
+        "the publisher starts": &["e/a starting node+", "c/b node-"], |_| {} => NotFlowing BridgeStarting Advertise;
+        "the receiver does not answer": &["e/a node+", "c/b suspect node-"], |_| {} => NotFlowing PeerSuspect Link;
+        "the sender does not answer": &["c/b node-", "e/a suspect node+"], |_| {} => NotFlowing PeerSuspect Link;
+        "one of two is down": &["e/a node+", "c/b node-", "c/d down node-"], |_| {} => Degraded PeerDown Link;
+        "the one that is meant is down": &["e/a node+", "c/b node-", "c/d down node-"], |s| s.to = Some("c/d") => NotFlowing PeerDown Link;
+        "the other one is meant": &["e/a node+", "c/b node-", "c/d down node-"], |s| s.to = Some("c/b") => Flowing Ok;
+        "the worst in the layer that is meant": &["e/a node+", "c/b node-", "c/d down node-"], |s| s.to = Some("c") => NotFlowing PeerDown Link;
+        "not planned yet": PAIR, |s| { s.plan = TopicPlan::default(); s.bridges.clear(); } => NotFlowing BridgeStarting Bridge;
+        "planned, not made": PAIR, |s| s.bridges.clear() => NotFlowing BridgeStarting Bridge;
+        "being made": PAIR, |s| s.bridges[0].state = BridgeState::Starting => NotFlowing BridgeStarting Bridge;
+        "not made": PAIR, |s| s.bridges[0].state = BridgeState::Failed("refused".to_owned()) => NotFlowing BridgeFailed Bridge;
+        "the intake is not made": FROM_CLOUD, |s| s.bridges[0].state = BridgeState::Failed("refused".to_owned()) => NotFlowing BridgeFailed Bridge;
+        "an intake that no plan expected delivers": FROM_CLOUD, |s| { s.plan = TopicPlan::default(); s.bridges.clear(); } => Flowing Ok;
+        "the source broker is away": PAIR, |s| s.node_broker.health = BrokerHealth::Down => NotFlowing BrokerDown Bridge;
+        "the target broker is away": FROM_CLOUD, |s| s.node_broker.health = BrokerHealth::Down => NotFlowing BrokerDown Deliver;
+        "another broker is away": PAIR, |s| s.layer_broker.health = BrokerHealth::Down => Flowing Ok;
+        "another flow uses the source": PAIR, |s| s.node_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Bridge;
+        "another flow uses the target": &["e/a@1 node+ layer-"], |s| s.layer_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Deliver;
+        "no budget at all": PAIR, |s| s.drops(DropReason::RateLimit, 0) => NotFlowing BudgetStarved Admit;
+        "less budget than rate": PAIR, |s| s.drops(DropReason::RateLimit, 4) => Degraded RateLimited Admit;
+        "thinned as asked": PAIR, |s| s.drops(DropReason::MaxRate, 4) => Flowing Ok;
+        "the queue overflows": PAIR, |s| s.drops(DropReason::QueueFull, 4) => Degraded RateLimited Link;
+        "all too large": PAIR, |s| s.drops(DropReason::TooLarge, 0) => NotFlowing TooLarge Admit;
+        "some too large": PAIR, |s| s.drops(DropReason::TooLarge, 9) => Degraded TooLarge Admit;
+        "too old on the link": PAIR, |s| s.drops(DropReason::Lifespan, 0) => NotFlowing Lifespan Link;
+        "too old on arrival": FROM_CLOUD, |s| s.drops(DropReason::Lifespan, 0) => NotFlowing Lifespan Deliver;
+        "the link went down": PAIR, |s| s.drops(DropReason::LinkDown, 5) => Degraded PeerDown Link;
+        "the broker refuses": FROM_CLOUD, |s| s.drops(DropReason::BrokerError, 0) => NotFlowing BrokerDown Deliver;
+        "messages of another type": PAIR, |s| s.drops(DropReason::TypeMismatch, 0) => NotFlowing TypeMismatch Admit;
+        "messages from elsewhere": PAIR, |s| s.drops(DropReason::ForeignOrigin, 0) => NotFlowing SourceMismatch Admit;
+        "repeats are no fault": PAIR, |s| s.drops(DropReason::Duplicate, 5) => Flowing Ok;
+        "the sender says why": FROM_CLOUD, |s| s.route("e/a", Some("c/b"), StepKind::Admit, WhyCode::BudgetStarved) => NotFlowing BudgetStarved Admit;
+        "the sender says that all is well": FROM_CLOUD, |s| s.route("e/a", Some("c/b"), StepKind::Deliver, WhyCode::Ok) => Flowing Ok;
+        "the receiver says why": PAIR, |s| s.route("c/b", None, StepKind::Deliver, WhyCode::BrokerDown) => NotFlowing BrokerDown Deliver;
+        "a route to somewhere else says nothing": FROM_CLOUD, |s| s.route("e/a", Some("f/x"), StepKind::Admit, WhyCode::BudgetStarved) => Flowing Ok;
+        "a native path": PAIR, |s| s.routes.push(RouteFacts {
+            flow: id("c/b"), to_layer: id("c/b").layer, receiver: None, step: StepKind::Deliver, ok: true, code: WhyCode::NativePath,
+        }) => Flowing Ok;
+    }
+}
+
+#[test]
+fn verdict_and_cause_of_each_case() {
+    let mut seen = BTreeSet::new();
+    for row in rows() {
+        let mut setup = Setup::new(world(row.flows));
+        (row.change)(&mut setup);
+        let why = setup.why();
+        assert_eq!(
+            (why.verdict, why.code),
+            (row.verdict, row.code),
+            "{}: {why:#?}",
+            row.name
+        );
+        let naming = why
+            .steps
+            .iter()
+            .find(|step| step.code == row.code && row.code != WhyCode::Ok);
+        assert_eq!(naming.map(|step| step.step), row.step, "{}: {why:#?}", row.name);
+        let failing = why.steps.iter().find(|step| !step.ok);
+        assert!(
+            failing.is_none_or(|step| step.code == why.code),
+            "{}: the first failing step names the code",
+            row.name
+        );
+        assert!(
+            why.steps.iter().all(|step| step.ok || step.code != WhyCode::Ok),
+            "{}",
+            row.name
+        );
+        assert!(!why.remedy.is_empty());
+        seen.extend(why.steps.iter().map(|step| step.code).chain([why.code]));
+    }
+    // The two that are left have tests of their own below.
+    let missing: Vec<_> = WhyCode::ALL.iter().filter(|code| !seen.contains(code)).collect();
+    assert_eq!(missing, [&WhyCode::NotOwner]);
+}
+
+/// The flow of `f/a` and `f/b` that does not carry the topic, and the one that does.
+fn replicas() -> (World, FlowId) {
+    let mut world = world(&["f/a@1 layer+", "f/b@1 layer+", "c/x@1 layer-"]);
+    let owner = crate::plan::owner(&world, &topic()).unwrap();
+    world.me = if owner == id("f/a") { id("f/b") } else { id("f/a") };
+    (world, owner)
+}
+
+#[test]
+fn a_replica_names_the_one_that_carries_the_topic() {
+    let (world, owner) = replicas();
+    let mut setup = Setup::new(world);
+    let why = setup.why();
+    assert_eq!((why.verdict, why.code), (Verdict::NotFlowing, WhyCode::NotOwner));
+    let step = why.steps.iter().find(|step| !step.ok).unwrap();
+    assert!(
+        step.step == StepKind::Plan && step.detail.contains(&owner.to_string()),
+        "{step:?}"
+    );
+    setup.route(&owner.to_string(), Some("c/x"), StepKind::Deliver, WhyCode::Ok);
+    assert_eq!(setup.why().verdict, Verdict::Flowing, "it says that it flows");
+}
+
+#[test]
+fn the_answer_has_the_keys_of_the_contract_in_their_order() {
+    let mut setup = Setup::new(world(PAIR));
+    setup.to = Some("c/b");
+    setup.bridges[0].state = BridgeState::Failed("topic refused".to_owned());
+    let text = serde_json::to_string(&setup.why()).unwrap();
+    let expected = concat!(
+        r#"{"topic":"imu/data","to":"c/b","verdict":"not_flowing","code":"bridge_failed","remedy":"Read the step's "#,
+        r#"detail and the flow's log: the broker refused what the bridge needs.","steps":["#,
+        r#"{"flow":"e/a","step":"advertise","ok":true,"code":"ok","detail":"driver on node scope"},"#,
+        r#"{"flow":"c/b","step":"request","ok":true,"code":"ok","detail":"on node scope"},"#,
+        r#"{"flow":"e/a","step":"plan","ok":true,"code":"ok","detail":"they match"},"#,
+        r#"{"flow":"e/a","step":"bridge","ok":false,"code":"bridge_failed","detail":"node to inter, c/b: topic refused"}]}"#,
+    );
+    assert_eq!(text, expected);
+    setup.to = None;
+    assert!(serde_json::to_string(&setup.why()).unwrap().contains(r#""to":null"#));
+}
+
+#[test]
+fn redis_says_that_it_is_at_most_once() {
+    let mut setup = Setup::new(world(PAIR));
+    offer(&mut setup.world, "e/a", "node").reliability = Reliability::Reliable;
+    ask(&mut setup.world, "c/b", "node").reliability = Reliability::Reliable;
+    setup.replan();
+    let why = setup.why();
+    assert_eq!(why.verdict, Verdict::Flowing);
+    assert!(
+        why.steps
+            .iter()
+            .any(|step| step.detail.contains("redis 7.0.15 delivers at most once")),
+        "{why:#?}"
+    );
+}
+
+#[test]
+fn an_answer_is_bounded_and_the_cause_comes_first() {
+    let mut lines = vec!["e/a node+".to_owned()];
+    lines.extend((0..500).map(|n| format!("c/n{n} node-")));
+    lines.push("f/z down node-".to_owned());
+    let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
+    let mut setup = Setup::new(world(&lines));
+    entry(&mut setup.world, "c/n0", "node")
+        .request
+        .as_mut()
+        .unwrap()
+        .type_name = "b/B".to_owned();
+    offer(&mut setup.world, "e/a", "node").type_name = "a/A".to_owned();
+    setup.replan();
+    let why = setup.why();
+    assert_eq!((why.verdict, why.code), (Verdict::Degraded, WhyCode::TypeMismatch));
+    assert_eq!(why.steps.len(), MAX_STEPS);
+}
+
+#[test]
+fn a_target_is_a_layer_a_node_or_a_service() {
+    for text in ["c", "c/b", "c/b/logger"] {
+        assert_eq!(text.parse::<WhyTarget>().unwrap().to_string(), text);
+    }
+    for text in ["", "/b", "c/", "c/b/", "c/b/l/0", "C"] {
+        assert!(text.parse::<WhyTarget>().is_err(), "{text}");
+    }
+}
+
+/// The ways that `why` looks for are those that the planner makes: where all bridges are up, none is missing.
+#[test]
+fn why_and_the_planner_agree_in_random_systems() {
+    let mut bridges = BTreeSet::new();
+    for seed in 0..300 {
+        let mut system = System::random(&mut Dice(seed));
+        for view in system.world.flows.values_mut() {
+            (view.state, view.reach) = (FlowState::Ready, Reach::Up);
+        }
+        for me in system.ids() {
+            system.world.me = me.clone();
+            let setup = Setup::new(system.world.clone());
+            let why = setup.why();
+            let missing = why.steps.iter().find(|step| step.code == WhyCode::BridgeStarting);
+            assert!(missing.is_none(), "seed {seed} {me}: {missing:?}\n{:#?}", setup.plan);
+            bridges.extend(
+                why.steps
+                    .into_iter()
+                    .filter(|step| step.step == StepKind::Bridge)
+                    .map(|step| step.detail),
+            );
+        }
+    }
+    assert!(bridges.len() > 20, "{bridges:?}");
+}

@@ -1,0 +1,407 @@
+//! One publisher and one requester: the hops between them, and what each of them says.
+
+use std::fmt::Write as _;
+
+use blaze_domain::{DropReason, FlowId, Reliability, Scope, WhyCode};
+
+use super::{BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, Step, StepKind, Verdict, WhyInput, absence, absent};
+use crate::plan::{Pairing, Publisher, Requester, Target, TopicView, asks_too_much, meets_directly, type_detail};
+use crate::world::{FlowState, Reach};
+
+/// The steps of one pair, in the order of a message's way.
+pub(super) struct Trace {
+    pub(super) steps: Vec<Step>,
+}
+
+impl Trace {
+    pub(super) fn failed(flow: &FlowId, step: StepKind, code: WhyCode, detail: String) -> Self {
+        let mut trace = Self { steps: Vec::new() };
+        trace.add(flow, step, false, code, detail);
+        trace
+    }
+
+    fn add(&mut self, flow: &FlowId, step: StepKind, ok: bool, code: WhyCode, detail: impl Into<String>) {
+        self.steps.push(Step {
+            flow: flow.clone(),
+            step,
+            ok,
+            code,
+            detail: detail.into(),
+        });
+    }
+
+    pub(super) fn verdict(&self) -> Verdict {
+        if self.steps.iter().any(|step| !step.ok) {
+            Verdict::NotFlowing
+        } else if self.code() == WhyCode::Ok {
+            Verdict::Flowing
+        } else {
+            Verdict::Degraded
+        }
+    }
+
+    /// That of the first failing step, else the first that says that something is not as asked for.
+    pub(super) fn code(&self) -> WhyCode {
+        let failing = self.steps.iter().find(|step| !step.ok);
+        let remark = || {
+            self.steps
+                .iter()
+                .find(|step| step.code != WhyCode::Ok && step.code != WhyCode::NativePath)
+        };
+        failing.or_else(remark).map_or(WhyCode::Ok, |step| step.code)
+    }
+}
+
+/// One bridge on the way.
+struct Hop<'w> {
+    flow: &'w FlowId,
+    from: Scope,
+    to: Target,
+}
+
+pub(super) struct Tracer<'a, 'w> {
+    pub(super) input: &'a WhyInput<'w>,
+    pub(super) view: &'a TopicView<'w>,
+}
+
+impl<'w> Tracer<'_, 'w> {
+    pub(super) fn trace(&self, publisher: &Publisher<'w>, requester: &Requester<'w>) -> Trace {
+        let mut trace = Trace { steps: Vec::new() };
+        trace.add(
+            publisher.flow,
+            StepKind::Advertise,
+            true,
+            WhyCode::Ok,
+            advertised(publisher),
+        );
+        trace.add(
+            requester.flow,
+            StepKind::Request,
+            true,
+            WhyCode::Ok,
+            requested(requester),
+        );
+        if self.plan(&mut trace, publisher, requester) {
+            for hop in self.hops(publisher, requester) {
+                self.hop(&mut trace, &hop);
+            }
+        }
+        trace
+    }
+
+    /// Whether the two match at all; the hops say the rest.
+    fn plan(&self, trace: &mut Trace, publisher: &Publisher<'w>, requester: &Requester<'w>) -> bool {
+        let (flow, plan) = (publisher.flow, StepKind::Plan);
+        match publisher.pairing(requester.request) {
+            Pairing::OtherOrigin => {
+                let detail = format!("`from` of {} matches no publisher", requester.flow);
+                trace.add(flow, plan, false, WhyCode::NoMatchingOrigin, detail);
+                return false;
+            }
+            Pairing::OtherType => {
+                trace.add(
+                    flow,
+                    plan,
+                    false,
+                    WhyCode::TypeMismatch,
+                    type_detail(publisher, requester),
+                );
+                return false;
+            }
+            Pairing::Matches => {}
+        }
+        if let Some(view) = self.input.world.flows.get(requester.flow)
+            && !self.carries(requester.flow)
+        {
+            let step = if absent(view) == WhyCode::PeerDown {
+                StepKind::Link
+            } else {
+                StepKind::Plan
+            };
+            trace.add(requester.flow, step, false, absent(view), absence(requester.flow, view));
+            return false;
+        }
+        if asks_too_much(publisher.advertise, requester.request) {
+            trace.add(
+                flow,
+                plan,
+                true,
+                WhyCode::QosMismatch,
+                "more is asked than offered: it flows as offered",
+            );
+        } else if meets_directly(publisher, requester) {
+            trace.add(flow, plan, true, WhyCode::Ok, "one scope: no bridge is needed");
+        } else {
+            trace.add(flow, plan, true, WhyCode::Ok, "they match");
+        }
+        self.note_broker(trace, publisher, requester);
+        true
+    }
+
+    /// A broker that loses messages of reliable topics says so.
+    fn note_broker(&self, trace: &mut Trace, publisher: &Publisher<'w>, requester: &Requester<'w>) {
+        let reliable = [publisher.advertise.reliability, requester.request.reliability] == [Reliability::Reliable; 2];
+        let ends = [(publisher.flow, publisher.scope), (requester.flow, requester.scope)];
+        let mut own = ends.iter().filter(|(flow, _)| *flow == self.view.me);
+        let broker = own.find_map(|(_, scope)| self.broker(*scope).filter(|broker| broker.at_most_once));
+        if let (true, Some(broker), Some(step)) = (reliable, broker, trace.steps.last_mut()) {
+            let _ = write!(step.detail, "; {} delivers at most once whatever is asked", broker.name);
+        }
+    }
+
+    fn carries(&self, id: &FlowId) -> bool {
+        let flow = self.input.world.flows.get(id);
+        flow.is_some_and(|flow| flow.state == FlowState::Ready && (flow.reach != Reach::Down || id == self.view.me))
+    }
+
+    /// The bridges between a publisher and a requester that match.
+    fn hops(&self, publisher: &Publisher<'w>, requester: &Requester<'w>) -> Vec<Hop<'w>> {
+        let hop = |flow, from, to| Hop { flow, from, to };
+        let framed = requester.request.framed.then_some(Target::Node { bare: false });
+        let bare = requester.request.bare.then_some(Target::Node { bare: true });
+        let node = |flow, from| framed.iter().chain(&bare).map(move |to| hop(flow, from, to.clone()));
+        let mut hops = Vec::new();
+        let on_node = requester.scope == Scope::Node;
+        if meets_directly(publisher, requester)
+            || (publisher.flow, publisher.scope) == (requester.flow, requester.scope)
+        {
+            // On one node a bare request alone needs a copy; framed ones read what is published.
+            hops.extend(
+                bare.filter(|_| on_node)
+                    .map(|bare| hop(requester.flow, Scope::Node, bare)),
+            );
+            return hops;
+        }
+        if publisher.group == requester.group {
+            hops.extend((publisher.scope == Scope::Node).then(|| hop(publisher.flow, Scope::Node, Target::Layer)));
+            hops.extend(node(requester.flow, Scope::Layer).filter(|_| on_node));
+            return hops;
+        }
+        let sender = if publisher.scope == Scope::Layer {
+            self.view.owner_in(publisher.group)
+        } else {
+            Some(publisher.flow)
+        };
+        let sender = sender.unwrap_or(publisher.flow);
+        let Some(receiver) = self.receiver(sender, publisher, requester) else {
+            return hops;
+        };
+        let target = Target::Inter {
+            layer: receiver.layer.clone(),
+            receiver: receiver.clone(),
+        };
+        hops.push(hop(sender, publisher.scope, target));
+        if on_node && requester.flow == receiver {
+            hops.extend(node(receiver, Scope::Inter));
+        } else {
+            hops.push(hop(receiver, Scope::Inter, Target::Layer));
+            hops.extend(node(requester.flow, Scope::Layer).filter(|_| on_node));
+        }
+        hops
+    }
+
+    /// The flow that the sender chose: as planned here, as it says, else as it would choose.
+    fn receiver(&self, sender: &FlowId, publisher: &Publisher<'w>, requester: &Requester<'w>) -> Option<&'w FlowId> {
+        let kept: Vec<&FlowId> = if sender == self.view.me {
+            let targets = self
+                .input
+                .plan
+                .bridges
+                .iter()
+                .filter(|bridge| bridge.from == publisher.scope);
+            targets.filter_map(|bridge| bridge.to.receiver()).collect()
+        } else {
+            let routes = self.input.routes.iter().filter(|route| route.flow == *sender);
+            routes.filter_map(|route| route.receiver.as_ref()).collect()
+        };
+        self.view.receiver(publisher, requester.group, &kept)
+    }
+
+    fn hop(&self, trace: &mut Trace, hop: &Hop<'w>) {
+        if hop.flow == self.view.me {
+            self.own_hop(trace, hop);
+        } else {
+            self.other_hop(trace, hop);
+        }
+    }
+
+    /// What another flow says of its part.
+    fn other_hop(&self, trace: &mut Trace, hop: &Hop<'w>) {
+        let (to_layer, receiver) = match &hop.to {
+            Target::Inter { layer, receiver } => (layer, Some(receiver)),
+            Target::Node { .. } | Target::Layer => (&hop.flow.layer, None),
+        };
+        let fits = |route: &&super::RouteFacts| {
+            route.flow == *hop.flow && route.to_layer == *to_layer && route.receiver.as_ref() == receiver
+        };
+        let route = self.input.routes.iter().find(fits);
+        let own_layer = self.view.own_layer_publisher().is_some() && hop.from == Scope::Layer;
+        if let Some(route) = route {
+            let detail = format!("{} says so of its way to {}", hop.flow, describe(&hop.to));
+            trace.add(hop.flow, route.step, route.ok, route.code, detail);
+        } else if own_layer && receiver.is_some() {
+            let detail = format!("{} carries it for the layer and has told nothing of it", hop.flow);
+            trace.add(self.view.me, StepKind::Plan, false, WhyCode::NotOwner, detail);
+        }
+        self.link(trace, hop);
+    }
+
+    /// What is known of a bridge of this flow.
+    fn own_hop(&self, trace: &mut Trace, hop: &Hop<'w>) {
+        let (flow, bridge) = (hop.flow, StepKind::Bridge);
+        let way = format!("{} to {}", hop.from, describe(&hop.to));
+        if let Some((code, detail)) = self.broker(hop.from).and_then(fault) {
+            return trace.add(flow, bridge, false, code, detail);
+        }
+        let planned = self
+            .input
+            .plan
+            .bridges
+            .iter()
+            .any(|planned| (planned.from, &planned.to) == (hop.from, &hop.to));
+        // What is addressed to a flow is delivered even where it did not expect to be chosen.
+        let unplanned = hop.from == Scope::Inter && !planned;
+        let facts = self
+            .input
+            .bridges
+            .iter()
+            .find(|facts| (facts.from, &facts.to) == (hop.from, &hop.to));
+        match facts.map(|facts| &facts.state) {
+            Some(BridgeState::Failed(detail)) => {
+                return trace.add(flow, bridge, false, WhyCode::BridgeFailed, format!("{way}: {detail}"));
+            }
+            Some(BridgeState::Up) => {}
+            None if unplanned => {}
+            Some(BridgeState::Starting) | None => {
+                let what = if planned { "is being made" } else { "is not planned yet" };
+                return trace.add(flow, bridge, false, WhyCode::BridgeStarting, format!("{way} {what}"));
+            }
+        }
+        trace.add(flow, bridge, true, WhyCode::Ok, way);
+        if let Some(facts) = facts {
+            drops(trace, hop, facts);
+        }
+        self.link(trace, hop);
+        if let Target::Node { .. } | Target::Layer = hop.to {
+            let scope = if hop.to == Target::Layer {
+                Scope::Layer
+            } else {
+                Scope::Node
+            };
+            match self.broker(scope).and_then(fault) {
+                Some((code, detail)) => trace.add(flow, StepKind::Deliver, false, code, detail),
+                None => trace.add(
+                    flow,
+                    StepKind::Deliver,
+                    true,
+                    WhyCode::Ok,
+                    facts.map_or_else(String::new, counts),
+                ),
+            }
+        }
+    }
+
+    /// Whether the receiver of a hop over the inter scope answers.
+    fn link(&self, trace: &mut Trace, hop: &Hop<'w>) {
+        let Target::Inter { receiver, .. } = &hop.to else {
+            return;
+        };
+        // Of the two ends one may be this flow, which knows that it lives.
+        let peer = if receiver == self.view.me { hop.flow } else { receiver };
+        let suspect = self
+            .input
+            .world
+            .flows
+            .get(peer)
+            .is_some_and(|view| view.reach == Reach::Suspect);
+        if suspect {
+            let detail = format!("{peer} has not answered for a moment");
+            trace.add(hop.flow, StepKind::Link, false, WhyCode::PeerSuspect, detail);
+        } else {
+            trace.add(hop.flow, StepKind::Link, true, WhyCode::Ok, format!("to {receiver}"));
+        }
+    }
+
+    fn broker(&self, scope: Scope) -> Option<&BrokerFacts> {
+        match scope {
+            Scope::Node => self.input.node_broker.as_ref(),
+            Scope::Layer => self.input.layer_broker.as_ref(),
+            Scope::Inter => None,
+        }
+    }
+}
+
+fn fault(broker: &BrokerFacts) -> Option<(WhyCode, String)> {
+    match broker.health {
+        BrokerHealth::Up => None,
+        BrokerHealth::Down => Some((WhyCode::BrokerDown, format!("{} does not answer", broker.name))),
+        BrokerHealth::InUse => Some((WhyCode::ScopeInUse, format!("another flow uses {}", broker.name))),
+    }
+}
+
+/// Drops that explain why messages are missing: all of them failed, or some.
+fn drops(trace: &mut Trace, hop: &Hop<'_>, facts: &BridgeFacts) {
+    let last = if matches!(hop.to, Target::Inter { .. }) {
+        StepKind::Link
+    } else {
+        StepKind::Deliver
+    };
+    let none_passed = facts.sent == 0;
+    let mut found = Vec::new();
+    for (reason, count) in facts.dropped.iter().filter(|(_, count)| **count > 0) {
+        let (step, code) = match reason {
+            DropReason::RateLimit if none_passed => (StepKind::Admit, WhyCode::BudgetStarved),
+            DropReason::RateLimit => (StepKind::Admit, WhyCode::RateLimited),
+            DropReason::TooLarge => (StepKind::Admit, WhyCode::TooLarge),
+            DropReason::TypeMismatch => (StepKind::Admit, WhyCode::TypeMismatch),
+            DropReason::ForeignOrigin => (StepKind::Admit, WhyCode::SourceMismatch),
+            DropReason::QueueFull => (last, WhyCode::RateLimited),
+            DropReason::Lifespan => (last, WhyCode::Lifespan),
+            DropReason::LinkDown => (last, WhyCode::PeerDown),
+            DropReason::BrokerError => (last, WhyCode::BrokerDown),
+            // As asked for, repeats, or faults of single messages that no setting cures.
+            DropReason::MaxRate
+            | DropReason::Duplicate
+            | DropReason::Echo
+            | DropReason::DecodeError
+            | DropReason::DecompressError
+            | DropReason::ReassemblyTimeout
+            | DropReason::NoDestination
+            | DropReason::Shutdown => continue,
+        };
+        found.push((step, code, format!("{count} dropped ({reason}), {}", counts(facts))));
+    }
+    found.sort();
+    for (step, code, detail) in found {
+        trace.add(hop.flow, step, !none_passed, code, detail);
+    }
+}
+
+fn counts(facts: &BridgeFacts) -> String {
+    format!("{} in, {} out lately", facts.received, facts.sent)
+}
+
+fn describe(target: &Target) -> String {
+    match target {
+        Target::Node { bare: false } => "node".to_owned(),
+        Target::Node { bare: true } => "node (bare)".to_owned(),
+        Target::Layer => "layer".to_owned(),
+        Target::Inter { receiver, .. } => format!("inter, {receiver}"),
+    }
+}
+
+fn advertised(publisher: &Publisher<'_>) -> String {
+    let mut services: Vec<&str> = publisher
+        .advertise
+        .sources
+        .iter()
+        .map(|source| source.service.as_str())
+        .collect();
+    services.dedup();
+    services.truncate(4);
+    format!("{} on {} scope", services.join(", "), publisher.scope)
+}
+
+fn requested(requester: &Requester<'_>) -> String {
+    format!("on {} scope", requester.scope)
+}
