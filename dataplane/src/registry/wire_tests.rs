@@ -1,6 +1,7 @@
 use blaze_proto::link::{LinkControl, link_control::Body};
 use proptest::prelude::*;
 
+use super::super::pieces::{MAX_LINK_CONTROL_BYTES, entry_hash, join, pack, pieces};
 use super::*;
 
 fn text(limit: usize) -> impl Strategy<Value = String> {

@@ -5,10 +5,13 @@ mod sync;
 
 use std::time::Duration;
 
+use blaze_domain::LayerKind;
 use blaze_domain::control::{AdvertiseMessage, ControlMessage, RequestMessage, WithdrawMessage};
-use serde_json::json;
+use blaze_proto::link::link_control::{Hello, Kind, State};
+use serde_json::{Value, json};
 
 use super::*;
+use crate::world::LayerScopeId;
 
 fn config(me: &str, epoch: u64, started: Instant) -> RegistryConfig {
     let me: FlowId = me.parse().unwrap();

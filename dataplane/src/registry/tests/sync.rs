@@ -390,6 +390,65 @@ fn a_new_life_replaces_what_the_old_one_announced() {
 }
 
 #[test]
+fn a_view_that_ran_ahead_of_its_flow_is_corrected() {
+    let (mut robot, mut fog, now) = pair();
+    let (me, fog_id) = (robot.world().me.clone(), fog.world().me.clone());
+    robot.on_hello(now, &fog_id, &hello(&fog));
+    let advertise = json!({"op": "advertise", "topic": "imu", "service": "a"});
+    robot.control(now, Scope::Node, advertise.to_string().as_bytes());
+    robot.poll(now + Duration::from_millis(20));
+    fog.on_hello(now, &me, &hello(&robot));
+    // A Delta of an earlier life comes late.
+    let stale = Delta {
+        from_version: 0,
+        to_version: 70,
+        part: 0,
+        parts: 1,
+        entries: Vec::new(),
+    };
+    fog.on_control(now, &me, Body::Delta(stale));
+    assert!(fog.all_topics().is_empty());
+    let mut at = now;
+    for _ in 0..200 {
+        at += Duration::from_millis(10);
+        if at.duration_since(now).as_millis() % 500 == 0 {
+            fog.on_hello(at, &me, &hello(&robot));
+        }
+        for (_, body) in fog.poll(at) {
+            robot.on_control(at, &fog_id, body);
+        }
+        for (_, body) in robot.poll(at) {
+            fog.on_control(at, &me, body);
+        }
+    }
+    assert!(fog.is_in_step_with(&me));
+    assert_eq!(fog.all_topics(), BTreeSet::from([topic("imu")]));
+}
+
+#[test]
+fn many_flows_are_pulled_a_few_at_a_time() {
+    let (robot, mut fog, now) = pair();
+    let mut hello = hello(&robot);
+    hello.registry_version = 1;
+    for index in 0..20 {
+        hello.node = format!("robot-{index}");
+        fog.on_hello(now, &format!("edge/robot-{index}").parse().unwrap(), &hello);
+    }
+    let mut at = now + Duration::from_millis(50);
+    assert_eq!(fog.next_poll(), Some(at));
+    assert_eq!(fog.poll(at).len(), 8);
+    // Nobody answers: the first give way to the others, and it never asks to be polled for nothing.
+    let mut asked = BTreeSet::new();
+    while at < now + Duration::from_secs(10) {
+        asked.extend(fog.poll(at).into_iter().map(|(flow, _)| flow));
+        let next = fog.next_poll().unwrap();
+        assert!(next > at, "{:?}", next - now);
+        at = next;
+    }
+    assert_eq!(asked.len(), 20);
+}
+
+#[test]
 fn state_and_reach_of_others_replan_everything() {
     let (robot, mut fog, now) = pair();
     let me = robot.world().me.clone();
