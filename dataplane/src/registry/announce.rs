@@ -11,7 +11,8 @@ use std::time::{Duration, Instant};
 use blaze_domain::TopicName;
 use blaze_proto::link::link_control as wire;
 
-use super::wire::{entry_hash, pack, pieces, removed};
+use super::pieces::{entry_hash, pack, pieces};
+use super::wire::removed;
 
 /// Changes wait this long for more of them.
 const DEBOUNCE: Duration = Duration::from_millis(10);

@@ -166,7 +166,3 @@ fn source(lease: &LeaseView<'_>) -> Source {
         service: lease.key.service.to_string(),
     }
 }
-
-#[cfg(test)]
-#[path = "merge_tests.rs"]
-mod tests;

@@ -13,8 +13,11 @@ use std::time::{Duration, Instant};
 use blaze_domain::TopicName;
 use blaze_proto::link::link_control as wire;
 
-use super::announce::{MAX_ASKED_PARTS, MAX_ENTRIES};
-use super::wire::{entry_hash, from_wire, join};
+use super::announce::MAX_ENTRIES;
+use super::pieces::{entry_hash, join};
+use super::pull::Pull;
+use super::types::SyncFaults;
+use super::wire::from_wire;
 use crate::world::TopicEntry;
 
 /// A gap may close by itself for this long: a Delta may come after the Hello that tells of it.
@@ -36,33 +39,6 @@ const MAX_PENDING_DELTAS: usize = 32;
 /// Most entries in one part.
 const MAX_PART_ENTRIES: usize = 1_000;
 
-/// What was ignored of other flows' announcements, and why.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct SyncFaults {
-    /// Entries with an invalid topic or an overlong text.
-    pub bad_entries: u64,
-    /// Entries beyond what one flow may announce.
-    pub too_many_entries: u64,
-    /// Deltas and snapshot parts with absurd numbers.
-    pub bad_parts: u64,
-    /// Snapshot parts that nobody had asked for.
-    pub unasked_parts: u64,
-    /// Deltas that gave way to newer ones before they could be applied.
-    pub evicted_deltas: u64,
-    /// Hellos that contradict themselves or their sender.
-    pub bad_hellos: u64,
-    /// Hellos of a life that is over.
-    pub old_epochs: u64,
-    /// Hellos of flows beyond the number that is followed.
-    pub too_many_flows: u64,
-    /// Announcements of flows that never said Hello.
-    pub unknown_flows: u64,
-    /// Messages to others that were dropped, because too many were asked for at once.
-    pub dropped_replies: u64,
-    /// Own route states that were not announced, because there are too many.
-    pub left_out_routes: u64,
-}
-
 struct RemoteEntry {
     hash: u64,
     routes: Vec<wire::RouteState>,
@@ -71,16 +47,6 @@ struct RemoteEntry {
 struct PartialDelta {
     parts: Vec<Option<Vec<wire::Entry>>>,
     missing: usize,
-}
-
-struct Pull {
-    /// `None` until the first part tells which version it is.
-    version: Option<u64>,
-    parts: Vec<Option<Vec<wire::Entry>>>,
-    missing: usize,
-    asked: BTreeSet<u32>,
-    next_request: Instant,
-    tries: u32,
 }
 
 /// The announcements of one other flow.
@@ -299,8 +265,7 @@ impl Remote {
         if !pull.take(now, snapshot) {
             faults.unasked_parts += 1;
         }
-        let complete = pull.version.is_some() && pull.missing == 0;
-        match self.pull.take_if(|_| complete) {
+        match self.pull.take_if(|pull| pull.is_complete()) {
             Some(pull) => self.finish(now, pull, topics, faults),
             None => BTreeSet::new(),
         }
@@ -404,14 +369,7 @@ impl Remote {
                 return None;
             }
             self.pull_at = None;
-            self.pull = Some(Pull {
-                version: None,
-                parts: Vec::new(),
-                missing: 0,
-                asked: (0..).take(MAX_ASKED_PARTS).collect(),
-                next_request: now,
-                tries: 0,
-            });
+            self.pull = Some(Pull::new(now));
         }
         let retry = self.retry;
         let pull = self.pull.as_mut().filter(|pull| pull.next_request <= now)?;
@@ -422,55 +380,5 @@ impl Remote {
             return None;
         }
         Some(pull.request(now, retry))
-    }
-}
-
-impl Pull {
-    /// Takes a part that was asked for.
-    fn take(&mut self, now: Instant, snapshot: wire::Snapshot) -> bool {
-        let count = usize::try_from(snapshot.parts).unwrap_or(0);
-        match self.version {
-            Some(version) if version == snapshot.version => {}
-            // The version that was begun is gone: begin with this one.
-            Some(version) if version > snapshot.version => return false,
-            _ => {
-                self.version = Some(snapshot.version);
-                self.parts = vec![None; count];
-                self.missing = count;
-                self.asked = (0..snapshot.parts).take(MAX_ASKED_PARTS).collect();
-            }
-        }
-        if self.parts.len() != count || !self.asked.remove(&snapshot.part) {
-            return false;
-        }
-        let slot = usize::try_from(snapshot.part)
-            .ok()
-            .and_then(|part| self.parts.get_mut(part));
-        if let Some(slot @ None) = slot {
-            *slot = Some(snapshot.entries);
-            self.missing -= 1;
-        }
-        self.tries = 0;
-        if self.asked.is_empty() {
-            self.next_request = now;
-        }
-        true
-    }
-
-    /// Asks for what was asked for and did not come, filled up with the next parts.
-    fn request(&mut self, now: Instant, retry: Duration) -> wire::SnapshotRequest {
-        if self.version.is_some() {
-            let next = (0..)
-                .zip(&self.parts)
-                .filter(|(_, part)| part.is_none())
-                .map(|(index, _)| index);
-            self.asked = next.take(MAX_ASKED_PARTS).collect();
-        }
-        self.tries += 1;
-        self.next_request = now + retry;
-        wire::SnapshotRequest {
-            version: self.version.unwrap_or(0),
-            parts: self.asked.iter().copied().collect(),
-        }
     }
 }

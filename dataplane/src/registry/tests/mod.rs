@@ -1,0 +1,54 @@
+//! The registry as its owner drives it.
+
+mod control;
+mod sync;
+
+use std::time::Duration;
+
+use blaze_domain::LayerKind;
+use blaze_domain::control::{AdvertiseMessage, ControlMessage, RequestMessage, WithdrawMessage};
+use blaze_proto::link::link_control::{Hello, Kind, State};
+use serde_json::{Value, json};
+
+use super::*;
+use crate::world::LayerScopeId;
+
+fn config(me: &str, epoch: u64, started: Instant) -> RegistryConfig {
+    let me: FlowId = me.parse().unwrap();
+    RegistryConfig {
+        kind: me.layer.as_str().parse().unwrap(),
+        me,
+        epoch,
+        node_scope: true,
+        layer_scope: Some(LayerScopeId(9)),
+        max_leases: 10_000,
+        layer_answers_need_id: true,
+        started,
+    }
+}
+
+fn topic(text: &str) -> TopicName {
+    text.parse().unwrap()
+}
+
+/// The Hello that a registry's flow would send.
+fn hello(registry: &Registry) -> Hello {
+    let own = registry.world().own().unwrap();
+    let (registry_version, registry_digest) = registry.announced();
+    Hello {
+        layer: registry.world().me.layer.to_string(),
+        node: registry.world().me.node.to_string(),
+        kind: match own.kind {
+            LayerKind::Edge => Kind::Edge,
+            LayerKind::Fog => Kind::Fog,
+            LayerKind::Cloud => Kind::Cloud,
+        }
+        .into(),
+        epoch: own.epoch,
+        registry_version,
+        registry_digest,
+        state: State::Ready.into(),
+        layer_scope_id: own.layer_scope.map_or(0, |id| id.0),
+        ..Hello::default()
+    }
+}
