@@ -1,0 +1,141 @@
+//! The task that connects the lease book with the broker.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use blaze_brokers::{Broker, BrokerError, BrokerKind, Content, Health, PublisherOptions, Received, SubscribeOptions};
+use blaze_domain::names::ChannelName;
+use bytes::Bytes;
+use tokio::time::sleep_until;
+
+use super::Shared;
+use super::protocol::{self, Answer, FlowEventKind, each};
+
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+const BATCH: usize = 256;
+
+/// The clock of the task, which tests can hold still.
+pub(super) fn now() -> Instant {
+    tokio::time::Instant::now().into_std()
+}
+
+/// Where a service gets its answers. On Kafka and DDS all share one topic.
+pub(super) fn reply_channel(kind: BrokerKind, own: &ChannelName) -> Option<ChannelName> {
+    match kind {
+        BrokerKind::Memory | BrokerKind::Redis => Some(own.clone()),
+        BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => "blaze/reply".parse().ok(),
+    }
+}
+
+/// Runs until the broker is closed.
+pub(super) async fn run(shared: Arc<Shared>, broker: Arc<dyn Broker>, own_reply: ChannelName) {
+    if let Err(error) = drive(&shared, broker.as_ref(), &own_reply).await {
+        tracing::warn!(%error, "the service cannot reach flows any more");
+    }
+    shared.book.lock().close();
+    shared.changed.notify_waiters();
+}
+
+async fn drive(shared: &Shared, broker: &dyn Broker, own_reply: &ChannelName) -> Result<(), BrokerError> {
+    let reply = reply_channel(broker.kind(), own_reply).unwrap_or_else(|| own_reply.clone());
+    let mut replies = subscribe(broker, &reply).await?;
+    let mut events = subscribe(broker, &ChannelName::events()).await?;
+    let control = broker.publisher(&ChannelName::control(), PublisherOptions::default())?;
+    let mut status = broker.status();
+    let mut was_up = status.borrow_and_update().health == Health::Up;
+    let (mut answers, mut told) = (Vec::new(), Vec::new());
+    loop {
+        let (objects, next) = {
+            let mut book = shared.book.lock();
+            (book.poll(now()), book.next_due())
+        };
+        for payload in protocol::payloads(&objects) {
+            // Refused while the broker is away: the book sends again until there is an answer.
+            control.publish_bare(&Bytes::from(payload));
+        }
+        shared.changed.notify_waiters();
+        tokio::select! {
+            count = replies.receive(&mut answers, BATCH) => {
+                if count == 0 {
+                    return Err(BrokerError::Closed);
+                }
+                on_answers(shared, answers.drain(..));
+            }
+            count = events.receive(&mut told, BATCH) => {
+                if count == 0 {
+                    return Err(BrokerError::Closed);
+                }
+                on_events(shared, told.drain(..));
+            }
+            changed = status.changed() => {
+                if changed.is_err() {
+                    return Err(BrokerError::Closed);
+                }
+                let is_up = status.borrow_and_update().health == Health::Up;
+                if is_up && !was_up {
+                    // What a flow said meanwhile was missed, and leases may have lapsed.
+                    shared.book.lock().send_all_again(now());
+                }
+                was_up = is_up;
+            }
+            () = shared.wake.notified() => {}
+            () = until(next) => {}
+        }
+    }
+}
+
+fn on_answers(shared: &Shared, answers: impl Iterator<Item = Received>) {
+    for payload in answers.filter_map(bare) {
+        let parsed: Vec<Answer> = each(&payload);
+        let mut book = shared.book.lock();
+        for answer in &parsed {
+            book.on_answer(answer, now());
+        }
+    }
+}
+
+fn on_events(shared: &Shared, events: impl Iterator<Item = Received>) {
+    for event in events.filter_map(bare).flat_map(|payload| protocol::events(&payload)) {
+        if event.kind == FlowEventKind::FlowStarted {
+            shared.book.lock().send_all_again(now());
+        }
+        // Without a listener there is nobody to tell.
+        let _ = shared.events.send(event);
+    }
+}
+
+fn bare(received: Received) -> Option<Bytes> {
+    match received.content {
+        Content::Bare { payload, .. } => Some(payload),
+        Content::Frame(_) | Content::Malformed { .. } => None,
+    }
+}
+
+async fn until(next: Option<Instant>) {
+    match next {
+        Some(next) => sleep_until(next.into()).await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Subscribes as soon as the broker lets it.
+async fn subscribe(broker: &dyn Broker, channel: &ChannelName) -> Result<blaze_brokers::Subscription, BrokerError> {
+    let mut pause = FIRST_PAUSE;
+    let mut status = broker.status();
+    loop {
+        match broker.subscribe(channel, SubscribeOptions::default()).await {
+            Ok(subscription) => return Ok(subscription),
+            Err(BrokerError::Away(reason)) => {
+                tracing::debug!(%channel, reason, "the broker is away, the service waits for it");
+            }
+            Err(error) => return Err(error),
+        }
+        // A change of the status may mean that it is back.
+        let _ = tokio::time::timeout(pause, status.changed()).await;
+        if status.has_changed().is_err() {
+            return Err(BrokerError::Closed);
+        }
+        pause = (pause * 2).min(LONGEST_PAUSE);
+    }
+}

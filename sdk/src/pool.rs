@@ -1,0 +1,223 @@
+//! Threads that run callbacks.
+//!
+//! ```text
+//! subscriptions ── tickets ──► ready queue ──► base threads (as many as cores)
+//!                                         └──► spare threads, while callbacks keep all others busy
+//! ```
+//!
+//! A ticket is "this subscription has something to run"; its job runs one callback and is put back at the end of the queue
+//! if there is more, so subscriptions take turns. When nothing was taken from the queue for [`STUCK_AFTER`], because every
+//! thread sits in a callback that waits for something, a spare thread comes to help; it leaves when it has been idle.
+
+use std::collections::VecDeque;
+use std::io;
+use std::sync::Arc;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use parking_lot::{Condvar, Mutex};
+use tokio::sync::watch;
+
+/// Spare threads of one pool at most.
+pub(crate) const MAX_SPARE_THREADS: usize = 16;
+/// How long the queue may stand still before a spare thread comes.
+const STUCK_AFTER: Duration = Duration::from_millis(50);
+/// How long a spare thread stays without work.
+const SPARE_IDLE: Duration = Duration::from_secs(5);
+
+/// Something that can be run piece by piece.
+pub(crate) trait Job: Send + Sync {
+    /// Runs one piece. Returns whether there is more. It must not panic.
+    fn run_one(&self) -> bool;
+}
+
+/// The threads; dropping it stops them.
+pub(crate) struct Pool {
+    shared: Arc<Shared>,
+}
+
+/// A way to put jobs into the pool.
+#[derive(Clone)]
+pub(crate) struct PoolHandle {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    state: Mutex<State>,
+    /// There is something in the queue.
+    work: Condvar,
+    /// The same, for the thread that watches whether it stands still.
+    watched: Condvar,
+    /// Threads that live.
+    alive: watch::Sender<usize>,
+}
+
+#[derive(Default)]
+struct State {
+    ready: VecDeque<Arc<dyn Job>>,
+    taken: u64,
+    /// Threads that wait for work; each will take one job of the queue.
+    idle: usize,
+    /// The watching thread looks at the queue by itself, it needs no call.
+    watching: bool,
+    spare: usize,
+    stopped: bool,
+}
+
+impl Pool {
+    /// Starts the threads; at least two, so that one slow callback never holds up the others.
+    pub(crate) fn start(threads: usize) -> io::Result<Self> {
+        let pool = Self {
+            shared: Arc::new(Shared {
+                state: Mutex::default(),
+                work: Condvar::new(),
+                watched: Condvar::new(),
+                alive: watch::Sender::new(0),
+            }),
+        };
+        for number in 0..threads.max(2) {
+            pool.shared
+                .spawn(format!("blaze-cb-{number}"), |shared| work(shared, None))?;
+        }
+        pool.shared.spawn("blaze-cb-watch".to_owned(), help_when_stuck)?;
+        Ok(pool)
+    }
+
+    pub(crate) fn handle(&self) -> PoolHandle {
+        PoolHandle {
+            shared: Arc::clone(&self.shared),
+        }
+    }
+
+    /// Forgets what waits and tells the threads to end after the callback that they are in.
+    pub(crate) fn stop(&self) {
+        let forgotten = {
+            let mut state = self.shared.state.lock();
+            state.stopped = true;
+            std::mem::take(&mut state.ready)
+        };
+        drop(forgotten);
+        self.shared.work.notify_all();
+        self.shared.watched.notify_all();
+    }
+
+    /// Waits until all threads ended. Returns how many had not within the time.
+    pub(crate) async fn ended(&self, within: Duration) -> usize {
+        let mut alive = self.shared.alive.subscribe();
+        let _ = tokio::time::timeout(within, alive.wait_for(|count| *count == 0)).await;
+        *alive.borrow()
+    }
+}
+
+impl Drop for Pool {
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+impl PoolHandle {
+    pub(crate) fn submit(&self, job: Arc<dyn Job>) {
+        self.shared.submit(job);
+    }
+}
+
+impl Shared {
+    fn submit(&self, job: Arc<dyn Job>) {
+        let mut state = self.state.lock();
+        if state.stopped {
+            return;
+        }
+        state.ready.push_back(job);
+        let call_watch = state.lacks_threads() && !state.watching;
+        drop(state);
+        self.work.notify_one();
+        if call_watch {
+            self.watched.notify_one();
+        }
+    }
+
+    fn spawn(self: &Arc<Self>, name: String, body: impl FnOnce(&Arc<Self>) + Send + 'static) -> io::Result<()> {
+        struct Alive(Arc<Shared>);
+        impl Drop for Alive {
+            fn drop(&mut self) {
+                self.0.alive.send_modify(|count| *count -= 1);
+            }
+        }
+        self.alive.send_modify(|count| *count += 1);
+        let alive = Alive(Arc::clone(self));
+        thread::Builder::new().name(name).spawn(move || body(&alive.0))?;
+        Ok(())
+    }
+
+    /// The next job; `None` when the pool stops or a spare thread was idle for its time.
+    fn next(&self, idle: Option<Duration>) -> Option<Arc<dyn Job>> {
+        let mut state = self.state.lock();
+        loop {
+            if state.stopped {
+                return None;
+            }
+            if let Some(job) = state.ready.pop_front() {
+                state.taken += 1;
+                return Some(job);
+            }
+            state.idle += 1;
+            let timed_out = match idle {
+                None => {
+                    self.work.wait(&mut state);
+                    false
+                }
+                Some(time) => self.work.wait_for(&mut state, time).timed_out(),
+            };
+            state.idle -= 1;
+            if timed_out && state.ready.is_empty() {
+                return None;
+            }
+        }
+    }
+}
+
+fn work(shared: &Arc<Shared>, idle: Option<Duration>) {
+    while let Some(job) = shared.next(idle) {
+        if job.run_one() {
+            shared.submit(job);
+        }
+    }
+}
+
+impl State {
+    /// More jobs wait than threads.
+    fn lacks_threads(&self) -> bool {
+        self.ready.len() > self.idle
+    }
+}
+
+fn help_when_stuck(shared: &Arc<Shared>) {
+    let mut state = shared.state.lock();
+    while !state.stopped {
+        if !state.lacks_threads() {
+            shared.watched.wait(&mut state);
+            continue;
+        }
+        let before = state.taken;
+        state.watching = true;
+        let look_again = Instant::now() + STUCK_AFTER;
+        while !state.stopped && !shared.watched.wait_until(&mut state, look_again).timed_out() {}
+        state.watching = false;
+        let is_stuck = state.taken == before && state.lacks_threads();
+        if state.stopped || !is_stuck || state.spare >= MAX_SPARE_THREADS {
+            continue;
+        }
+        state.spare += 1;
+        let number = state.spare;
+        drop(state);
+        let started = shared.spawn(format!("blaze-spare-{number}"), |shared| {
+            work(shared, Some(SPARE_IDLE));
+            shared.state.lock().spare -= 1;
+        });
+        state = shared.state.lock();
+        if let Err(error) = started {
+            state.spare -= 1;
+            tracing::warn!(%error, "all callback threads are busy, and no spare thread could be started");
+        }
+    }
+}

@@ -1,0 +1,246 @@
+//! The one object of a service.
+
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use blaze_brokers::{Broker, BrokerError};
+use blaze_domain::{InstanceName, LayerName, NodeName, Origin, Scope, ServiceName};
+
+use crate::broker::LocalBroker;
+use crate::flow::FlowManager;
+use crate::pool::Pool;
+use crate::tasks::Tasks;
+
+/// How long [`ServiceManager::shutdown`] waits for the flow to take leave.
+const LEAVE_WITHIN: Duration = Duration::from_secs(1);
+/// How long it waits for tasks and for callbacks that run.
+const END_WITHIN: Duration = Duration::from_secs(5);
+/// Longest time to live of a lease, in seconds.
+const MAX_TTL_S: u64 = 86_400;
+
+/// Why the SDK refused.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SdkError {
+    /// The broker refused.
+    #[error(transparent)]
+    Broker(#[from] BrokerError),
+    /// An option has a value that it may not have.
+    #[error("{option} {reason}")]
+    Option {
+        /// The option.
+        option: &'static str,
+        /// What is wrong with its value.
+        reason: String,
+    },
+    /// The threads for callbacks could not be started.
+    #[error("no threads for callbacks: {0}")]
+    Threads(#[source] std::io::Error),
+    /// The service was shut down.
+    #[error("the service was shut down")]
+    ShutDown,
+}
+
+/// Who a service is and what it works with.
+#[derive(Clone)]
+pub struct ServiceOptions {
+    /// Layer that it runs in.
+    pub layer: LayerName,
+    /// Node that it runs on; absent for a service of a layer.
+    pub node: Option<NodeName>,
+    /// Its name.
+    pub service: ServiceName,
+    /// Which of several of that name it is.
+    pub instance: InstanceName,
+    /// The local broker. The service does not close it.
+    pub broker: Arc<dyn Broker>,
+    /// How far that broker reaches.
+    pub scope: Scope,
+    /// Threads for callbacks; 0 = as many as the process may use cores (cgroups count). At least two are started.
+    pub pool_threads: usize,
+    /// Time to live of the service's leases, 1 s to 1 day; they are renewed at a third of it.
+    pub lease_ttl: Duration,
+    /// How long to wait for a flow's answer to an advertise, request or withdraw.
+    pub control_timeout: Duration,
+    /// Larger is newer; 0 = milliseconds since 1970 at the start.
+    pub epoch: u64,
+}
+
+impl ServiceOptions {
+    /// The first instance of a service on no particular node, with the default bounds.
+    #[must_use]
+    pub fn new(layer: LayerName, service: ServiceName, broker: Arc<dyn Broker>, scope: Scope) -> Self {
+        Self {
+            layer,
+            node: None,
+            service,
+            instance: InstanceName::first(),
+            broker,
+            scope,
+            pool_threads: 0,
+            lease_ttl: Duration::from_secs(15),
+            control_timeout: Duration::from_secs(10),
+            epoch: 0,
+        }
+    }
+
+    /// The same service on a node.
+    #[must_use]
+    pub fn on_node(mut self, node: NodeName) -> Self {
+        self.node = Some(node);
+        self
+    }
+}
+
+/// Who a service is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Identity {
+    /// Layer that it runs in.
+    pub layer: LayerName,
+    /// Node that it runs on.
+    pub node: Option<NodeName>,
+    /// Its name.
+    pub service: ServiceName,
+    /// Which of several of that name it is.
+    pub instance: InstanceName,
+    /// Larger is newer.
+    pub epoch: u64,
+}
+
+impl Identity {
+    /// As it stands in the header of each message.
+    #[must_use]
+    pub fn origin(&self) -> Origin {
+        Origin {
+            layer: self.layer.to_string(),
+            node: self.node.as_ref().map(NodeName::to_string).unwrap_or_default(),
+            service: self.service.to_string(),
+            instance: self.instance.to_string(),
+            epoch: self.epoch,
+        }
+    }
+}
+
+/// What the parts of a service share.
+pub(crate) struct Shared {
+    pub(crate) identity: Identity,
+    pub(crate) broker: Arc<dyn Broker>,
+    pub(crate) scope: Scope,
+    pub(crate) pool: Pool,
+    pub(crate) pool_threads: usize,
+    pub(crate) tasks: Tasks,
+}
+
+impl Shared {
+    pub(crate) fn refuse_when_stopping(&self) -> Result<(), SdkError> {
+        if self.tasks.is_stopping() {
+            return Err(SdkError::ShutDown);
+        }
+        Ok(())
+    }
+}
+
+/// A service's door into the system: the local broker and the flow. Dropping it ends all that it started; what it leased
+/// then lapses at the flow, whereas [`ServiceManager::shutdown`] withdraws it.
+pub struct ServiceManager {
+    shared: Arc<Shared>,
+    broker: LocalBroker,
+    flow: FlowManager,
+}
+
+impl ServiceManager {
+    /// Starts the service's threads and tasks. It does not wait for the broker or a flow.
+    ///
+    /// # Errors
+    /// [`SdkError::Option`] or [`SdkError::Threads`].
+    pub async fn start(options: ServiceOptions) -> Result<Self, SdkError> {
+        let ttl_s = options.lease_ttl.as_secs();
+        if !(1..=MAX_TTL_S).contains(&ttl_s) {
+            return Err(SdkError::Option {
+                option: "lease_ttl",
+                reason: format!("is {:?}, 1 s to {MAX_TTL_S} s are allowed", options.lease_ttl),
+            });
+        }
+        let pool_threads = match options.pool_threads {
+            0 => std::thread::available_parallelism().map_or(2, usize::from),
+            threads => threads,
+        }
+        .max(2);
+        let shared = Arc::new(Shared {
+            identity: Identity {
+                layer: options.layer,
+                node: options.node,
+                service: options.service,
+                instance: options.instance,
+                epoch: if options.epoch == 0 { now_ms() } else { options.epoch },
+            },
+            broker: options.broker,
+            scope: options.scope,
+            pool: Pool::start(pool_threads).map_err(SdkError::Threads)?,
+            pool_threads,
+            tasks: Tasks::default(),
+        });
+        let flow = FlowManager::start(
+            shared.identity.clone(),
+            Arc::clone(&shared.broker),
+            &shared.tasks,
+            Duration::from_secs(ttl_s),
+            options.control_timeout,
+        );
+        Ok(Self {
+            broker: LocalBroker::new(Arc::clone(&shared)),
+            shared,
+            flow,
+        })
+    }
+
+    /// Publish and subscribe.
+    #[must_use]
+    pub fn broker(&self) -> &LocalBroker {
+        &self.broker
+    }
+
+    /// Advertise and request.
+    #[must_use]
+    pub fn flow(&self) -> &FlowManager {
+        &self.flow
+    }
+
+    /// Who the service is.
+    #[must_use]
+    pub fn identity(&self) -> &Identity {
+        &self.shared.identity
+    }
+
+    /// Withdraws all leases, ends all subscriptions, and waits for tasks and for callbacks that run: at most some 11 s. The
+    /// broker stays open.
+    pub async fn shutdown(self) {
+        self.flow.leave(LEAVE_WITHIN).await;
+        self.shared.tasks.stop();
+        self.shared.pool.stop();
+        let tasks = self.shared.tasks.ended(END_WITHIN).await;
+        let threads = self.shared.pool.ended(END_WITHIN).await;
+        if tasks + threads > 0 {
+            tracing::warn!(
+                service = %self.shared.identity.service,
+                tasks,
+                threads,
+                "the service ends, though tasks or callbacks still run"
+            );
+        }
+    }
+}
+
+impl Drop for ServiceManager {
+    fn drop(&mut self) {
+        self.shared.tasks.stop();
+        self.shared.pool.stop();
+    }
+}
+
+fn now_ms() -> u64 {
+    let since_epoch = SystemTime::now()
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .unwrap_or_default();
+    u64::try_from(since_epoch.as_millis()).unwrap_or(u64::MAX)
+}
