@@ -13,6 +13,7 @@ use crate::exit::{CliError, Exit};
 use crate::http::get_json;
 use crate::output::{self, Format, terminal_width};
 
+pub(crate) use bridges::dropped_text;
 pub use bridges::{Bridge, Bridges, Place};
 
 /// `blaze topics`.

@@ -21,7 +21,7 @@ pub struct DemoOptions {
     /// What services talk to on each node
     #[arg(long, value_enum, default_value_t = Brokers::Memory)]
     pub brokers: Brokers,
-    /// Play these ROS 2 recordings (MCAP, CDR) instead of the built-in ones
+    /// Play these ROS 2 recordings (MCAP, CDR) instead of the built-in ones; with --only, name them in each process
     #[arg(long, value_name = "FILE.mcap", num_args = 1..)]
     pub record: Vec<PathBuf>,
     /// Run these nodes only; they find the others over DDS
@@ -155,9 +155,6 @@ impl DemoOptions {
                 "--brokers real: this build carries no Redis and Kafka adapters. Leave it out to use brokers within the process.",
             );
         }
-        if !self.record.is_empty() && !self.nodes().contains(&DemoNode::Robot1) {
-            return usage("--record: robot-1 plays the recordings, and it does not run in this process.");
-        }
         if let Some(address) = self.listen.iter().chain(&self.peer).find(|address| address.is_ipv6()) {
             return Err(CliError::Usage(format!("{address}: DDS is carried over IPv4 only.")));
         }
@@ -264,7 +261,6 @@ mod tests {
     fn bad_combinations_are_refused_with_a_reason() {
         for (line, why) in [
             (&["--brokers", "real"][..], "no Redis and Kafka"),
-            (&["--only", "fog-1", "--record", "a.mcap"], "robot-1 plays"),
             (&["--listen", "0.0.0.0"], "one interface"),
             (&["--peer", "::1"], "IPv4 only"),
         ] {

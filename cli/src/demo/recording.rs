@@ -180,6 +180,28 @@ pub struct Recording {
     pub unusable_messages: u64,
 }
 
+/// The recordings that the program carries with it.
+const BUILT_IN: [(&str, &[u8]); 2] = [
+    ("jackal.mcap", include_bytes!("../../../demo/data/jackal.mcap")),
+    ("camera.mcap", include_bytes!("../../../demo/data/camera.mcap")),
+];
+
+/// Reads the recordings that the program carries with it: IMU and odometry of a robot, and a camera.
+///
+/// # Errors
+/// None as long as they are whole; they are part of the program.
+pub fn load_built_in() -> Result<Vec<Recording>, RecordingError> {
+    let mut pictures = camera::Budget::default();
+    BUILT_IN
+        .into_iter()
+        .map(|(name, bytes)| {
+            let path = Path::new(name);
+            let raw = read_records(path, bytes, &[])?;
+            raw.prepare(path, &[], &mut pictures)
+        })
+        .collect()
+}
+
 /// Reads recordings that are played together.
 ///
 /// # Errors
@@ -189,23 +211,11 @@ pub fn load_all(paths: &[PathBuf]) -> Result<Vec<Recording>, RecordingError> {
     let mut pictures = camera::Budget::default();
     let mut recordings = Vec::with_capacity(paths.len());
     for path in paths {
-        let recording = load(path, &taken, &mut pictures)?;
+        let recording = read_file(path, &taken)?.prepare(path, &taken, &mut pictures)?;
         taken.extend(recording.topics.iter().map(|topic| topic.name.clone()));
         recordings.push(recording);
     }
     Ok(recordings)
-}
-
-fn load(path: &Path, taken: &[TopicName], pictures: &mut camera::Budget) -> Result<Recording, RecordingError> {
-    let mut raw = read_file(path, taken)?;
-    raw.unusable += camera::decode_topics(&mut raw, taken, pictures);
-    if raw.messages.is_empty() {
-        return Err(RecordingError::Empty {
-            path: path.to_owned(),
-            skipped: raw.skipped,
-        });
-    }
-    Ok(raw.finish(path))
 }
 
 /// What a file holds, before pace and pictures are looked at.
@@ -254,8 +264,12 @@ fn read_file(path: &Path, taken: &[TopicName]) -> Result<RawRecording, Recording
             bytes,
         });
     }
+    read_records(path, BufReader::with_capacity(1 << 20, file), taken)
+}
+
+fn read_records(path: &Path, source: impl Read, taken: &[TopicName]) -> Result<RawRecording, RecordingError> {
     let mut source = Counting {
-        inner: BufReader::with_capacity(1 << 20, file),
+        inner: source,
         count: 0,
     };
     check_magic(path, &mut source.inner)?;
@@ -369,6 +383,23 @@ impl RawRecording {
                 }
             })
             .ok()
+    }
+
+    /// Decodes pictures, orders the messages and works out the pace.
+    fn prepare(
+        mut self,
+        path: &Path,
+        taken: &[TopicName],
+        pictures: &mut camera::Budget,
+    ) -> Result<Recording, RecordingError> {
+        self.unusable += camera::decode_topics(&mut self, taken, pictures);
+        if self.messages.is_empty() {
+            return Err(RecordingError::Empty {
+                path: path.to_owned(),
+                skipped: self.skipped,
+            });
+        }
+        Ok(self.finish(path))
     }
 
     /// Orders the messages and works out the pace.

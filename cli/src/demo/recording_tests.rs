@@ -81,6 +81,17 @@ fn the_jackal_recording_is_read() {
 }
 
 #[test]
+fn the_program_carries_its_recordings() {
+    let recordings = load_built_in().unwrap();
+    let names: Vec<&str> = recordings
+        .iter()
+        .flat_map(|recording| &recording.topics)
+        .map(|topic| topic.name.as_str())
+        .collect();
+    assert_eq!(names.len(), 3, "{names:?}");
+}
+
+#[test]
 fn camera_pictures_are_rgb() {
     let start = Instant::now();
     let recording = &load_all(&[data("camera.mcap")]).unwrap()[0];

@@ -1,0 +1,453 @@
+//! What the demo knows of each topic and consumer; written by the player and the consumers, read by the report.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use blaze_domain::DropReason;
+use blaze_proto::Frame;
+use parking_lot::Mutex;
+use serde::Serialize;
+
+use super::flows::{FlowView, Spot};
+use super::options::DemoNode;
+use super::roles::{Consumer, MOVES_FROM, MOVES_TO, MOVING_SERVICE, PUBLISHING_NODE, PlayedTopic};
+use super::stats::{Arrival, Period, SubscriptionStats};
+
+/// Index of a consumer on the board.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ConsumerId(usize);
+
+/// One topic on its way to one consumer; a line of the report.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TopicRow {
+    /// The topic.
+    pub topic: String,
+    /// `layer/node` of the publisher.
+    pub from: String,
+    /// `layer/node` of the consumer; absent where nobody listens in this process.
+    pub to: Option<String>,
+    /// The consumer.
+    pub service: Option<&'static str>,
+    /// Scopes on the way, `scope:broker`.
+    pub route: Vec<String>,
+    /// Messages published a second; absent where the publisher is in another process.
+    pub rate_in_hz: Option<f64>,
+    /// Messages received a second.
+    pub rate_out_hz: f64,
+    /// Payload bytes received a second.
+    pub bytes_per_s: f64,
+    /// Messages published; absent where the publisher is in another process.
+    pub sent: Option<u64>,
+    /// Messages received.
+    pub received: u64,
+    /// Missing between the first and the last received.
+    pub lost: u64,
+    /// Received again.
+    pub duplicated: u64,
+    /// Received after a later one.
+    pub reordered: u64,
+    /// Dropped on the way, by reason.
+    pub dropped: BTreeMap<String, u64>,
+    /// From publication to the consumer.
+    pub latency_ms: LatencyMs,
+    /// Whether the topic counts as large.
+    #[serde(skip)]
+    pub large: bool,
+    /// Whether the consumer still listens.
+    #[serde(skip)]
+    pub active: bool,
+    /// Seconds from the last message to the end; absent without any.
+    #[serde(skip)]
+    pub silent: Option<Duration>,
+}
+
+/// Latency percentiles in milliseconds; absent without any message.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct LatencyMs {
+    /// Median.
+    pub p50: Option<f64>,
+    /// 99 %.
+    pub p99: Option<f64>,
+}
+
+/// A consumer that went from one node to another.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Move {
+    /// The service.
+    pub service: &'static str,
+    /// `layer/node` that it left.
+    pub from: String,
+    /// `layer/node` where it is now.
+    pub to: String,
+    /// From the last message there to the first here, by their publication; 0 when both ran side by side.
+    pub gap_ms: f64,
+}
+
+/// See the module.
+#[derive(Debug)]
+pub struct Board {
+    start: Instant,
+    same_clock: bool,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    publishers: Vec<PublisherEntry>,
+    consumers: Vec<ConsumerEntry>,
+    looked: Instant,
+}
+
+#[derive(Debug)]
+struct PublisherEntry {
+    topic: PlayedTopic,
+    /// Whether it publishes in this process.
+    here: bool,
+    sent: u64,
+    sent_before: u64,
+    first: Option<Instant>,
+}
+
+#[derive(Debug)]
+struct ConsumerEntry {
+    consumer: Consumer,
+    publisher: usize,
+    stats: SubscriptionStats,
+    active: bool,
+    route: Vec<String>,
+    on_the_way: DropCounter,
+    at_consumer: u64,
+    dropped_before: BTreeMap<String, u64>,
+}
+
+/// Adds up counters of bridges that may be made anew, and then count from 0.
+#[derive(Debug, Default)]
+struct DropCounter {
+    earlier: BTreeMap<String, u64>,
+    current: BTreeMap<String, u64>,
+}
+
+impl DropCounter {
+    fn set(&mut self, now: BTreeMap<String, u64>) {
+        let fell = self
+            .current
+            .iter()
+            .any(|(reason, count)| now.get(reason).copied().unwrap_or(0) < *count);
+        let last = std::mem::replace(&mut self.current, now);
+        if fell {
+            for (reason, count) in last {
+                *self.earlier.entry(reason).or_default() += count;
+            }
+        }
+    }
+
+    fn total(&self) -> BTreeMap<String, u64> {
+        let mut total = self.earlier.clone();
+        for (reason, count) in &self.current {
+            *total.entry(reason.clone()).or_default() += count;
+        }
+        total.retain(|_, count| *count > 0);
+        total
+    }
+}
+
+impl ConsumerEntry {
+    fn dropped(&self) -> BTreeMap<String, u64> {
+        let mut total = self.on_the_way.total();
+        if self.at_consumer > 0 {
+            *total.entry(DropReason::QueueFull.as_str().to_owned()).or_default() += self.at_consumer;
+        }
+        total
+    }
+}
+
+impl Board {
+    /// A board without consumers. `nodes` run in this process; `start` is when the demo began.
+    #[must_use]
+    pub fn new(topics: Vec<PlayedTopic>, nodes: &[DemoNode], start: Instant) -> Self {
+        let here = nodes.contains(&PUBLISHING_NODE);
+        let publishers = topics.into_iter().map(|topic| PublisherEntry {
+            topic,
+            here,
+            sent: 0,
+            sent_before: 0,
+            first: None,
+        });
+        Self {
+            start,
+            same_clock: here,
+            state: Mutex::new(State {
+                publishers: publishers.collect(),
+                consumers: Vec::new(),
+                looked: start,
+            }),
+        }
+    }
+
+    /// Notes that a topic (its index) was published.
+    pub fn published(&self, topic: usize, now: Instant) {
+        if let Some(publisher) = self.state.lock().publishers.get_mut(topic) {
+            publisher.sent += 1;
+            publisher.first.get_or_insert(now);
+        }
+    }
+
+    /// A consumer begins to listen. `None`: nobody plays its topic.
+    pub fn add_consumer(&self, consumer: Consumer, now: Instant) -> Option<ConsumerId> {
+        let mut state = self.state.lock();
+        let publisher = state
+            .publishers
+            .iter()
+            .position(|entry| entry.topic.name == consumer.topic)?;
+        state.consumers.push(ConsumerEntry {
+            consumer,
+            publisher,
+            stats: SubscriptionStats::new(now),
+            active: true,
+            route: Vec::new(),
+            on_the_way: DropCounter::default(),
+            at_consumer: 0,
+            dropped_before: BTreeMap::new(),
+        });
+        Some(ConsumerId(state.consumers.len() - 1))
+    }
+
+    /// A frame came. `unix_ns` is the clock of this host; it is compared with the publisher's only if that runs here
+    /// too, else the age that the flows wrote into the frame counts.
+    pub fn frame_arrived(&self, id: ConsumerId, frame: &Frame, unix_ns: u64, now: Instant) {
+        let latency = if self.same_clock {
+            Duration::from_nanos(unix_ns.saturating_sub(frame.publish_time_ns()))
+        } else {
+            Duration::from_micros(frame.age_us())
+        };
+        let arrival = Arrival {
+            writer: frame.writer(),
+            sequence: frame.sequence(),
+            publish_time_ns: frame.publish_time_ns(),
+            latency,
+            bytes: frame.payload().len(),
+        };
+        self.arrived(id, &arrival, now);
+    }
+
+    /// A message came.
+    pub fn arrived(&self, id: ConsumerId, arrival: &Arrival, now: Instant) {
+        if let Some(entry) = self.state.lock().consumers.get_mut(id.0) {
+            entry.stats.add(arrival, now);
+        }
+    }
+
+    /// Messages gave way in the consumer's own queue.
+    pub fn dropped_at_consumer(&self, id: ConsumerId, count: u64) {
+        if let Some(entry) = self.state.lock().consumers.get_mut(id.0) {
+            entry.at_consumer += count;
+        }
+    }
+
+    /// The consumer listens no more.
+    pub fn end_consumer(&self, id: ConsumerId) {
+        if let Some(entry) = self.state.lock().consumers.get_mut(id.0) {
+            entry.active = false;
+        }
+    }
+
+    /// Messages that a consumer has received.
+    #[must_use]
+    pub fn received(&self, id: ConsumerId) -> u64 {
+        let state = self.state.lock();
+        state
+            .consumers
+            .get(id.0)
+            .map_or(0, |entry| entry.stats.counters().received)
+    }
+
+    /// Messages that all consumers have received.
+    #[must_use]
+    pub fn received_by_all(&self) -> u64 {
+        let state = self.state.lock();
+        state
+            .consumers
+            .iter()
+            .map(|entry| entry.stats.counters().received)
+            .sum()
+    }
+
+    /// Takes over routes and drops from the flows. What is not to be seen any more keeps its last value.
+    pub fn set_view(&self, view: &FlowView) {
+        let from = Spot::Node(PUBLISHING_NODE);
+        for entry in &mut self.state.lock().consumers {
+            if let Some(path) = view.path(entry.consumer.topic.as_str(), &from, &entry.consumer.spot()) {
+                entry.route = path.route;
+                entry.on_the_way.set(path.dropped);
+            }
+        }
+    }
+
+    /// What happened since the last call: a row for each consumer that listens, and for each topic without any.
+    #[must_use]
+    pub fn recent(&self, now: Instant) -> Vec<TopicRow> {
+        let mut state = self.state.lock();
+        let seconds = now.saturating_duration_since(state.looked).as_secs_f64();
+        state.looked = now;
+        let State {
+            publishers, consumers, ..
+        } = &mut *state;
+        let mut rows = Vec::new();
+        for entry in consumers.iter_mut() {
+            let period = entry.stats.take_recent(now);
+            let total = entry.dropped();
+            let before = std::mem::replace(&mut entry.dropped_before, total.clone());
+            if let Some(publisher) = publishers.get(entry.publisher).filter(|_| entry.active) {
+                let sent = publisher.sent - publisher.sent_before;
+                let mut row = row(publisher, sent, seconds, Some(entry), &period, now);
+                row.dropped = difference(&total, &before);
+                rows.push(row);
+            }
+        }
+        rows.extend(unheard(publishers, consumers, now, |publisher| {
+            (publisher.sent - publisher.sent_before, seconds)
+        }));
+        for publisher in publishers {
+            publisher.sent_before = publisher.sent;
+        }
+        rows
+    }
+
+    /// Everything until `end`: a row for each consumer there ever was, and for each topic without any.
+    #[must_use]
+    pub fn total(&self, end: Instant) -> Vec<TopicRow> {
+        let state = self.state.lock();
+        let State {
+            publishers, consumers, ..
+        } = &*state;
+        let sent = |publisher: &PublisherEntry| {
+            let since = |first| end.saturating_duration_since(first).as_secs_f64();
+            (publisher.sent, publisher.first.map_or(0.0, since))
+        };
+        let heard = consumers.iter().filter_map(|entry| {
+            let publisher = publishers.get(entry.publisher)?;
+            // One that has left is measured up to its last message.
+            let until = entry
+                .stats
+                .last
+                .map(|(at, _)| at)
+                .filter(|_| !entry.active)
+                .unwrap_or(end);
+            let (count, seconds) = sent(publisher);
+            Some(row(
+                publisher,
+                count,
+                seconds,
+                Some(entry),
+                &entry.stats.total(until),
+                end,
+            ))
+        });
+        heard.chain(unheard(publishers, consumers, end, sent)).collect()
+    }
+
+    /// Seconds from the start to the first message in each layer that has one.
+    #[must_use]
+    pub fn first_message_s(&self) -> BTreeMap<&'static str, f64> {
+        let state = self.state.lock();
+        let mut first = BTreeMap::new();
+        for entry in &state.consumers {
+            if let Some((at, _)) = entry.stats.first {
+                let seconds = round(at.saturating_duration_since(self.start).as_secs_f64(), 3);
+                let known = first.entry(entry.consumer.node.layer()).or_insert(seconds);
+                *known = known.min(seconds);
+            }
+        }
+        first
+    }
+
+    /// The move of the consumer, once messages have come to it at both ends and it has left the first.
+    #[must_use]
+    pub fn moved(&self) -> Option<Move> {
+        let state = self.state.lock();
+        let find = |node: DemoNode| {
+            let mut entries = state.consumers.iter();
+            entries.find(|entry| entry.consumer.service == MOVING_SERVICE && entry.consumer.node == node)
+        };
+        let (left, joined) = (find(MOVES_FROM)?, find(MOVES_TO)?);
+        let (_, last_ns) = left.stats.last.filter(|_| !left.active)?;
+        let (_, first_ns) = joined.stats.first?;
+        Some(Move {
+            service: MOVING_SERVICE,
+            from: MOVES_FROM.flow(),
+            to: MOVES_TO.flow(),
+            gap_ms: round(first_ns.saturating_sub(last_ns) as f64 / 1e6, 3),
+        })
+    }
+}
+
+/// Rows for what is published here and heard by nobody here; `sent` gives the messages and the seconds they took.
+fn unheard<'a>(
+    publishers: &'a [PublisherEntry],
+    consumers: &'a [ConsumerEntry],
+    now: Instant,
+    sent: impl Fn(&PublisherEntry) -> (u64, f64) + 'a,
+) -> impl Iterator<Item = TopicRow> + 'a {
+    let nobody = move |publisher: &&PublisherEntry| {
+        publisher.here
+            && !consumers
+                .iter()
+                .any(|entry| entry.consumer.topic == publisher.topic.name)
+    };
+    publishers.iter().filter(nobody).map(move |publisher| {
+        let (count, seconds) = sent(publisher);
+        row(publisher, count, seconds, None, &Period::default(), now)
+    })
+}
+
+fn row(
+    publisher: &PublisherEntry,
+    sent: u64,
+    seconds: f64,
+    entry: Option<&ConsumerEntry>,
+    period: &Period,
+    end: Instant,
+) -> TopicRow {
+    let rate = |count: u64, seconds: f64| if seconds > 0.0 { count as f64 / seconds } else { 0.0 };
+    let counters = &period.counters;
+    TopicRow {
+        topic: publisher.topic.name.to_string(),
+        from: PUBLISHING_NODE.flow(),
+        to: entry.map(|entry| entry.consumer.node.flow()),
+        service: entry.map(|entry| entry.consumer.service),
+        route: entry.map(|entry| entry.route.clone()).unwrap_or_default(),
+        rate_in_hz: publisher.here.then(|| round(rate(sent, seconds), 2)),
+        rate_out_hz: round(rate(counters.received, period.seconds), 2),
+        bytes_per_s: round(rate(counters.bytes, period.seconds), 0),
+        sent: publisher.here.then_some(sent),
+        received: counters.received,
+        lost: counters.lost,
+        duplicated: counters.duplicated,
+        reordered: counters.reordered,
+        dropped: entry.map(ConsumerEntry::dropped).unwrap_or_default(),
+        latency_ms: LatencyMs {
+            p50: period.p50_ms.map(|value| round(value, 3)),
+            p99: period.p99_ms.map(|value| round(value, 3)),
+        },
+        large: publisher.topic.large,
+        active: entry.is_some_and(|entry| entry.active),
+        silent: entry.and_then(|entry| Some(end.saturating_duration_since(entry.stats.last?.0))),
+    }
+}
+
+fn difference(now: &BTreeMap<String, u64>, before: &BTreeMap<String, u64>) -> BTreeMap<String, u64> {
+    let grown = now.iter().map(|(reason, count)| {
+        let earlier = before.get(reason).copied().unwrap_or(0);
+        (reason.clone(), count.saturating_sub(earlier))
+    });
+    grown.filter(|(_, count)| *count > 0).collect()
+}
+
+fn round(value: f64, decimals: i32) -> f64 {
+    let scale = 10f64.powi(decimals);
+    (value * scale).round() / scale
+}
+
+#[cfg(test)]
+#[path = "board_tests.rs"]
+mod tests;

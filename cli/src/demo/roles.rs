@@ -1,0 +1,153 @@
+//! Who publishes and who listens in the demo.
+//!
+//! ```text
+//! edge  robot-1: imu-driver, odometry, camera-driver      edge-2: monitor
+//! fog   fog-1:   dashboard, analytics (until half time)
+//! cloud cloud-1: recorder, analytics (from half time)
+//! ```
+
+use blaze_domain::{Durability, Reliability, TopicName};
+
+use super::flows::Spot;
+use super::options::DemoNode;
+use super::recording::{RecordedTopic, Recording};
+
+/// From this size on a topic is large: best effort, with a lifespan (as `flow.bandwidth.large_bytes`).
+pub const LARGE_BYTES: usize = 65_536;
+/// Lifespan of a picture in milliseconds.
+pub const PICTURE_LIFESPAN_MS: u32 = 500;
+/// The service that moves at half time.
+pub const MOVING_SERVICE: &str = "analytics";
+/// Where it starts.
+pub const MOVES_FROM: DemoNode = DemoNode::Fog1;
+/// Where it goes.
+pub const MOVES_TO: DemoNode = DemoNode::Cloud1;
+/// Who plays.
+pub const PUBLISHING_NODE: DemoNode = DemoNode::Robot1;
+
+/// A topic that is played, and how it is advertised.
+#[derive(Debug, Clone)]
+pub struct PlayedTopic {
+    /// Its name.
+    pub name: TopicName,
+    /// Who publishes it.
+    pub service: &'static str,
+    /// Media type of the payload.
+    pub encoding: String,
+    /// Messages a second.
+    pub rate_hz: f64,
+    /// Largest payload.
+    pub max_bytes: usize,
+    /// Whether it counts as large: pictures and the like.
+    pub large: bool,
+}
+
+impl PlayedTopic {
+    fn new(topic: &RecordedTopic) -> Self {
+        let large = topic.max_bytes >= LARGE_BYTES;
+        let service = match topic.type_name.as_str() {
+            "sensor_msgs/msg/Imu" => "imu-driver",
+            "nav_msgs/msg/Odometry" => "odometry",
+            _ if large => "camera-driver",
+            _ => "player",
+        };
+        Self {
+            name: topic.name.clone(),
+            service,
+            encoding: topic.encoding.clone(),
+            rate_hz: topic.rate_hz,
+            max_bytes: topic.max_bytes,
+            large,
+        }
+    }
+
+    /// Pictures may be lost, everything else is repaired.
+    #[must_use]
+    pub fn reliability(&self) -> Reliability {
+        if self.large {
+            Reliability::BestEffort
+        } else {
+            Reliability::Reliable
+        }
+    }
+
+    /// Nothing is kept for late joiners.
+    #[must_use]
+    pub fn durability(&self) -> Durability {
+        Durability::Volatile
+    }
+
+    /// Milliseconds after which a message is of no use; 0 = none.
+    #[must_use]
+    pub fn lifespan_ms(&self) -> u32 {
+        if self.large { PICTURE_LIFESPAN_MS } else { 0 }
+    }
+}
+
+/// Topics of all recordings, in their order: first of the first recording first.
+#[must_use]
+pub fn played_topics<'a>(recordings: impl IntoIterator<Item = &'a Recording>) -> Vec<PlayedTopic> {
+    let topics = recordings.into_iter().flat_map(|recording| &recording.topics);
+    topics.map(PlayedTopic::new).collect()
+}
+
+/// One topic that one service listens to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Consumer {
+    /// The service.
+    pub service: &'static str,
+    /// Where it runs.
+    pub node: DemoNode,
+    /// What it listens to.
+    pub topic: TopicName,
+    /// Whether it starts only at half time.
+    pub later: bool,
+}
+
+impl Consumer {
+    /// Where it listens: on edge-2 its node scope, in fog and cloud the layer scope.
+    #[must_use]
+    pub fn spot(&self) -> Spot {
+        match self.node {
+            DemoNode::Robot1 | DemoNode::Edge2 => Spot::Node(self.node),
+            DemoNode::Fog1 | DemoNode::Cloud1 => Spot::Layer(self.node.layer().to_owned()),
+        }
+    }
+}
+
+/// The topic of the service that moves: the first that is not large, else the first.
+fn moving_topic(topics: &[PlayedTopic]) -> Option<&PlayedTopic> {
+    let imu = topics.iter().find(|topic| topic.service == "imu-driver");
+    imu.or_else(|| topics.iter().find(|topic| !topic.large))
+        .or(topics.first())
+}
+
+/// Everybody who listens on the given nodes.
+#[must_use]
+pub fn consumers(topics: &[PlayedTopic], nodes: &[DemoNode]) -> Vec<Consumer> {
+    let all = [
+        ("monitor", DemoNode::Edge2),
+        ("dashboard", DemoNode::Fog1),
+        ("recorder", DemoNode::Cloud1),
+    ];
+    let steady = all.into_iter().flat_map(|(service, node)| {
+        topics.iter().map(move |topic| Consumer {
+            service,
+            node,
+            topic: topic.name.clone(),
+            later: false,
+        })
+    });
+    let moving = moving_topic(topics).into_iter().flat_map(|topic| {
+        [(MOVES_FROM, false), (MOVES_TO, true)].map(|(node, later)| Consumer {
+            service: MOVING_SERVICE,
+            node,
+            topic: topic.name.clone(),
+            later,
+        })
+    });
+    steady
+        .chain(moving)
+        .filter(|consumer| nodes.contains(&consumer.node))
+        .collect()
+}

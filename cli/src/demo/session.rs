@@ -1,0 +1,335 @@
+//! One run of the demo: play, report each second, move a consumer half way, judge at the end.
+//!
+//! What the flows and services are is the business of a [`Stage`]; this is the same for any.
+
+use std::future::Future;
+use std::io::Write;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use blaze_domain::TopicName;
+use tokio::time::{MissedTickBehavior, interval_at, sleep, sleep_until};
+
+use super::board::{Board, ConsumerId};
+use super::flows::FlowView;
+use super::options::DemoNode;
+use super::player::{Played, Player, PlayerReport};
+use super::recording::Recording;
+use super::report::Report;
+use super::roles::{Consumer, MOVES_FROM, MOVES_TO, MOVING_SERVICE, PlayedTopic};
+use super::verdict::{Outcome, Summary, judge};
+use crate::exit::CliError;
+
+/// How long the moved consumer may wait for its first message before it leaves its old place.
+const MOVE_TIMEOUT: Duration = Duration::from_secs(5);
+/// After the last message was played: what is on the way may still arrive.
+const DRAIN_LIMIT: Duration = Duration::from_secs(3);
+/// No message for so long: nothing is on the way any more.
+const DRAIN_QUIET: Duration = Duration::from_millis(300);
+const LOOK_PERIOD: Duration = Duration::from_millis(20);
+
+/// The flows and services that a session runs on.
+pub trait Stage {
+    /// Nodes of this process and their admin ports.
+    fn admin_ports(&self) -> Vec<(DemoNode, SocketAddr)>;
+
+    /// Starts a service that listens: what it receives goes to the board under `id`.
+    fn listen(&self, consumer: &Consumer, id: ConsumerId) -> impl Future<Output = Result<(), String>>;
+
+    /// Ends a service that listens.
+    fn stop_listening(&self, id: ConsumerId) -> impl Future<Output = Result<(), String>>;
+
+    /// Publishes; called on the player's thread. Topics are counted over all recordings, see
+    /// [`played_topics`](super::roles::played_topics). `None`: the publishers are in another process.
+    fn publisher(&self) -> Option<Box<dyn FnMut(usize, bytes::Bytes) + Send>>;
+
+    /// Completes when the user wants an end, or a flow ended by itself (then with a sentence).
+    fn interrupted(&self) -> impl Future<Output = Option<String>>;
+}
+
+/// What a session plays, and for how long.
+pub struct Script {
+    /// Nodes of this process.
+    pub nodes: Vec<DemoNode>,
+    /// What is played.
+    pub recordings: Vec<Arc<Recording>>,
+    /// Its topics.
+    pub topics: Vec<PlayedTopic>,
+    /// Who listens here.
+    pub consumers: Vec<Consumer>,
+    /// How long.
+    pub duration: Duration,
+}
+
+/// Runs the script and prints it. Returns what was found at the end.
+///
+/// # Errors
+/// [`CliError::OutputClosed`] when nobody reads the report, [`CliError::Failed`] when the player cannot start.
+pub async fn run<S: Stage, Out: Write, Err: Write>(
+    stage: &S,
+    board: &Arc<Board>,
+    script: Script,
+    report: &mut Report<Out, Err>,
+) -> Result<Summary, CliError> {
+    let mut session = Session {
+        stage,
+        board,
+        start: Instant::now(),
+        faults: Vec::new(),
+        moving: Moving::No,
+    };
+    for consumer in script.consumers.iter().filter(|consumer| !consumer.later) {
+        let id = session.listen(consumer).await;
+        if let Some(leaves) = id.filter(|_| consumer.service == MOVING_SERVICE && consumer.node == MOVES_FROM) {
+            session.moving = Moving::Later { leaves };
+        }
+    }
+    let player = session.start_player(&script)?;
+    session.start = Instant::now();
+    let interruption = session.play(&script, report).await?;
+    let played = session.start.elapsed();
+    let end = Instant::now();
+    if let Some(pace) = player.map(Player::stop).filter(|pace| pace.late + pace.unusable > 0) {
+        report.event(played, &pace_text(&pace))?;
+    }
+    session.drain().await;
+    board.set_view(&FlowView::ask(&stage.admin_ports()).await);
+    let interrupted = interruption.is_some();
+    session.faults.extend(interruption.flatten());
+    let summary = judge(Outcome {
+        nodes: script.nodes,
+        duration: played,
+        interrupted,
+        faults: session.faults,
+        first_message_s: board.first_message_s(),
+        moved: board.moved(),
+        topics: board.total(end),
+    });
+    report.summary(&summary)?;
+    Ok(summary)
+}
+
+struct Session<'a, S> {
+    stage: &'a S,
+    board: &'a Arc<Board>,
+    start: Instant,
+    faults: Vec<String>,
+    moving: Moving,
+}
+
+/// The consumer that goes to another node half way.
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Moving {
+    /// It does not move here, or has moved.
+    No,
+    /// It will, and then leave this place.
+    Later { leaves: ConsumerId },
+    /// It listens at both places, until something came to the new one or the time is over.
+    Joining {
+        leaves: ConsumerId,
+        joined: ConsumerId,
+        topic: TopicName,
+        deadline: Instant,
+    },
+}
+
+impl<S: Stage> Session<'_, S> {
+    async fn listen(&mut self, consumer: &Consumer) -> Option<ConsumerId> {
+        let id = self.board.add_consumer(consumer.clone(), Instant::now())?;
+        if let Err(fault) = self.stage.listen(consumer, id).await {
+            let place = consumer.node.flow();
+            self.faults.push(format!(
+                "{} on {place} cannot listen to {}: {fault}",
+                consumer.service, consumer.topic
+            ));
+        }
+        Some(id)
+    }
+
+    fn start_player(&self, script: &Script) -> Result<Option<Player>, CliError> {
+        let Some(mut publish) = self.stage.publisher() else {
+            return Ok(None);
+        };
+        let mut bases = Vec::with_capacity(script.recordings.len());
+        let mut topics = 0;
+        for recording in &script.recordings {
+            bases.push(topics);
+            topics += recording.topics.len();
+        }
+        let board = Arc::clone(self.board);
+        let sink = move |played: Played| {
+            let topic = bases.get(played.recording).copied().unwrap_or_default() + played.topic;
+            board.published(topic, Instant::now());
+            publish(topic, played.payload);
+        };
+        Player::start(&script.recordings, sink)
+            .map(Some)
+            .map_err(|error| CliError::Failed(format!("the player does not start: {error}")))
+    }
+
+    /// Reports each second until the time is over. Returns whether it was ended before, and why, if not by the user.
+    async fn play<Out: Write, Err: Write>(
+        &mut self,
+        script: &Script,
+        report: &mut Report<Out, Err>,
+    ) -> Result<Option<Option<String>>, CliError> {
+        let start = tokio::time::Instant::from_std(self.start);
+        let second = Duration::from_secs(1);
+        let mut seconds = interval_at(start + second, second);
+        seconds.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let half = sleep_until(start + script.duration / 2);
+        let end = sleep_until(start + script.duration);
+        let (board, stage) = (self.board, self.stage);
+        let interrupted = stage.interrupted();
+        tokio::pin!(half, end, interrupted);
+        // What `recent` counts begins with the first message.
+        let _ = board.recent(self.start);
+        let mut last_tick = self.start;
+        let mut half_passed = false;
+        loop {
+            tokio::select! {
+                () = &mut end => {
+                    if last_tick.elapsed() > second / 2 {
+                        self.tick(report).await?;
+                    }
+                    self.finish_move(report).await?;
+                    return Ok(None);
+                }
+                reason = &mut interrupted => return Ok(Some(reason)),
+                _ = seconds.tick() => {
+                    last_tick = Instant::now();
+                    self.tick(report).await?;
+                }
+                () = &mut half, if !half_passed => {
+                    half_passed = true;
+                    self.begin_move(script, report).await?;
+                }
+                () = sleep(LOOK_PERIOD), if self.is_joining() => {
+                    if self.has_joined() {
+                        self.finish_move(report).await?;
+                    }
+                }
+            }
+        }
+    }
+
+    async fn tick<Out: Write, Err: Write>(&self, report: &mut Report<Out, Err>) -> Result<(), CliError> {
+        self.board.set_view(&FlowView::ask(&self.stage.admin_ports()).await);
+        let now = Instant::now();
+        report.rows(now - self.start, &self.board.recent(now))
+    }
+
+    fn is_joining(&self) -> bool {
+        matches!(self.moving, Moving::Joining { .. })
+    }
+
+    /// Whether it can leave its old place: something came to the new one, or it has waited long enough.
+    fn has_joined(&self) -> bool {
+        match &self.moving {
+            Moving::Joining { joined, deadline, .. } => self.board.received(*joined) > 0 || Instant::now() >= *deadline,
+            Moving::No | Moving::Later { .. } => false,
+        }
+    }
+
+    /// Listens at the new place first, so that nothing is missed.
+    async fn begin_move<Out: Write, Err: Write>(
+        &mut self,
+        script: &Script,
+        report: &mut Report<Out, Err>,
+    ) -> Result<(), CliError> {
+        let Moving::Later { leaves } = self.moving else {
+            return Ok(());
+        };
+        self.moving = Moving::No;
+        let Some(later) = script.consumers.iter().find(|consumer| consumer.later) else {
+            return Ok(());
+        };
+        let links = self.links(&later.topic).await;
+        let (from, to) = (MOVES_FROM.flow(), MOVES_TO.flow());
+        report.event(
+            self.start.elapsed(),
+            &format!("{MOVING_SERVICE} moves from {from} to {to}; {links}"),
+        )?;
+        if let Some(joined) = self.listen(later).await {
+            self.moving = Moving::Joining {
+                leaves,
+                joined,
+                topic: later.topic.clone(),
+                deadline: Instant::now() + MOVE_TIMEOUT,
+            };
+        }
+        Ok(())
+    }
+
+    /// Leaves the old place, once it listens at the new one.
+    async fn finish_move<Out: Write, Err: Write>(&mut self, report: &mut Report<Out, Err>) -> Result<(), CliError> {
+        let Moving::Joining {
+            leaves, joined, topic, ..
+        } = std::mem::replace(&mut self.moving, Moving::No)
+        else {
+            return Ok(());
+        };
+        let (from, to) = (MOVES_FROM.flow(), MOVES_TO.flow());
+        if self.board.received(joined) == 0 {
+            self.faults
+                .push(format!("{MOVING_SERVICE} got nothing on {to} when it moved there"));
+        }
+        if let Err(fault) = self.stage.stop_listening(leaves).await {
+            self.faults
+                .push(format!("{MOVING_SERVICE} cannot leave {from}: {fault}"));
+        }
+        self.board.end_consumer(leaves);
+        let gap = self.board.moved().map_or_else(
+            || "no message came to it there".to_owned(),
+            |moved| format!("{:.0} ms without a message", moved.gap_ms),
+        );
+        let links = self.links(&topic).await;
+        report.event(
+            self.start.elapsed(),
+            &format!("{MOVING_SERVICE} is on {to}: {gap}; {links}"),
+        )
+    }
+
+    /// Where a topic travels now, for people.
+    async fn links(&self, topic: &TopicName) -> String {
+        let links = FlowView::ask(&self.stage.admin_ports()).await.links_of(topic.as_str());
+        if links.is_empty() {
+            format!("no bridge carries {topic} to another layer")
+        } else {
+            format!("bridges of {topic}: {}", links.join(", "))
+        }
+    }
+
+    /// Waits until nothing more arrives.
+    async fn drain(&self) {
+        let deadline = Instant::now() + DRAIN_LIMIT;
+        let mut received = self.board.received_by_all();
+        let mut since = Instant::now();
+        while since.elapsed() < DRAIN_QUIET && Instant::now() < deadline {
+            sleep(LOOK_PERIOD).await;
+            let now = self.board.received_by_all();
+            if now != received {
+                received = now;
+                since = Instant::now();
+            }
+        }
+    }
+}
+
+fn pace_text(pace: &PlayerReport) -> String {
+    let mut text = format!(
+        "the player kept its pace but for {} of {} messages, the worst {} ms late",
+        pace.late,
+        pace.played,
+        pace.worst.as_millis()
+    );
+    if pace.unusable > 0 {
+        text.push_str(&format!("; {} pictures do not decode", pace.unusable));
+    }
+    text
+}
+
+#[cfg(test)]
+#[path = "session_tests.rs"]
+mod tests;
