@@ -381,7 +381,7 @@ fn counts(facts: &BridgeFacts) -> String {
     format!("{} in, {} out lately", facts.received, facts.sent)
 }
 
-fn describe(target: &Target) -> String {
+pub(super) fn describe(target: &Target) -> String {
     match target {
         Target::Node { bare: false } => "node".to_owned(),
         Target::Node { bare: true } => "node (bare)".to_owned(),
