@@ -164,7 +164,7 @@ pub struct Received {
 }
 
 /// What a publisher is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct PublisherOptions {
     /// Samples to keep per writer for late joiners; 0 = volatile.
     pub depth: u32,

@@ -2,6 +2,8 @@
 //!
 //! See `ARCHITECTURE.md` for the map.
 
+pub mod control;
+pub mod flow;
 pub mod lane;
 pub mod limit;
 pub mod link;

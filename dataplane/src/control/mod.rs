@@ -191,7 +191,11 @@ impl ControlCore {
         self.refused += outcome.faults;
         for answer in outcome.answers.into_iter().filter(|answer| answer.designated) {
             let body = Bytes::from(answer.body.to_string());
-            self.outputs.push_back(Output::Publish { scope, channel: answer.reply_to, body });
+            self.outputs.push_back(Output::Publish {
+                scope,
+                channel: answer.reply_to,
+                body,
+            });
         }
         for event in &outcome.events {
             self.tell(event, wall_ms);
@@ -237,7 +241,10 @@ impl ControlCore {
         let announced = self.registry.announced();
         if announced != self.announced {
             self.announced = announced;
-            self.outputs.push_back(Output::Announce { version: announced.0, digest: announced.1 });
+            self.outputs.push_back(Output::Announce {
+                version: announced.0,
+                digest: announced.1,
+            });
         }
     }
 
@@ -256,7 +263,10 @@ impl ControlCore {
 
     fn touch(&mut self, now: Instant, topics: BTreeSet<TopicName>) {
         for topic in topics {
-            self.dirty.entry(topic).and_modify(|dirty| dirty.last = now).or_insert(Dirty { first: now, last: now });
+            self.dirty
+                .entry(topic)
+                .and_modify(|dirty| dirty.last = now)
+                .or_insert(Dirty { first: now, last: now });
         }
     }
 
@@ -270,8 +280,12 @@ impl ControlCore {
         let due = |dirty: &Dirty| {
             now.saturating_duration_since(dirty.last) >= QUIET || now.saturating_duration_since(dirty.first) >= LATEST
         };
-        let topics: Vec<TopicName> =
-            self.dirty.iter().filter(|(_, dirty)| due(dirty)).map(|(topic, _)| topic.clone()).collect();
+        let topics: Vec<TopicName> = self
+            .dirty
+            .iter()
+            .filter(|(_, dirty)| due(dirty))
+            .map(|(topic, _)| topic.clone())
+            .collect();
         for topic in topics {
             self.dirty.remove(&topic);
             self.plan(now, &topic, wall_ms);
@@ -291,10 +305,19 @@ impl ControlCore {
         } else {
             self.plans.insert(topic.clone(), plan.clone());
         }
-        self.registry.set_route_state(now, topic, route_states(&self.config.me, &plan));
-        self.outputs.push_back(Output::Plan { topic: topic.clone(), plan, info });
+        self.registry
+            .set_route_state(now, topic, route_states(&self.config.me, &plan));
+        self.outputs.push_back(Output::Plan {
+            topic: topic.clone(),
+            plan,
+            info,
+        });
         if had_route != has_route {
-            let kind = if has_route { EventKind::RouteUp } else { EventKind::RouteDown };
+            let kind = if has_route {
+                EventKind::RouteUp
+            } else {
+                EventKind::RouteDown
+            };
             self.tell(&draft(kind, Some(topic.clone())), wall_ms);
         }
     }
@@ -304,15 +327,27 @@ impl ControlCore {
             tracing::info!(event = event.event.as_str(), code = event.code, "{}", event.detail);
         }
         let body = Bytes::from(event.stamp(&self.config.me, wall_ms).to_json().to_string());
-        let scopes = [(Scope::Node, self.config.node_scope), (Scope::Layer, self.config.layer_scope.is_some())];
+        let scopes = [
+            (Scope::Node, self.config.node_scope),
+            (Scope::Layer, self.config.layer_scope.is_some()),
+        ];
         for (scope, _) in scopes.into_iter().filter(|(_, there)| *there) {
-            self.outputs.push_back(Output::Publish { scope, channel: ChannelName::events(), body: body.clone() });
+            self.outputs.push_back(Output::Publish {
+                scope,
+                channel: ChannelName::events(),
+                body: body.clone(),
+            });
         }
     }
 }
 
 fn draft(event: EventKind, topic: Option<TopicName>) -> EventDraft {
-    EventDraft { event, topic, code: "", detail: String::new() }
+    EventDraft {
+        event,
+        topic,
+        code: "",
+        detail: String::new(),
+    }
 }
 
 /// What this flow does for a topic, as other flows are told for their `why`.
@@ -322,7 +357,14 @@ fn route_states(me: &FlowId, plan: &TopicPlan) -> Vec<RouteState> {
             Target::Inter { layer, receiver } => (layer.to_string(), receiver.to_string(), "bridge"),
             Target::Node { .. } | Target::Layer => (me.layer.to_string(), me.to_string(), "deliver"),
         };
-        RouteState { to_layer, receiver, step: step.to_owned(), ok: true, code: "ok".to_owned(), next_offset: 0 }
+        RouteState {
+            to_layer,
+            receiver,
+            step: step.to_owned(),
+            ok: true,
+            code: "ok".to_owned(),
+            next_offset: 0,
+        }
     });
     let blocked = plan.blocked.iter().map(|blocked| {
         let (to_layer, receiver) = match &blocked.to {
@@ -330,18 +372,34 @@ fn route_states(me: &FlowId, plan: &TopicPlan) -> Vec<RouteState> {
             Destination::Layer(layer) => (layer.to_string(), String::new()),
         };
         let code = blocked.code.as_str().to_owned();
-        RouteState { to_layer, receiver, step: "plan".to_owned(), ok: false, code, next_offset: 0 }
+        RouteState {
+            to_layer,
+            receiver,
+            step: "plan".to_owned(),
+            ok: false,
+            code,
+            next_offset: 0,
+        }
     });
     carried.chain(blocked).take(MAX_ROUTE_STATES).collect()
 }
 
 /// What the local advertisements of a topic say.
 fn local_info(own: Option<&FlowView>, topic: &TopicName) -> TopicInfo {
-    let Some(entry) = own.and_then(|own| own.topics.get(topic)) else { return TopicInfo::default() };
-    let advertised: Vec<_> = [&entry.node.advertise, &entry.layer.advertise].into_iter().flatten().collect();
-    let Some(first) = advertised.first() else { return TopicInfo::default() };
+    let Some(entry) = own.and_then(|own| own.topics.get(topic)) else {
+        return TopicInfo::default();
+    };
+    let advertised: Vec<_> = [&entry.node.advertise, &entry.layer.advertise]
+        .into_iter()
+        .flatten()
+        .collect();
+    let Some(first) = advertised.first() else {
+        return TopicInfo::default();
+    };
     let sources: BTreeSet<_> = advertised.iter().flat_map(|advertise| &advertise.sources).collect();
-    let only = (sources.len() == 1 && !advertised.iter().any(|a| a.more_sources)).then(|| sources.first()).flatten();
+    let only = (sources.len() == 1 && !advertised.iter().any(|a| a.more_sources))
+        .then(|| sources.first())
+        .flatten();
     TopicInfo {
         encoding: first.encoding.clone(),
         service: only.map(|source| source.service.clone()).unwrap_or_default(),
@@ -349,7 +407,9 @@ fn local_info(own: Option<&FlowView>, topic: &TopicName) -> TopicInfo {
         priority: advertised.iter().filter_map(|a| a.priority).min(),
         max_bytes: advertised.iter().filter_map(|a| a.max_bytes).max(),
         rate_hz: advertised.iter().map(|a| a.rate_hz).sum::<Option<f64>>(),
-        reliable: advertised.iter().any(|a| a.reliability == blaze_domain::Reliability::Reliable),
+        reliable: advertised
+            .iter()
+            .any(|a| a.reliability == blaze_domain::Reliability::Reliable),
         depth: advertised.iter().map(|a| a.depth).max().unwrap_or(0),
         lifespan_ms: advertised.iter().map(|a| a.lifespan_ms).max().unwrap_or(0),
     }

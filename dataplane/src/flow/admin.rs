@@ -13,10 +13,10 @@ use blaze_domain::control::{LeaseKind, rfc3339_millis};
 use blaze_domain::{Priority, Scope, TopicName};
 use serde_json::{Map, Value, json};
 
-use super::plane::wall_ns;
 use super::Shared;
-use crate::link::PeerState;
+use super::plane::wall_ns;
 use crate::lane::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
+use crate::link::PeerState;
 use crate::plan::Target;
 use crate::registry::{LeaseView, Terms};
 use crate::world::{Advertise, Request};
@@ -59,7 +59,12 @@ fn rounded(value: f64) -> Value {
 async fn topics(State(shared): App) -> Json<Value> {
     let now = Instant::now();
     let rates: BTreeMap<TopicName, (f64, f64)> = shared.plane.read(|state| {
-        state.core.topics_mut().iter_mut().map(|path| (path.name.clone(), path.in_rate.rate(now))).collect()
+        state
+            .core
+            .topics_mut()
+            .iter_mut()
+            .map(|path| (path.name.clone(), path.in_rate.rate(now)))
+            .collect()
     });
     let control = shared.control.lock();
     let registry = control.registry();
@@ -75,13 +80,26 @@ async fn topics(State(shared): App) -> Json<Value> {
             }
         }
         for remote in registry.remote_leases(&topic) {
-            advertised.extend(remote.advertise.iter().flat_map(|a| remote_advertise(remote.flow, remote.scope, a)));
-            requested.extend(remote.request.iter().map(|r| remote_request(remote.flow, remote.scope, r)));
+            advertised.extend(
+                remote
+                    .advertise
+                    .iter()
+                    .flat_map(|a| remote_advertise(remote.flow, remote.scope, a)),
+            );
+            requested.extend(
+                remote
+                    .request
+                    .iter()
+                    .map(|r| remote_request(remote.flow, remote.scope, r)),
+            );
         }
         if advertised.is_empty() && requested.is_empty() {
             continue;
         }
-        let blocked = control.plans().get(&topic).is_some_and(|p| p.bridges.is_empty() && !p.blocked.is_empty());
+        let blocked = control
+            .plans()
+            .get(&topic)
+            .is_some_and(|p| p.bridges.is_empty() && !p.blocked.is_empty());
         let state = match (advertised.is_empty(), requested.is_empty()) {
             (true, _) => "no_advertise",
             (false, true) => "no_request",
@@ -111,7 +129,12 @@ fn lease_row(shared: &Shared, now: Instant, lease: &LeaseView<'_>) -> Value {
     });
     let terms = match lease.terms {
         Terms::Advertise { rate_hz, max_bytes, .. } => json!({"rate_hz": rate_hz, "max_bytes": max_bytes}),
-        Terms::Request { max_rate_hz, bare, from, .. } => json!({
+        Terms::Request {
+            max_rate_hz,
+            bare,
+            from,
+            ..
+        } => json!({
             "max_rate_hz": max_rate_hz, "lifespan_ms": quality.lifespan_ms, "bare": bare,
             "from": (!from.is_any()).then(|| json!({"layer": from.layer, "node": from.node, "service": from.service})),
         }),
@@ -180,7 +203,11 @@ async fn bridges(State(shared): App) -> Json<Value> {
 }
 
 fn scope_and_broker(shared: &Shared, scope: Scope) -> Value {
-    let broker = if scope == Scope::Inter { json!("dds") } else { broker_of(shared, scope) };
+    let broker = if scope == Scope::Inter {
+        json!("dds")
+    } else {
+        broker_of(shared, scope)
+    };
     json!({"scope": scope, "broker": broker})
 }
 
@@ -199,7 +226,11 @@ fn bridge_id(path: &TopicPath, bridge: &BridgeState, own_layer: &str) -> String 
                     && other.receiver().is_some_and(|(other_layer, _)| other_layer == layer)
             };
             let several = path.bridges.iter().filter(same_layer).count() > 1;
-            let node = if several { format!("|{}", receiver.node) } else { String::new() };
+            let node = if several {
+                format!("|{}", receiver.node)
+            } else {
+                String::new()
+            };
             format!("{topic}|{from}>inter|{layer}{node}")
         }
     }
@@ -217,8 +248,12 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
     };
     let mut to = scope_and_broker(shared, to_scope);
     extend(&mut to, json!({"layer": layer, "flow": flow}));
-    let dropped: Map<String, Value> =
-        bridge.stats.dropped.iter().map(|(reason, count)| (reason.to_string(), json!(count))).collect();
+    let dropped: Map<String, Value> = bridge
+        .stats
+        .dropped
+        .iter()
+        .map(|(reason, count)| (reason.to_string(), json!(count)))
+        .collect();
     let class = match bridge.sink {
         Sink::Lane { class, .. } => json!(class),
         Sink::Publish { .. } => Value::Null,
@@ -239,7 +274,9 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
 
 async fn peers(State(shared): App) -> Json<Value> {
     let now = Instant::now();
-    let peers = shared.plane.read(|state| state.engine.as_ref().map(|engine| engine.peers()).unwrap_or_default());
+    let peers = shared
+        .plane
+        .read(|state| state.engine.as_ref().map(|engine| engine.peers()).unwrap_or_default());
     let control = shared.control.lock();
     let rows: Vec<Value> = peers
         .iter()
@@ -286,13 +323,20 @@ async fn allocation(State(shared): App) -> Json<Value> {
         (rows, payload)
     });
     let (rows, payload) = rows;
-    let links: BTreeMap<String, f64> = traffic.by_destination.iter_mut().fold(BTreeMap::new(), |mut links, to| {
-        *links.entry(to.flow.layer.to_string()).or_default() += to.rate.rate(now).1;
-        links
-    });
+    let links: BTreeMap<String, f64> = traffic
+        .by_destination
+        .iter_mut()
+        .fold(BTreeMap::new(), |mut links, to| {
+            *links.entry(to.flow.layer.to_string()).or_default() += to.rate.rate(now).1;
+            links
+        });
     let wire: f64 = links.values().sum();
     // F9: s·α with the overhead factor α = 1.02.
-    let factor = if payload > 0.0 { rounded(wire / (payload * 1.02)) } else { Value::Null };
+    let factor = if payload > 0.0 {
+        rounded(wire / (payload * 1.02))
+    } else {
+        Value::Null
+    };
     let links: Vec<Value> = links
         .into_iter()
         .map(|(layer, rate)| json!({"layer": layer, "limit_bytes_per_s": null, "wire_bytes_per_s": rate.round()}))
@@ -313,7 +357,9 @@ fn allocation_row(now: Instant, path: &mut TopicPath, payload_bytes_per_s: &mut 
     let mut class = None;
     let size = path.size_bytes();
     for bridge in path.bridges.iter_mut().filter(|bridge| bridge.phase != Phase::Ended) {
-        let Some(layer) = bridge.receiver().map(|(layer, _)| layer.clone()) else { continue };
+        let Some(layer) = bridge.receiver().map(|(layer, _)| layer.clone()) else {
+            continue;
+        };
         let (hz, bytes) = bridge.out_rate.rate(now);
         *payload_bytes_per_s += bytes;
         if let Sink::Lane { class: lane_class, .. } = bridge.sink {
@@ -328,7 +374,11 @@ fn allocation_row(now: Instant, path: &mut TopicPath, payload_bytes_per_s: &mut 
         return None;
     }
     let advertised = path.info.rate_hz.unwrap_or_else(|| path.in_rate.rate(now).0);
-    let class = if class == Some(Priority::Bulk) { "large" } else { "standard" };
+    let class = if class == Some(Priority::Bulk) {
+        "large"
+    } else {
+        "standard"
+    };
     Some(json!({
         "topic": path.name, "class": class, "size_bytes": size, "advertised_hz": rounded(advertised), "lanes": lanes,
     }))

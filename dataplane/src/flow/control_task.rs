@@ -4,7 +4,9 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, BrokerError, Content, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription};
+use blaze_brokers::{
+    Broker, BrokerError, Content, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
+};
 use blaze_domain::Scope;
 use blaze_domain::names::ChannelName;
 use blaze_proto::link::link_control::State as HelloState;
@@ -47,19 +49,17 @@ impl ControlTask {
         let mut tick = tokio::time::interval(TICK);
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         let mut announced = false;
-        let mut batch: Vec<Received> = Vec::new();
+        let (mut of_node, mut of_layer): (Vec<Received>, Vec<Received>) = (Vec::new(), Vec::new());
         loop {
-            let mut scope = None;
             tokio::select! {
                 () = self.draining.cancelled() => break,
                 _ = tick.tick() => {}
                 () = self.shared.plane.news() => {}
-                () = node.receive(&mut batch) => scope = Some(Scope::Node),
-                () = layer.receive(&mut batch) => scope = Some(Scope::Layer),
+                () = node.receive(&mut of_node) => {}
+                () = layer.receive(&mut of_layer) => {}
             }
-            if let Some(scope) = scope {
-                self.take_control(scope, &mut batch);
-            }
+            self.take_control(Scope::Node, &mut of_node);
+            self.take_control(Scope::Layer, &mut of_layer);
             if !announced && node.is_settled() && layer.is_settled() {
                 announced = true;
                 self.shared.control.lock().announce_start(wall_ms());
@@ -112,7 +112,12 @@ impl ControlTask {
                 plane.with(|state| state.engine.as_mut().map(|engine| engine.send_control(now, &to, body)));
             }
             Output::Announce { version, digest } => {
-                plane.with(|state| state.engine.as_mut().map(|engine| engine.set_registry(now, version, digest)));
+                plane.with(|state| {
+                    state
+                        .engine
+                        .as_mut()
+                        .map(|engine| engine.set_registry(now, version, digest))
+                });
             }
             Output::State(flow_state) => {
                 let said = match flow_state {
@@ -130,7 +135,9 @@ impl ControlTask {
     }
 
     fn publish(&mut self, scope: Scope, channel: ChannelName, body: &Bytes) {
-        let Some(broker) = self.shared.brokers.of(scope) else { return };
+        let Some(broker) = self.shared.brokers.of(scope) else {
+            return;
+        };
         if self.writers.len() >= MAX_WRITERS {
             self.writers.clear();
         }
@@ -160,7 +167,10 @@ struct ControlChannel {
 
 impl ControlChannel {
     fn new(broker: Option<Arc<dyn Broker>>) -> Self {
-        Self { broker, subscription: None }
+        Self {
+            broker,
+            subscription: None,
+        }
     }
 
     /// Whether it is subscribed, or there is none.
@@ -170,14 +180,19 @@ impl ControlChannel {
 
     /// Waits for payloads; returns also when it has just been subscribed. Without a broker it never returns.
     async fn receive(&mut self, batch: &mut Vec<Received>) {
-        let Some(broker) = &self.broker else { return std::future::pending().await };
+        let Some(broker) = &self.broker else {
+            return std::future::pending().await;
+        };
         if let Some(subscription) = &mut self.subscription {
             if subscription.receive(batch, BATCH).await > 0 {
                 return;
             }
             self.subscription = None;
         }
-        let options = SubscribeOptions { max_messages: MAX_WAITING, ..SubscribeOptions::default() };
+        let options = SubscribeOptions {
+            max_messages: MAX_WAITING,
+            ..SubscribeOptions::default()
+        };
         match broker.subscribe(&ChannelName::control(), options).await {
             Ok(subscription) => self.subscription = Some(subscription),
             Err(BrokerError::Closed) => std::future::pending().await,

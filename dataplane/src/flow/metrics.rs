@@ -15,7 +15,9 @@ use crate::registry::Terms;
 const MAX_TOPICS: usize = 1000;
 const OTHER: &str = "_other";
 /// Upper bounds of the latency buckets in seconds.
-const BUCKETS: [f64; 14] = [0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0];
+const BUCKETS: [f64; 14] = [
+    0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0,
+];
 
 /// The text of one scrape.
 pub(super) fn render(shared: &Shared) -> String {
@@ -69,26 +71,78 @@ impl Page {
     fn new() -> prometheus::Result<Self> {
         let r = Registry::new();
         Ok(Self {
-            messages: counter(&r, "blaze_flow_messages_total", "Messages through a bridge.", &["topic", "from", "to", "direction"])?,
-            bytes: counter(&r, "blaze_flow_bytes_total", "Payload bytes through a bridge.", &["topic", "from", "to", "direction"])?,
-            dropped: counter(&r, "blaze_flow_dropped_total", "Messages dropped.", &["topic", "to", "reason"])?,
+            messages: counter(
+                &r,
+                "blaze_flow_messages_total",
+                "Messages through a bridge.",
+                &["topic", "from", "to", "direction"],
+            )?,
+            bytes: counter(
+                &r,
+                "blaze_flow_bytes_total",
+                "Payload bytes through a bridge.",
+                &["topic", "from", "to", "direction"],
+            )?,
+            dropped: counter(
+                &r,
+                "blaze_flow_dropped_total",
+                "Messages dropped.",
+                &["topic", "to", "reason"],
+            )?,
             bridges: gauge(&r, "blaze_flow_bridges", "Bridges by state.", &["state"])?,
-            queue_bytes: gauge(&r, "blaze_flow_queue_bytes", "Bytes that wait for the link or may have to be repaired.", &["to", "class"])?,
-            rate: gauge(&r, "blaze_flow_rate_hertz", "Rates of a topic.", &["topic", "to", "kind"])?,
-            budget: gauge(&r, "blaze_flow_budget_bytes_per_second", "Wire bytes per second.", &["to", "kind"])?,
-            wire_bytes: counter(&r, "blaze_flow_wire_bytes_total", "IP bytes sent on the inter scope.", &["to", "class"])?,
-            peer_up: gauge(&r, "blaze_flow_peer_up", "1 while the peer says Hello and acknowledges.", &["peer"])?,
+            queue_bytes: gauge(
+                &r,
+                "blaze_flow_queue_bytes",
+                "Bytes that wait for the link or may have to be repaired.",
+                &["to", "class"],
+            )?,
+            rate: gauge(
+                &r,
+                "blaze_flow_rate_hertz",
+                "Rates of a topic.",
+                &["topic", "to", "kind"],
+            )?,
+            budget: gauge(
+                &r,
+                "blaze_flow_budget_bytes_per_second",
+                "Wire bytes per second.",
+                &["to", "kind"],
+            )?,
+            wire_bytes: counter(
+                &r,
+                "blaze_flow_wire_bytes_total",
+                "IP bytes sent on the inter scope.",
+                &["to", "class"],
+            )?,
+            peer_up: gauge(
+                &r,
+                "blaze_flow_peer_up",
+                "1 while the peer says Hello and acknowledges.",
+                &["peer"],
+            )?,
             peer_rtt: gauge(&r, "blaze_flow_peer_rtt_seconds", "Round trip to the peer.", &["peer"])?,
             leases: gauge(&r, "blaze_flow_leases", "Leases of local services.", &["kind"])?,
-            link: counter(&r, "blaze_flow_link_events_total", "Things that happened on the link.", &["event"])?,
-            build: gauge(&r, "blaze_build_info", "1, with the version as label.", &["version", "program"])?,
+            link: counter(
+                &r,
+                "blaze_flow_link_events_total",
+                "Things that happened on the link.",
+                &["event"],
+            )?,
+            build: gauge(
+                &r,
+                "blaze_build_info",
+                "1, with the version as label.",
+                &["version", "program"],
+            )?,
             latency: parking_lot::Mutex::default(),
             registry: r,
         })
     }
 
     fn fill(&self, shared: &Shared) {
-        self.build.with_label_values(&[env!("CARGO_PKG_VERSION"), "blaze-flow"]).set(1.0);
+        self.build
+            .with_label_values(&[env!("CARGO_PKG_VERSION"), "blaze-flow"])
+            .set(1.0);
         self.fill_topics(shared);
         self.fill_link(shared);
         self.fill_control(shared);
@@ -99,10 +153,16 @@ impl Page {
         let mut histograms: BTreeMap<(String, String), Histogram> = BTreeMap::new();
         shared.plane.read(|state| {
             for (reason, count) in state.core.unattributed.iter() {
-                self.dropped.with_label_values(&["", "", reason.as_str()]).inc_by(count as f64);
+                self.dropped
+                    .with_label_values(&["", "", reason.as_str()])
+                    .inc_by(count as f64);
             }
             for (index, path) in state.core.topics_mut().iter_mut().enumerate() {
-                let topic = if index < MAX_TOPICS { path.name.to_string() } else { OTHER.to_owned() };
+                let topic = if index < MAX_TOPICS {
+                    path.name.to_string()
+                } else {
+                    OTHER.to_owned()
+                };
                 self.fill_topic(now, &topic, path, &mut histograms);
             }
         });
@@ -125,7 +185,9 @@ impl Page {
         histograms: &mut BTreeMap<(String, String), Histogram>,
     ) {
         for (reason, count) in path.ingress_drops.iter() {
-            self.dropped.with_label_values(&[topic, "", reason.as_str()]).inc_by(count as f64);
+            self.dropped
+                .with_label_values(&[topic, "", reason.as_str()])
+                .inc_by(count as f64);
         }
         let advertised = path.info.rate_hz.unwrap_or_else(|| path.in_rate.rate(now).0);
         for bridge in &mut path.bridges {
@@ -133,13 +195,22 @@ impl Page {
             let from = bridge.from.as_str();
             let stats = &bridge.stats;
             for (direction, count) in [("in", stats.taken), ("out", stats.out)] {
-                self.messages.with_label_values(&[topic, from, &to, direction]).inc_by(count.messages as f64);
-                self.bytes.with_label_values(&[topic, from, &to, direction]).inc_by(count.bytes as f64);
+                self.messages
+                    .with_label_values(&[topic, from, &to, direction])
+                    .inc_by(count.messages as f64);
+                self.bytes
+                    .with_label_values(&[topic, from, &to, direction])
+                    .inc_by(count.bytes as f64);
             }
             for (reason, count) in stats.dropped.iter() {
-                self.dropped.with_label_values(&[topic, &to, reason.as_str()]).inc_by(count as f64);
+                self.dropped
+                    .with_label_values(&[topic, &to, reason.as_str()])
+                    .inc_by(count as f64);
             }
-            histograms.entry((topic.to_owned(), to.clone())).or_default().add(bridge);
+            histograms
+                .entry((topic.to_owned(), to.clone()))
+                .or_default()
+                .add(bridge);
             let state = match bridge.phase {
                 Phase::Up { .. } => "up",
                 Phase::Draining { .. } => "draining",
@@ -159,9 +230,13 @@ impl Page {
 
     fn fill_link(&self, shared: &Shared) {
         let now = Instant::now();
-        let (peers, counters) = shared
-            .plane
-            .read(|state| state.engine.as_ref().map(|engine| (engine.peers(), engine.counters())).unwrap_or_default());
+        let (peers, counters) = shared.plane.read(|state| {
+            state
+                .engine
+                .as_ref()
+                .map(|engine| (engine.peers(), engine.counters()))
+                .unwrap_or_default()
+        });
         for peer in &peers {
             let name = peer.flow.to_string();
             let up = f64::from(u8::from(peer.state == crate::link::PeerState::Up));
@@ -171,7 +246,9 @@ impl Page {
             }
             let to = format!("inter/{}", peer.flow.layer);
             for (index, bytes) in peer.queue_bytes.iter().enumerate() {
-                self.queue_bytes.with_label_values(&[&to, class_label(index)]).add(*bytes as f64);
+                self.queue_bytes
+                    .with_label_values(&[&to, class_label(index)])
+                    .add(*bytes as f64);
             }
         }
         for (event, count) in [
@@ -192,22 +269,32 @@ impl Page {
         }
         if let Some(transport) = &shared.transport {
             let status = transport.status();
-            self.link.with_label_values(&["participant_rebuilt"]).inc_by(status.rebuilds as f64);
-            self.link.with_label_values(&["not_sent"]).inc_by(status.not_sent as f64);
-            self.link.with_label_values(&["malformed_sample"]).inc_by(status.malformed as f64);
+            self.link
+                .with_label_values(&["participant_rebuilt"])
+                .inc_by(status.rebuilds as f64);
+            self.link
+                .with_label_values(&["not_sent"])
+                .inc_by(status.not_sent as f64);
+            self.link
+                .with_label_values(&["malformed_sample"])
+                .inc_by(status.malformed as f64);
         }
         let mut traffic = shared.egress.traffic();
         let mut used = 0.0;
         for destination in &mut traffic.by_destination {
             let to = format!("inter/{}", destination.flow.layer);
             for (index, bytes) in destination.wire_bytes.iter().enumerate() {
-                self.wire_bytes.with_label_values(&[&to, class_label(index)]).inc_by(*bytes as f64);
+                self.wire_bytes
+                    .with_label_values(&[&to, class_label(index)])
+                    .inc_by(*bytes as f64);
             }
             let rate = destination.rate.rate(now).1;
             used += rate;
             self.budget.with_label_values(&[&to, "used"]).add(rate);
         }
-        self.budget.with_label_values(&["inter", "limit"]).set(shared.egress.budget());
+        self.budget
+            .with_label_values(&["inter", "limit"])
+            .set(shared.egress.budget());
         self.budget.with_label_values(&["inter", "used"]).set(used);
     }
 
@@ -223,7 +310,9 @@ impl Page {
             };
             self.leases.with_label_values(&[kind]).inc();
         }
-        self.link.with_label_values(&["control_message_refused"]).inc_by(control.refused as f64);
+        self.link
+            .with_label_values(&["control_message_refused"])
+            .inc_by(control.refused as f64);
     }
 
     fn text(&self) -> prometheus::Result<String> {

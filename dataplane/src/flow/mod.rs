@@ -36,8 +36,8 @@ use tokio_util::sync::CancellationToken;
 use crate::control::{ControlConfig, ControlCore};
 use crate::lane::core::{DataConfig, DataCore};
 use crate::link::dds::{DdsConfig, DdsStatus, DdsTransport};
-use crate::link::{Engine, EngineConfig, Limits};
 use crate::link::transport::{Endpoint, Transport};
+use crate::link::{Engine, EngineConfig, Limits};
 use crate::world::LayerScopeId;
 use pacing::Egress;
 use plane::{Plane, wall_ns};
@@ -118,8 +118,16 @@ const HEALTH: Duration = Duration::from_millis(200);
 /// # Errors
 /// When the admin port cannot be bound, the epoch cannot be kept or the inter scope's configuration can never work.
 pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Result<RunningFlow> {
-    let FlowOptions { settings, node, layer, state_dir } = options;
-    let epochs = Arc::new(Epochs { me: settings.me.clone(), state_dir });
+    let FlowOptions {
+        settings,
+        node,
+        layer,
+        state_dir,
+    } = options;
+    let epochs = Arc::new(Epochs {
+        me: settings.me.clone(),
+        state_dir,
+    });
     let epoch = epochs.next().context("keeping the epoch")?;
     let now = Instant::now();
     let layer_scope = layer.as_ref().map(|layer| layer.id);
@@ -131,7 +139,8 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         salt: rand::random(),
     });
     let engine = settings.inter.as_ref().map(|inter| {
-        let max_datagram = crate::link::dds::max_datagram_bytes(inter.mtu.into(), inter.chunking, inter.listen_address());
+        let max_datagram =
+            crate::link::dds::max_datagram_bytes(inter.mtu.into(), inter.chunking, inter.listen_address());
         let config = EngineConfig {
             me: settings.me.clone(),
             kind: settings.kind,
@@ -143,7 +152,11 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         Engine::new(config, now, wall_ns())
     });
     let plane = Plane::new(core, engine);
-    let transport = settings.inter.as_ref().map(|inter| connect(inter, &settings.me, epoch, &epochs, &plane)).transpose()?;
+    let transport = settings
+        .inter
+        .as_ref()
+        .map(|inter| connect(inter, &settings.me, epoch, &epochs, &plane))
+        .transpose()?;
     if let Some(transport) = &transport {
         let addresses = transport.dds.addresses();
         plane.with(|state| state.engine.as_mut().map(|engine| engine.set_addresses(addresses)));
@@ -162,7 +175,10 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         },
         now,
     );
-    let brokers = LocalBrokers { node, layer: layer.map(|layer| layer.broker) };
+    let brokers = LocalBrokers {
+        node,
+        layer: layer.map(|layer| layer.broker),
+    };
     let egress = Egress::new(settings.live.budget_bytes_per_s());
     let readiness = readiness(&brokers, transport.is_some());
     let shared = Arc::new(Shared {
@@ -198,7 +214,11 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         draining: draining.clone(),
     };
     supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
-    supervisor.spawn("health", TaskPolicy::Essential, watch_health(Arc::clone(&shared), ready));
+    supervisor.spawn(
+        "health",
+        TaskPolicy::Essential,
+        watch_health(Arc::clone(&shared), ready),
+    );
     let pacer = if shared.transport.is_some() {
         let shared = Arc::clone(&shared);
         let run = move || {
@@ -210,7 +230,13 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
     } else {
         None
     };
-    Ok(RunningFlow { shared, supervisor, admin: address, draining, pacer })
+    Ok(RunningFlow {
+        shared,
+        supervisor,
+        admin: address,
+        draining,
+        pacer,
+    })
 }
 
 impl RunningFlow {
@@ -241,7 +267,9 @@ impl RunningFlow {
     pub fn reload(&self, live: LiveSettings) {
         let now = Instant::now();
         self.shared.egress.set_budget(live.budget_bytes_per_s());
-        self.shared.plane.read(|state| state.core.set_large_bytes(live.large_bytes));
+        self.shared
+            .plane
+            .read(|state| state.core.set_large_bytes(live.large_bytes));
         self.shared.control.lock().set_rules(now, live.rules.clone());
         *self.shared.live.lock() = live;
     }
@@ -260,7 +288,9 @@ impl RunningFlow {
         while Instant::now() < until && still_draining() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
-        self.shared.plane.with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
+        self.shared
+            .plane
+            .with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
         if self.shared.transport.is_some() {
             tokio::time::sleep(GOODBYE).await;
         }
@@ -290,7 +320,10 @@ fn connect(
         peer_slots: inter.peer_slots,
         mtu: inter.mtu.into(),
         chunking: inter.chunking,
-        local: Endpoint { flow: me.clone(), epoch },
+        local: Endpoint {
+            flow: me.clone(),
+            epoch,
+        },
         next_epoch: Arc::new(move || epochs.next().unwrap_or_else(|_| wall_ns() / 1_000_000)),
         sink: Arc::new(move |event| sink.transport_event(event)),
     })
@@ -316,7 +349,9 @@ impl Epochs {
 /// What Hello says of the layer broker. One that only this process sees is none to others, and has an identity all the
 /// same: flows of this process share it.
 fn said_layer_scope(layer: Option<&LayerBroker>) -> (LayerScope, u64) {
-    let Some(layer) = layer else { return (LayerScope::None, 0) };
+    let Some(layer) = layer else {
+        return (LayerScope::None, 0);
+    };
     let kind = match layer.broker.kind() {
         BrokerKind::Kafka => LayerScope::Kafka,
         BrokerKind::Dds | BrokerKind::Ros2 => LayerScope::Dds,
@@ -327,7 +362,11 @@ fn said_layer_scope(layer: Option<&LayerBroker>) -> (LayerScope, u64) {
 
 fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {
     let readiness = Readiness::new();
-    let there = [("node_broker", brokers.node.is_some()), ("layer_broker", brokers.layer.is_some()), ("inter", inter)];
+    let there = [
+        ("node_broker", brokers.node.is_some()),
+        ("layer_broker", brokers.layer.is_some()),
+        ("inter", inter),
+    ];
     for (check, _) in there.into_iter().filter(|(_, there)| *there) {
         readiness.add(check, Gate::Decides, CheckStatus::Failed, "starting");
     }
@@ -344,10 +383,17 @@ async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>) {
             marked = Instant::now();
             shared.plane.read(|state| state.core.mark());
         }
-        for (check, broker) in [("node_broker", &shared.brokers.node), ("layer_broker", &shared.brokers.layer)] {
+        for (check, broker) in [
+            ("node_broker", &shared.brokers.node),
+            ("layer_broker", &shared.brokers.layer),
+        ] {
             let Some(broker) = broker else { continue };
             let status = broker.status().borrow().clone();
-            let state = if status.health == Health::Up { CheckStatus::Ok } else { CheckStatus::Failed };
+            let state = if status.health == Health::Up {
+                CheckStatus::Ok
+            } else {
+                CheckStatus::Failed
+            };
             shared.readiness.set(check, state, status.detail);
         }
         if let Some(transport) = &shared.transport {

@@ -106,13 +106,21 @@ impl Egress {
                 std::thread::sleep(wait.min(IDLE));
                 continue;
             }
-            let Some(transmit) = plane.next_transmit(IDLE) else { continue };
+            let Some(transmit) = plane.next_transmit(IDLE) else {
+                continue;
+            };
             let wire_bytes = transport.wire_bytes(transmit.datagram.len());
             let outcome = transport.send(&transmit.to, transmit.class, transmit.datagram);
             let now = Instant::now();
             pacer.spend(wire_bytes, now);
             let mut traffic = self.traffic.lock();
-            traffic.add(now, &transmit.to.flow, transmit.class, wire_bytes as u64, transmit.control);
+            traffic.add(
+                now,
+                &transmit.to.flow,
+                transmit.class,
+                wire_bytes as u64,
+                transmit.control,
+            );
             if outcome == crate::link::transport::SendOutcome::NotSent {
                 traffic.not_sent += 1;
             }
@@ -130,7 +138,11 @@ impl Traffic {
             Some(place) => place,
             None if self.by_destination.len() < MAX_DESTINATIONS => {
                 let rate = RateMeter::new(now);
-                self.by_destination.push(DestinationTraffic { flow: to.clone(), wire_bytes: [0; 3], rate });
+                self.by_destination.push(DestinationTraffic {
+                    flow: to.clone(),
+                    wire_bytes: [0; 3],
+                    rate,
+                });
                 self.by_destination.len() - 1
             }
             None => return,

@@ -15,8 +15,8 @@ use tokio::sync::Notify;
 
 use crate::lane::core::{DataCore, LaneLink};
 use crate::lane::path::TopicId;
-use crate::link::{Engine, LaneId, LinkEvent, Submit, Transmit};
 use crate::link::transport::TransportEvent;
+use crate::link::{Engine, LaneId, LinkEvent, Submit, Transmit};
 
 /// Link events that wait for the control core; Hellos and registry messages beyond it are dropped and repaired by the
 /// next digest.
@@ -68,9 +68,17 @@ impl PlaneState {
             match event {
                 LinkEvent::Deliver { frame, .. } => self.core.deliver(now, frame, engine),
                 LinkEvent::LaneSent { lane, bytes, wait } => self.core.lane_sent(now, lane, bytes as u64, wait),
-                LinkEvent::LaneOut { lane, messages, bytes, .. } => self.core.lane_out(lane, messages, bytes as u64),
-                LinkEvent::LaneDropped { lane, reason, messages, .. } => self.core.lane_dropped(lane, reason, messages),
-                LinkEvent::ReceiverDropped { topic, reason, messages } => {
+                LinkEvent::LaneOut {
+                    lane, messages, bytes, ..
+                } => self.core.lane_out(lane, messages, bytes as u64),
+                LinkEvent::LaneDropped {
+                    lane, reason, messages, ..
+                } => self.core.lane_dropped(lane, reason, messages),
+                LinkEvent::ReceiverDropped {
+                    topic,
+                    reason,
+                    messages,
+                } => {
                     self.core.receiver_dropped(&topic, reason, messages);
                 }
                 other => news(other),

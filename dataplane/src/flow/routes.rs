@@ -61,7 +61,13 @@ impl Routes {
     /// Without any route.
     #[must_use]
     pub fn new(plane: Arc<Plane>, brokers: LocalBrokers, supervisor: Supervisor) -> Self {
-        Self { plane, brokers, supervisor, sources: Mutex::default(), writers: Mutex::default() }
+        Self {
+            plane,
+            brokers,
+            supervisor,
+            sources: Mutex::default(),
+            writers: Mutex::default(),
+        }
     }
 
     /// Makes the bridges of a topic equal to its plan.
@@ -76,7 +82,9 @@ impl Routes {
         }
         let applied = self.plane.with(|state| {
             let id = state.core.intern(topic, now)?;
-            state.core.apply(now, id, info, plan, |target| writers.get(target).cloned());
+            state
+                .core
+                .apply(now, id, info, plan, |target| writers.get(target).cloned());
             let path = state.core.path(id);
             Some((id, [Scope::Node, Scope::Layer].map(|scope| (scope, path.reads(scope)))))
         });
@@ -99,7 +107,11 @@ impl Routes {
     pub fn is_subscribed(&self, topic: TopicId, scope: Scope) -> bool {
         match scope {
             Scope::Inter => true,
-            _ => self.sources.lock().get(&(topic, scope)).is_some_and(|s| s.subscribed.load(Ordering::Relaxed)),
+            _ => self
+                .sources
+                .lock()
+                .get(&(topic, scope))
+                .is_some_and(|s| s.subscribed.load(Ordering::Relaxed)),
         }
     }
 
@@ -118,7 +130,11 @@ impl Routes {
             Target::Inter { .. } => return None,
         };
         let depth = if lane.durable { lane.depth } else { 0 };
-        let options = PublisherOptions { depth, reliable: lane.reliable, large };
+        let options = PublisherOptions {
+            depth,
+            reliable: lane.reliable,
+            large,
+        };
         let key = (scope, channel, options);
         if let Some(writer) = self.writers.lock().get(&key) {
             return Some(Arc::clone(writer));
@@ -154,7 +170,10 @@ impl Routes {
             channel: topic.into(),
             topic: id,
             scope,
-            options: SubscribeOptions { large, ..SubscribeOptions::default() },
+            options: SubscribeOptions {
+                large,
+                ..SubscribeOptions::default()
+            },
             subscribed: Arc::clone(&subscribed),
         };
         let name = format!("source {scope} {topic}");

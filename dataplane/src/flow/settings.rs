@@ -55,7 +55,9 @@ impl From<&FlowSection> for LiveSettings {
         Self {
             limit_mbps: flow.bandwidth.limit_mbps,
             large_bytes: u64::from(flow.bandwidth.large_bytes),
-            rules: PlanRules { topics: rules.collect() },
+            rules: PlanRules {
+                topics: rules.collect(),
+            },
         }
     }
 }

@@ -26,7 +26,11 @@ const MAX_HINTS: usize = 16;
 
 pub(super) async fn why(State(shared): State<Arc<Shared>>, query: Query<BTreeMap<String, String>>) -> Response {
     let Some(topic) = query_text(&query, "topic") else {
-        return refusal(StatusCode::BAD_REQUEST, "invalid_request", "the parameter topic is missing: /v1/why?topic=imu/data");
+        return refusal(
+            StatusCode::BAD_REQUEST,
+            "invalid_request",
+            "the parameter topic is missing: /v1/why?topic=imu/data",
+        );
     };
     let topic: TopicName = match topic.parse() {
         Ok(topic) => topic,
@@ -37,7 +41,11 @@ pub(super) async fn why(State(shared): State<Arc<Shared>>, query: Query<BTreeMap
     let to: Option<WhyTarget> = match query_text(&query, "to").map(|text| text.parse()).transpose() {
         Ok(to) => to,
         Err(error) => {
-            return refusal(StatusCode::BAD_REQUEST, "invalid_request", &format!("to is layer[/node[/service]]: {error}"));
+            return refusal(
+                StatusCode::BAD_REQUEST,
+                "invalid_request",
+                &format!("to is layer[/node[/service]]: {error}"),
+            );
         }
     };
     let bridges = bridge_facts(&shared, &topic);
@@ -62,9 +70,21 @@ fn bridge_facts(shared: &Shared, topic: &TopicName) -> Vec<BridgeFacts> {
     let found = shared.plane.read(|state| {
         let id = state.core.find(topic.as_str())?;
         let live = |bridge: &&Bridge| matches!(bridge.phase, Phase::Up { .. });
-        Some((id, state.core.path(id).bridges.iter().filter(live).map(facts_of).collect::<Vec<_>>()))
+        Some((
+            id,
+            state
+                .core
+                .path(id)
+                .bridges
+                .iter()
+                .filter(live)
+                .map(facts_of)
+                .collect::<Vec<_>>(),
+        ))
     });
-    let Some((id, mut facts)) = found else { return Vec::new() };
+    let Some((id, mut facts)) = found else {
+        return Vec::new();
+    };
     for fact in &mut facts {
         fact.state = state_of(shared, id, fact.from);
     }
@@ -84,14 +104,26 @@ fn facts_of(bridge: &Bridge) -> BridgeFacts {
 }
 
 fn state_of(shared: &Shared, topic: TopicId, from: Scope) -> BridgeState {
-    if shared.routes.is_subscribed(topic, from) { BridgeState::Up } else { BridgeState::Starting }
+    if shared.routes.is_subscribed(topic, from) {
+        BridgeState::Up
+    } else {
+        BridgeState::Starting
+    }
 }
 
 fn broker_facts(broker: &dyn Broker) -> BrokerFacts {
     let status = broker.status().borrow().clone();
     BrokerFacts {
-        name: if status.detail.is_empty() { broker.kind().to_string() } else { status.detail },
-        health: if status.health == Health::Up { BrokerHealth::Up } else { BrokerHealth::Down },
+        name: if status.detail.is_empty() {
+            broker.kind().to_string()
+        } else {
+            status.detail
+        },
+        health: if status.health == Health::Up {
+            BrokerHealth::Up
+        } else {
+            BrokerHealth::Down
+        },
         at_most_once: broker.kind() == BrokerKind::Redis,
     }
 }
