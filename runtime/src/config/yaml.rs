@@ -148,7 +148,7 @@ impl Builder<'_> {
                 }
                 let (path, line) = self.next_place(line);
                 let value = self.scalar(&text, style, tag.as_deref(), line, &path);
-                self.put(path, line, value);
+                self.put(&path, line, value);
                 Ok(())
             }
             Event::SequenceStart(anchor, tag) => self.open(Open::List(Vec::new()), anchor, tag.as_deref(), line),
@@ -205,7 +205,7 @@ impl Builder<'_> {
             path.clone(),
             "aliases (*name) are not allowed: write the value out",
         );
-        self.put(path, line, Value::Null);
+        self.put(&path, line, Value::Null);
         Ok(())
     }
 
@@ -234,7 +234,7 @@ impl Builder<'_> {
                 Open::List(items) => Value::Array(items),
                 Open::Map { entries, .. } => Value::Object(entries),
             };
-            self.put(path, 0, value);
+            self.put(&path, 0, value);
         }
     }
 
@@ -281,8 +281,8 @@ impl Builder<'_> {
     }
 
     /// A value is complete: it goes into the open collection.
-    fn put(&mut self, path: String, line: usize, value: Value) {
-        self.note_place(&path, line);
+    fn put(&mut self, path: &str, line: usize, value: Value) {
+        self.note_place(path, line);
         match self.stack.last_mut() {
             None => self.document = Some(value),
             Some(Frame {
