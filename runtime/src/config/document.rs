@@ -246,10 +246,13 @@ impl Document {
             made.push((at.clone(), fresh || slot.is_null()));
         }
         let parsed = yaml::parse(text, &Origin::Single(place.clone()), &at);
-        match parsed.value {
-            Some(value) if parsed.faults.is_empty() => *slot = value,
-            _ => return Err(parsed.faults),
-        }
+        let read = match parsed.value {
+            Some(value) if parsed.faults.is_empty() => {
+                *slot = value;
+                Ok(())
+            }
+            _ => Err(parsed.faults),
+        };
         self.places.forget_below(&at);
         // Sections that exist only because of the override have its place too.
         for (path, fresh) in made {
@@ -258,7 +261,7 @@ impl Document {
             }
         }
         self.places.set(&at, place.clone());
-        Ok(())
+        read
     }
 }
 

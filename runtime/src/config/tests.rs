@@ -135,13 +135,14 @@ mod loading {
         let texts = texts(&faults);
         assert_eq!(texts[..7], expected);
         assert!(texts[7].starts_with("--set colour: colour: is not YAML: "), "{texts:?}");
-        assert_eq!(texts[8], "--set colour: colour: unknown key");
-        assert_eq!(texts[9], "--set extra: extra: unknown key");
         assert_eq!(
-            texts[10],
-            "--set limit[0]: limit: holds a value, so nothing can be set below it"
+            texts[8..],
+            [
+                "--set colour: colour: unknown key",
+                "--set extra: extra: unknown key",
+                "--set limit[0]: limit: holds a value, so nothing can be set below it",
+            ]
         );
-        assert_eq!(texts.len(), 11);
     }
 
     #[test]

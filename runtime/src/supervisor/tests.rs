@@ -132,7 +132,7 @@ async fn the_deadline_aborts_what_is_left() {
     let runtime = tokio::runtime::Handle::current();
     let thread = supervisor
         .spawn_thread("blocked", TaskPolicy::Essential, move || {
-            runtime.block_on(held.cancelled())
+            runtime.block_on(held.cancelled());
         })
         .unwrap();
     let steps = ShutdownSteps::new(Duration::from_millis(100)).on(
@@ -201,7 +201,7 @@ fn child_process() {
                 steps = steps.on(ShutdownPhase::Drain, "drain", async {
                     crate::supervisor::say(format_args!("draining"));
                     std::future::pending::<()>().await;
-                })
+                });
             }
             "fail" => {
                 supervisor.spawn("pacer", TaskPolicy::Essential, async {});
