@@ -9,7 +9,8 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::walk::{Node, Section, formed, free_text, parsed, path, text, whole};
+use super::readers::{formed, free_text, parsed, path, text, whole};
+use super::walk::{Node, Section};
 use super::{SecretText, TopicPattern, url};
 use crate::qos::{UnknownWord, word_enum};
 

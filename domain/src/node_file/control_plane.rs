@@ -7,8 +7,9 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use super::readers::{boolean, parsed, path, text, whole};
 use super::services::{loopback, mongodb, socket};
-use super::walk::{Node, Section, boolean, from_empty, parsed, path, text, whole};
+use super::walk::{Node, Section, from_empty};
 use super::{SecretText, url};
 use crate::qos::{UnknownWord, word_enum};
 

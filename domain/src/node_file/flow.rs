@@ -6,7 +6,8 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use super::walk::{Node, Section, boolean, from_empty, number, parsed, whole};
+use super::readers::{boolean, number, parsed, whole};
+use super::walk::{Node, Section, from_empty};
 use super::{AutoBool, TopicPattern, auto_bool};
 use crate::MAX_PAYLOAD_BYTES;
 use crate::names::{LayerName, TopicName};

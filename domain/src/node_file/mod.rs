@@ -13,6 +13,7 @@ mod control_plane;
 mod effect;
 mod flow;
 mod pattern;
+mod readers;
 mod services;
 #[cfg(test)]
 mod tests;
@@ -43,7 +44,8 @@ pub use services::{
 use crate::identity::FlowId;
 use crate::names::{LayerName, NodeName};
 use crate::qos::LayerKind;
-use walk::{Node, Report, Section, parsed, path};
+use readers::{parsed, path};
+use walk::{Node, Report, Section};
 
 /// Something in the file that is not allowed.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -264,7 +266,7 @@ fn auto_bool(node: &Node<'_>) -> Option<AutoBool> {
 /// A URL that starts with one of the schemes; it is not repeated in faults, for it may hold a password.
 fn url(schemes: &'static [&'static str]) -> impl Fn(&Node<'_>) -> Option<SecretText> {
     move |node| {
-        let text = walk::text(node)?;
+        let text = readers::text(node)?;
         match schemes.iter().find_map(|scheme| text.strip_prefix(scheme)) {
             Some(rest) if !rest.is_empty() && !rest.contains(char::is_whitespace) => Some(SecretText(text)),
             _ => node.fault(format!("is not a URL that starts with {}", schemes.join(" or "))),

@@ -7,7 +7,8 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use super::walk::{Node, Section, formed, from_empty, parsed, path, text, whole};
+use super::readers::{formed, parsed, path, text, whole};
+use super::walk::{Node, Section, from_empty};
 use super::{AutoBool, RedisBroker, SecretText, auto_bool, url};
 use crate::names::TopicName;
 use crate::qos::{UnknownWord, word_enum};

@@ -14,6 +14,9 @@ pub const MAX_FILE_BYTES: u64 = 1024 * 1024;
 /// Names of variables that override the file start with this.
 const PREFIX: &str = "BLAZE__";
 
+/// Name and content of a file.
+pub(super) type NamedText = (Arc<str>, Arc<str>);
+
 /// Where a configuration comes from. Precedence: overrides > environment > file > defaults of the schema.
 #[derive(Debug, Clone, Default)]
 pub struct Sources {
@@ -69,7 +72,7 @@ impl Sources {
     }
 
     /// The text of the file; `Ok(None)` if there is none and none is needed.
-    pub(super) fn read_file(&self) -> Result<Option<(Arc<str>, Arc<str>)>, LocatedFault> {
+    pub(super) fn read_file(&self) -> Result<Option<NamedText>, LocatedFault> {
         let Some(file) = self.resolve_file() else {
             if self.file_may_be_absent {
                 return Ok(None);
@@ -166,10 +169,7 @@ impl Document {
         }
     }
 
-    pub(super) fn from_text(
-        sources: &Sources,
-        text: Option<(Arc<str>, Arc<str>)>,
-    ) -> (Option<Self>, Vec<LocatedFault>) {
+    pub(super) fn from_text(sources: &Sources, text: Option<NamedText>) -> (Option<Self>, Vec<LocatedFault>) {
         let parsed = match &text {
             Some((name, text)) => yaml::parse(text, &Origin::File(Arc::clone(name)), ""),
             None => yaml::parse("", &Origin::Single(Place::Nowhere), ""),
@@ -246,10 +246,13 @@ impl Document {
             made.push((at.clone(), fresh || slot.is_null()));
         }
         let parsed = yaml::parse(text, &Origin::Single(place.clone()), &at);
-        match parsed.value {
-            Some(value) if parsed.faults.is_empty() => *slot = value,
-            _ => return Err(parsed.faults),
-        }
+        let read = match parsed.value {
+            Some(value) if parsed.faults.is_empty() => {
+                *slot = value;
+                Ok(())
+            }
+            _ => Err(parsed.faults),
+        };
         self.places.forget_below(&at);
         // Sections that exist only because of the override have its place too.
         for (path, fresh) in made {
@@ -258,7 +261,7 @@ impl Document {
             }
         }
         self.places.set(&at, place.clone());
-        Ok(())
+        read
     }
 }
 

@@ -11,6 +11,7 @@
 
 mod document;
 mod place;
+mod scalar;
 #[cfg(test)]
 mod tests;
 mod watch;

@@ -15,6 +15,7 @@ use serde_json::Value;
 use tokio::sync::{mpsc, watch as channel};
 use tokio::time::{Instant, MissedTickBehavior};
 
+use super::document::NamedText;
 use super::{Document, Loaded, LocatedFault, Schema, Sources, judge};
 use crate::supervisor::{Supervisor, TaskPolicy};
 
@@ -100,7 +101,7 @@ pub fn watch<T: Send + Sync + 'static>(
 }
 
 /// Name and text of the file, or why it could not be read.
-type Seen = Result<Option<(Arc<str>, Arc<str>)>, LocatedFault>;
+type Seen = Result<Option<NamedText>, LocatedFault>;
 
 struct Task<T> {
     sources: Sources,
@@ -159,7 +160,7 @@ impl<T: Send + Sync + 'static> Task<T> {
         });
     }
 
-    fn judge(&self, text: Option<(Arc<str>, Arc<str>)>) -> Result<Loaded<T>, Vec<LocatedFault>> {
+    fn judge(&self, text: Option<NamedText>) -> Result<Loaded<T>, Vec<LocatedFault>> {
         // A file that is being written is empty for a moment. It would be valid and reset everything to its default.
         let emptied = text.as_ref().is_some_and(|(_, text)| text.trim().is_empty());
         let before = &self.tell.borrow().loaded.document;
@@ -196,7 +197,7 @@ impl Hangup {
         {
             return;
         }
-        std::future::pending().await
+        std::future::pending::<()>().await;
     }
 }
 
@@ -279,4 +280,36 @@ fn directory_of(file: &Path) -> &Path {
 fn identity(path: &Path) -> Option<(u64, u64)> {
     let metadata = std::fs::metadata(path).ok()?;
     Some((metadata.dev(), metadata.ino()))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn another_directory_under_the_same_name_is_armed() {
+        let parent = tempfile::tempdir().unwrap();
+        let directory = parent.path().join("etc");
+        let file = directory.join("blaze.yaml");
+        let make = || {
+            fs::create_dir(&directory).unwrap();
+            fs::write(&file, "a: 1").unwrap();
+        };
+        make();
+        let (events, mut changed) = mpsc::channel(1);
+        let mut directories = Directories::new(Some(events));
+        directories.arm(&file);
+        let first = directories.armed.clone();
+        assert_eq!(first.len(), 1);
+        fs::rename(&directory, parent.path().join("old")).unwrap();
+        make();
+        directories.arm(&file);
+        assert_ne!(directories.armed, first);
+        while changed.try_recv().is_ok() {}
+        fs::write(&file, "a: 2").unwrap();
+        let told = tokio::time::timeout(Duration::from_secs(10), changed.recv()).await;
+        assert_eq!(told, Ok(Some(())));
+    }
 }

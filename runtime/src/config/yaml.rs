@@ -7,9 +7,10 @@ use std::collections::HashSet;
 use std::sync::Arc;
 
 use saphyr_parser::{Event, Parser, ScalarStyle, Span, Tag};
-use serde_json::{Map, Number, Value};
+use serde_json::{Map, Value};
 
 use super::place::{LocatedFault, Place, Places, join};
+use super::scalar::core_schema;
 
 /// Deepest nesting.
 pub(super) const MAX_DEPTH: usize = 32;
@@ -148,7 +149,7 @@ impl Builder<'_> {
                 }
                 let (path, line) = self.next_place(line);
                 let value = self.scalar(&text, style, tag.as_deref(), line, &path);
-                self.put(path, line, value);
+                self.put(&path, line, value);
                 Ok(())
             }
             Event::SequenceStart(anchor, tag) => self.open(Open::List(Vec::new()), anchor, tag.as_deref(), line),
@@ -205,7 +206,7 @@ impl Builder<'_> {
             path.clone(),
             "aliases (*name) are not allowed: write the value out",
         );
-        self.put(path, line, Value::Null);
+        self.put(&path, line, Value::Null);
         Ok(())
     }
 
@@ -234,7 +235,7 @@ impl Builder<'_> {
                 Open::List(items) => Value::Array(items),
                 Open::Map { entries, .. } => Value::Object(entries),
             };
-            self.put(path, 0, value);
+            self.put(&path, 0, value);
         }
     }
 
@@ -281,8 +282,8 @@ impl Builder<'_> {
     }
 
     /// A value is complete: it goes into the open collection.
-    fn put(&mut self, path: String, line: usize, value: Value) {
-        self.note_place(&path, line);
+    fn put(&mut self, path: &str, line: usize, value: Value) {
+        self.note_place(path, line);
         match self.stack.last_mut() {
             None => self.document = Some(value),
             Some(Frame {
@@ -315,73 +316,6 @@ impl Builder<'_> {
     }
 }
 
-/// The value of a plain scalar by the core schema of YAML 1.2.
-fn core_schema(text: &str) -> Result<Value, String> {
-    match text {
-        "" | "~" | "null" | "Null" | "NULL" => return Ok(Value::Null),
-        "true" | "True" | "TRUE" => return Ok(Value::Bool(true)),
-        "false" | "False" | "FALSE" => return Ok(Value::Bool(false)),
-        ".nan" | ".NaN" | ".NAN" => return Err("is not a number".to_owned()),
-        _ => {}
-    }
-    let unsigned = text.strip_prefix(['-', '+']).unwrap_or(text);
-    if matches!(unsigned, ".inf" | ".Inf" | ".INF") {
-        return Err("is not a finite number".to_owned());
-    }
-    if let Some(radix) = radix_number(text) {
-        return radix;
-    }
-    if is_decimal(unsigned) {
-        return decimal(text);
-    }
-    Ok(Value::String(text.to_owned()))
-}
-
-/// `0o17` and `0xff`.
-fn radix_number(text: &str) -> Option<Result<Value, String>> {
-    let (digits, radix) = match (text.strip_prefix("0o"), text.strip_prefix("0x")) {
-        (Some(digits), _) => (digits, 8),
-        (_, Some(digits)) => (digits, 16),
-        _ => return None,
-    };
-    if digits.is_empty() || !digits.chars().all(|c| c.is_digit(radix)) {
-        return None;
-    }
-    Some(
-        u64::from_str_radix(digits, radix)
-            .map(Value::from)
-            .map_err(|_| "is a number too large to hold".to_owned()),
-    )
-}
-
-/// `[0-9]+ | (\.[0-9]+ | [0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?`, without the sign.
-fn is_decimal(text: &str) -> bool {
-    let digits = |text: &str| text.bytes().all(|b| b.is_ascii_digit());
-    let (mantissa, exponent) = match text.split_once(['e', 'E']) {
-        Some((mantissa, exponent)) => (mantissa, Some(exponent.strip_prefix(['-', '+']).unwrap_or(exponent))),
-        None => (text, None),
-    };
-    let (before, after) = mantissa.split_once('.').unwrap_or((mantissa, ""));
-    digits(before)
-        && digits(after)
-        && !(before.is_empty() && after.is_empty())
-        && exponent.is_none_or(|exponent| !exponent.is_empty() && digits(exponent))
-}
-
-fn decimal(text: &str) -> Result<Value, String> {
-    let plain = text.strip_prefix('+').unwrap_or(text);
-    if let Ok(value) = plain.parse::<i64>() {
-        return Ok(value.into());
-    }
-    if let Ok(value) = plain.parse::<u64>() {
-        return Ok(value.into());
-    }
-    let number = plain.parse::<f64>().ok().and_then(Number::from_f64);
-    number
-        .map(Value::Number)
-        .ok_or_else(|| "is a number too large to hold".to_owned())
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -404,38 +338,10 @@ mod tests {
     }
 
     #[test]
-    fn scalars_follow_the_core_schema() {
-        for (text, expected) in [
-            ("150", json!(150)),
-            ("-7", json!(-7)),
-            ("+7", json!(7)),
-            ("18446744073709551615", json!(u64::MAX)),
-            ("1.5", json!(1.5)),
-            (".5", json!(0.5)),
-            ("1.", json!(1.0)),
-            ("1e3", json!(1000.0)),
-            ("0x1F", json!(31)),
-            ("0o17", json!(15)),
-            ("017", json!(17)),
-            ("off", json!("off")),
-            ("yes", json!("yes")),
-            ("True", json!(true)),
-            ("~", json!(null)),
-            ("1_000", json!("1_000")),
-            ("1.2.3", json!("1.2.3")),
-            (".", json!(".")),
-            ("e3", json!("e3")),
-            ("0x", json!("0x")),
-            ("-", json!(["-"])),
-            ("10.0.1.1", json!("10.0.1.1")),
-            ("\"150\"", json!("150")),
-            ("'true'", json!("true")),
-            ("!!str 150", json!("150")),
-        ] {
-            if text != "-" {
-                assert_eq!(value(&format!("a: {text}")), json!({ "a": expected }), "{text}");
-            }
-        }
+    fn quotes_and_tags_make_text() {
+        let text = "a: 150\nb: \"150\"\nc: 'true'\nd: !!str 150\ne:\nf: off\n";
+        let expected = json!({ "a": 150, "b": "150", "c": "true", "d": "150", "e": null, "f": "off" });
+        assert_eq!(value(text), expected);
         assert_eq!(value(""), Value::Null);
         assert_eq!(value("# only a comment\n"), Value::Null);
     }

@@ -68,8 +68,9 @@ impl Supervisor {
     }
 
     fn build(runtime: tokio::runtime::Handle, name: String, parent: Option<Self>) -> Self {
-        let token =
-            |parent: Option<&CancellationToken>| parent.map_or_else(CancellationToken::new, |t| t.child_token());
+        let token = |parent: Option<&CancellationToken>| {
+            parent.map_or_else(CancellationToken::new, CancellationToken::child_token)
+        };
         let above = parent.as_ref().map(|parent| &parent.shared);
         Self {
             shared: Arc::new(Shared {
