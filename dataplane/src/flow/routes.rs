@@ -49,7 +49,7 @@ struct Source {
 type WriterKey = (Scope, ChannelName, PublisherOptions);
 
 /// Writers and source tasks of one flow.
-pub struct Routes {
+pub(crate) struct Routes {
     plane: Arc<Plane>,
     brokers: LocalBrokers,
     supervisor: Supervisor,
@@ -60,7 +60,7 @@ pub struct Routes {
 impl Routes {
     /// Without any route.
     #[must_use]
-    pub fn new(plane: Arc<Plane>, brokers: LocalBrokers, supervisor: Supervisor) -> Self {
+    pub(super) fn new(plane: Arc<Plane>, brokers: LocalBrokers, supervisor: Supervisor) -> Self {
         Self {
             plane,
             brokers,
@@ -71,7 +71,7 @@ impl Routes {
     }
 
     /// Makes the bridges of a topic equal to its plan.
-    pub fn apply(&self, topic: &TopicName, plan: &TopicPlan, info: TopicInfo) {
+    pub(super) fn apply(&self, topic: &TopicName, plan: &TopicPlan, info: TopicInfo) {
         let now = Instant::now();
         let large = self.plane.read(|state| state.core.is_large(info.max_bytes));
         let mut writers: HashMap<Target, Arc<dyn Publisher>> = HashMap::new();
@@ -104,7 +104,7 @@ impl Routes {
 
     /// Whether everything that the topic's bridges read is subscribed.
     #[must_use]
-    pub fn is_subscribed(&self, topic: TopicId, scope: Scope) -> bool {
+    pub(super) fn is_subscribed(&self, topic: TopicId, scope: Scope) -> bool {
         match scope {
             Scope::Inter => true,
             _ => self
@@ -116,7 +116,7 @@ impl Routes {
     }
 
     /// Ends all source tasks.
-    pub fn stop(&self) {
+    pub(super) fn stop(&self) {
         for (_, source) in std::mem::take(&mut *self.sources.lock()) {
             source.task.stop();
         }

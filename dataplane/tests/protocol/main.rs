@@ -22,18 +22,28 @@ fn run_seeds(name: &str, chaos: &Chaos) {
     let only: Option<u64> = std::env::var("BLAZE_SEED").ok().and_then(|text| text.parse().ok());
     let range = only.map_or(0..seeds(), |seed| seed..seed + 1);
     let mut failures = Vec::new();
-    for seed in range {
-        if let Err(fault) = Simulation::new(seed, chaos).run() {
-            failures.push(format!("seed {seed}: {fault}"));
-            if failures.len() >= 5 {
-                break;
-            }
+    let mut deliveries = 0;
+    for seed in range.clone() {
+        match Simulation::new(seed, chaos).run() {
+            Ok(seen) => deliveries += seen,
+            Err(fault) => failures.push(format!("seed {seed}: {fault}")),
+        }
+        if failures.len() >= 5 {
+            break;
         }
     }
     assert!(
         failures.is_empty(),
         "{name} (BLAZE_SEED=n repeats one):\n{}",
         failures.join("\n")
+    );
+    println!(
+        "{name}: {} seeds, {deliveries} deliveries in the last rounds",
+        range.count()
+    );
+    assert!(
+        only.is_some() || deliveries as u64 > 10 * range.end,
+        "{name}: only {deliveries} deliveries were asked for"
     );
 }
 

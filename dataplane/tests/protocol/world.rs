@@ -28,11 +28,11 @@ const TOPICS: [&str; 4] = ["imu/data", "odom", "camera/image", "cmd_vel"];
 const WALL_NS: u64 = 1_700_000_000_000_000_000;
 
 /// What goes wrong before the quiet.
-pub struct Chaos {
-    pub loss: f64,
-    pub partitions: bool,
-    pub restarts: bool,
-    pub churn: bool,
+pub(crate) struct Chaos {
+    pub(crate) loss: f64,
+    pub(crate) partitions: bool,
+    pub(crate) restarts: bool,
+    pub(crate) churn: bool,
 }
 
 /// One scope's broker: survives its flow.
@@ -121,7 +121,7 @@ impl Ord for Packet {
     }
 }
 
-pub struct Simulation<'a> {
+pub(crate) struct Simulation<'a> {
     chaos: &'a Chaos,
     random: StdRng,
     start: Instant,
@@ -139,7 +139,7 @@ pub struct Simulation<'a> {
 }
 
 impl<'a> Simulation<'a> {
-    pub fn new(seed: u64, chaos: &'a Chaos) -> Self {
+    pub(crate) fn new(seed: u64, chaos: &'a Chaos) -> Self {
         let mut random = StdRng::seed_from_u64(seed);
         let start = Instant::now();
         let count = random.random_range(2..=5usize);
@@ -250,7 +250,8 @@ impl<'a> Simulation<'a> {
     }
 
     /// The whole story of one seed.
-    pub fn run(mut self) -> Result<(), String> {
+    /// Gives how many deliveries were expected and seen in the last round.
+    pub(crate) fn run(mut self) -> Result<usize, String> {
         self.lease_all();
         let chaos = Duration::from_millis(self.random.random_range(2_000..8_000));
         let end = self.now + chaos;
@@ -264,6 +265,12 @@ impl<'a> Simulation<'a> {
         for index in 0..self.flows.len() {
             if !self.flows[index].alive {
                 self.restart(index);
+            }
+        }
+        for index in 0..self.services.len() {
+            if !self.services[index].active && self.random.random_bool(0.7) {
+                self.services[index].active = true;
+                self.lease(index);
             }
         }
         self.run_for(Duration::from_secs(5));
@@ -599,7 +606,7 @@ impl<'a> Simulation<'a> {
         counts.collect()
     }
 
-    fn everybody_has(&self, sent: &[(usize, u64)], before: &HashMap<(usize, Scope), usize>) -> Result<(), String> {
+    fn everybody_has(&self, sent: &[(usize, u64)], before: &HashMap<(usize, Scope), usize>) -> Result<usize, String> {
         let mut expected: BTreeMap<(usize, Scope), BTreeSet<(TopicName, WriterId, u64)>> = BTreeMap::new();
         let mut wanted: BTreeMap<(usize, Scope), BTreeSet<&TopicName>> = BTreeMap::new();
         for request in self
@@ -622,6 +629,7 @@ impl<'a> Simulation<'a> {
                 }
             }
         }
+        let deliveries = expected.values().map(BTreeSet::len).sum();
         for (index, scopes) in self.scopes.iter().enumerate() {
             for (scope, broker) in scopes {
                 let place = (index, *scope);
@@ -647,7 +655,7 @@ impl<'a> Simulation<'a> {
                 }
             }
         }
-        Ok(())
+        Ok(deliveries)
     }
 
     fn describe(&self) -> String {
