@@ -221,3 +221,86 @@ fn help_when_stuck(shared: &Arc<Shared>) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    const DEADLINE: Duration = Duration::from_secs(20);
+
+    /// Runs once, and then waits until it is let go.
+    #[derive(Default)]
+    struct Stuck {
+        running: AtomicUsize,
+        may_end: Mutex<bool>,
+        ends: Condvar,
+    }
+
+    impl Job for Stuck {
+        fn run_one(&self) -> bool {
+            self.running.fetch_add(1, Ordering::SeqCst);
+            let mut may_end = self.may_end.lock();
+            while !*may_end {
+                self.ends.wait(&mut may_end);
+            }
+            false
+        }
+    }
+
+    impl Stuck {
+        fn let_go(&self) {
+            *self.may_end.lock() = true;
+            self.ends.notify_all();
+        }
+    }
+
+    fn eventually(mut holds: impl FnMut() -> bool) {
+        let until = Instant::now() + DEADLINE;
+        while !holds() {
+            assert!(Instant::now() < until, "not within {DEADLINE:?}");
+            thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    #[tokio::test]
+    async fn stuck_threads_get_help_up_to_a_bound_and_all_end_when_it_stops() {
+        let pool = Pool::start(2).unwrap();
+        let stuck = Arc::new(Stuck::default());
+        let most = 2 + MAX_SPARE_THREADS;
+        for _ in 0..most + 5 {
+            pool.handle().submit(Arc::clone(&stuck) as Arc<dyn Job>);
+        }
+        eventually(|| stuck.running.load(Ordering::SeqCst) == most);
+        {
+            let state = pool.shared.state.lock();
+            assert_eq!((state.ready.len(), state.spare), (5, MAX_SPARE_THREADS));
+        }
+        assert_eq!(*pool.shared.alive.borrow(), most + 1, "and the one that watches");
+        pool.stop();
+        assert!(
+            pool.ended(Duration::from_millis(1)).await >= most,
+            "they are still in their jobs"
+        );
+        stuck.let_go();
+        assert_eq!(pool.ended(DEADLINE).await, 0);
+        assert_eq!(stuck.running.load(Ordering::SeqCst), most, "what waited was forgotten");
+    }
+
+    #[tokio::test]
+    async fn quick_jobs_need_no_spare_threads_and_take_turns() {
+        struct Counting(AtomicUsize, usize);
+        impl Job for Counting {
+            fn run_one(&self) -> bool {
+                self.0.fetch_add(1, Ordering::SeqCst) + 1 < self.1
+            }
+        }
+        let pool = Pool::start(2).unwrap();
+        let jobs: Vec<_> = (0..4).map(|_| Arc::new(Counting(AtomicUsize::new(0), 5_000))).collect();
+        for job in &jobs {
+            pool.handle().submit(Arc::clone(job) as Arc<dyn Job>);
+        }
+        eventually(|| jobs.iter().all(|job| job.0.load(Ordering::SeqCst) == 5_000));
+        assert_eq!(pool.shared.state.lock().spare, 0);
+    }
+}

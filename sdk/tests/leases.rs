@@ -1,6 +1,6 @@
 //! Leases against a flow that answers as the contract says, on a clock that stands still until all wait.
 
-#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "helpers of tests")]
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -4,7 +4,7 @@
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, mpsc};
+use std::sync::{Arc, Condvar, Mutex, mpsc};
 use std::time::{Duration, Instant, SystemTime};
 
 use blaze_brokers::memory::MemoryHub;
@@ -62,6 +62,34 @@ async fn listen(
     (subscription, receiver)
 }
 
+/// Callbacks wait here until it is opened, which also happens when the test ends.
+struct Gate(Arc<(Mutex<bool>, Condvar)>);
+
+impl Gate {
+    fn closed() -> Self {
+        Self(Arc::default())
+    }
+
+    fn waiter(&self) -> impl Fn() + Send + Sync + 'static {
+        let shared = Arc::clone(&self.0);
+        move || {
+            let is_open = shared.0.lock().unwrap();
+            drop(shared.1.wait_while(is_open, |is_open| !*is_open).unwrap());
+        }
+    }
+
+    fn open(&self) {
+        *self.0.0.lock().unwrap() = true;
+        self.0.1.notify_all();
+    }
+}
+
+impl Drop for Gate {
+    fn drop(&mut self) {
+        self.open();
+    }
+}
+
 /// Publishes frames with any header on a hub.
 struct Raw {
     to: Arc<dyn blaze_brokers::Publisher>,
@@ -104,7 +132,7 @@ fn now_ns() -> u64 {
     .unwrap()
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_message_tells_who_published_it_when_and_what_it_is() {
     let hub = MemoryHub::new("t");
     let (sender, receiver) = (service(&hub, "driver", 2).await, service(&hub, "logger", 2).await);
@@ -143,13 +171,13 @@ async fn a_message_tells_who_published_it_when_and_what_it_is() {
     assert_ne!(other.writer(), publisher.writer());
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn messages_of_each_writer_come_one_at_a_time_and_in_order() {
     const MESSAGES: u64 = 2_000;
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 4).await;
     type Seen = HashMap<WriterId, (bool, u64)>;
-    let seen: Arc<parking_lot::Mutex<Seen>> = Arc::default();
+    let seen: Arc<Mutex<Seen>> = Arc::default();
     let wrong = Arc::new(AtomicUsize::new(0));
     let (noted, errors) = (Arc::clone(&seen), Arc::clone(&wrong));
     let options = SubscribeOptions {
@@ -161,14 +189,14 @@ async fn messages_of_each_writer_come_one_at_a_time_and_in_order() {
         .subscribe(&topic("t"), options, move |message| {
             let writer = message.writer().unwrap();
             let ok = {
-                let mut seen = noted.lock();
+                let mut seen = noted.lock().unwrap();
                 let (busy, last) = seen.entry(writer).or_default();
                 let ok = !*busy && message.sequence() == Some(*last + 1);
                 (*busy, *last) = (true, message.sequence().unwrap());
                 ok
             };
             std::thread::yield_now();
-            noted.lock().entry(writer).or_default().0 = false;
+            noted.lock().unwrap().entry(writer).or_default().0 = false;
             errors.fetch_add(usize::from(!ok), Ordering::Relaxed);
         })
         .await
@@ -192,10 +220,10 @@ async fn messages_of_each_writer_come_one_at_a_time_and_in_order() {
     .await;
     subscription.close().await;
     assert_eq!(wrong.load(Ordering::Relaxed), 0);
-    assert!(seen.lock().values().all(|(_, last)| *last == MESSAGES));
+    assert!(seen.lock().unwrap().values().all(|(_, last)| *last == MESSAGES));
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn concurrency_runs_callbacks_of_one_writer_at_the_same_time() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 4).await;
@@ -227,22 +255,21 @@ async fn concurrency_runs_callbacks_of_one_writer_at_the_same_time() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn slow_callbacks_do_not_hold_up_others_even_if_there_are_more_than_threads() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
-    let gate = Arc::new(parking_lot::RwLock::new(()));
-    let closed = gate.write();
+    let gate = Gate::closed();
     let mut slow = Vec::new();
     let entered = Arc::new(AtomicUsize::new(0));
     for number in 0..5 {
-        let (gate, entered) = (Arc::clone(&gate), Arc::clone(&entered));
+        let (wait, entered) = (gate.waiter(), Arc::clone(&entered));
         let name = topic(&format!("slow/{number}"));
         let subscription = service
             .broker()
             .subscribe(&name, SubscribeOptions::default(), move |_| {
                 entered.fetch_add(1, Ordering::SeqCst);
-                drop(gate.read());
+                wait();
             })
             .await
             .unwrap();
@@ -263,23 +290,22 @@ async fn slow_callbacks_do_not_hold_up_others_even_if_there_are_more_than_thread
         assert_eq!(heard.recv_timeout(DEADLINE).unwrap().sequence(), Some(sequence));
     }
     assert_eq!(entered.load(Ordering::SeqCst), 5, "the slow ones still wait");
-    drop(closed);
+    gate.open();
     eventually("the slow ones go on", || entered.load(Ordering::SeqCst) == 15).await;
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn one_subscription_never_takes_all_threads() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 3).await;
-    let gate = Arc::new(parking_lot::RwLock::new(()));
-    let closed = gate.write();
+    let gate = Gate::closed();
     let entered = Arc::new(AtomicUsize::new(0));
-    let (wait, count) = (Arc::clone(&gate), Arc::clone(&entered));
+    let (wait, count) = (gate.waiter(), Arc::clone(&entered));
     let slow = service
         .broker()
         .subscribe(&topic("slow"), SubscribeOptions::default(), move |_| {
             count.fetch_add(1, Ordering::SeqCst);
-            drop(wait.read());
+            wait();
         })
         .await
         .unwrap();
@@ -293,18 +319,17 @@ async fn one_subscription_never_takes_all_threads() {
     quick.send(1, 1, |_| {});
     heard.recv_timeout(DEADLINE).unwrap();
     assert_eq!(entered.load(Ordering::SeqCst), 2);
-    drop(closed);
+    gate.open();
     eventually("all ten writers are served", || slow.stats().delivered == 10).await;
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_full_queue_drops_the_oldest_and_counts_them() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
-    let gate = Arc::new(parking_lot::RwLock::new(()));
-    let closed = gate.write();
+    let gate = Gate::closed();
     let (sender, heard) = mpsc::sync_channel(1_000);
-    let wait = Arc::clone(&gate);
+    let wait = gate.waiter();
     let options = SubscribeOptions {
         max_messages: 10,
         ..SubscribeOptions::default()
@@ -313,7 +338,7 @@ async fn a_full_queue_drops_the_oldest_and_counts_them() {
         .broker()
         .subscribe(&topic("t"), options, move |message| {
             sender.try_send(message.sequence().unwrap()).unwrap();
-            drop(wait.read());
+            wait();
         })
         .await
         .unwrap();
@@ -324,13 +349,13 @@ async fn a_full_queue_drops_the_oldest_and_counts_them() {
         raw.send(1, sequence, |_| {});
     }
     eventually("all arrived", || subscription.stats().queue_dropped == 89).await;
-    drop(closed);
+    gate.open();
     let kept: Vec<u64> = (0..10).map(|_| heard.recv_timeout(DEADLINE).unwrap()).collect();
     assert_eq!(kept, (91..=100).collect::<Vec<_>>());
     assert_eq!(subscription.stats().delivered, 11);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_panicking_callback_is_counted_and_the_next_message_comes() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
@@ -352,7 +377,7 @@ async fn a_panicking_callback_is_counted_and_the_next_message_comes() {
     assert_eq!(subscription.stats().panicked, 5);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn repeats_and_malformed_messages_are_left_out_and_losses_counted() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
@@ -380,7 +405,7 @@ async fn repeats_and_malformed_messages_are_left_out_and_losses_counted() {
     assert!(heard.try_recv().is_err());
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_subscription_thins_to_its_own_rate() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
@@ -400,13 +425,13 @@ async fn a_subscription_thins_to_its_own_rate() {
     assert_eq!((thin.stats().delivered, thin.stats().lost), (1, 0));
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn old_messages_are_left_out_on_arrival_and_in_the_queue() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
-    let gate = Arc::new(parking_lot::RwLock::new(()));
+    let gate = Gate::closed();
     let (sender, heard) = mpsc::sync_channel(10);
-    let wait = Arc::clone(&gate);
+    let wait = gate.waiter();
     let options = SubscribeOptions {
         lifespan: Duration::from_secs(30),
         ..SubscribeOptions::default()
@@ -414,8 +439,11 @@ async fn old_messages_are_left_out_on_arrival_and_in_the_queue() {
     let subscription = service
         .broker()
         .subscribe(&topic("t"), options, move |message| {
-            sender.try_send(message.sequence().unwrap()).unwrap();
-            drop(wait.read());
+            let sequence = message.sequence().unwrap();
+            sender.try_send(sequence).unwrap();
+            if sequence == 5 {
+                wait();
+            }
         })
         .await
         .unwrap();
@@ -428,7 +456,6 @@ async fn old_messages_are_left_out_on_arrival_and_in_the_queue() {
     assert_eq!(heard.recv_timeout(DEADLINE).unwrap(), 4);
     assert_eq!(subscription.stats().expired, 3);
 
-    let closed = gate.write();
     raw.send(1, 5, |_| {});
     assert_eq!(heard.recv_timeout(DEADLINE).unwrap(), 5);
     let sent = Instant::now();
@@ -438,12 +465,12 @@ async fn old_messages_are_left_out_on_arrival_and_in_the_queue() {
         subscription.stats().received == 7 && sent.elapsed() > Duration::from_millis(600)
     })
     .await;
-    drop(closed);
+    gate.open();
     assert_eq!(heard.recv_timeout(DEADLINE).unwrap(), 7);
     assert_eq!(subscription.stats().expired, 4);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn late_joiners_get_what_is_kept_and_repeats_once() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
@@ -467,7 +494,7 @@ async fn late_joiners_get_what_is_kept_and_repeats_once() {
     assert_eq!(found, [Some(4), Some(5), Some(6)]);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn bad_options_are_refused_with_their_name() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
@@ -506,7 +533,7 @@ async fn bad_options_are_refused_with_their_name() {
     assert_eq!(publisher.sequence(), 0);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_outage_costs_messages_but_not_the_subscription() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
@@ -527,7 +554,7 @@ async fn an_outage_costs_messages_but_not_the_subscription() {
     assert_eq!(subscription.stats().lost, 1);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn dropping_a_subscription_ends_it_at_the_broker() {
     let hub = MemoryHub::new("t");
     let service = service(&hub, "s", 2).await;
@@ -539,11 +566,16 @@ async fn dropping_a_subscription_ends_it_at_the_broker() {
     let channel: ChannelName = "t".parse().unwrap();
     eventually("the broker has no reader", || hub.subscriptions_of(&channel) == 0).await;
     raw.send(1, 2, |_| {});
-    assert!(heard.recv_timeout(DEADLINE).is_err(), "the callback is gone");
+    let end = heard.recv_timeout(DEADLINE);
+    assert_eq!(
+        end.unwrap_err(),
+        mpsc::RecvTimeoutError::Disconnected,
+        "the callback is gone"
+    );
 }
 
-#[tokio::test]
-async fn shutdown_leaves_no_task_no_thread_and_no_reader() {
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn shutdown_leaves_no_task_and_no_reader() {
     let hub = MemoryHub::new("t");
     let tasks = || tokio::runtime::Handle::current().metrics().num_alive_tasks();
     let before = tasks();
