@@ -194,7 +194,7 @@ mod tests {
                     "inter:dds",
                     "layer:memory",
                     Some("cloud"),
-                    json!({"rate_limit": 1, "lifespan": 2}),
+                    &json!({"rate_limit": 1, "lifespan": 2}),
                 ),
             ),
         ])
