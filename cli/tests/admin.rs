@@ -1,5 +1,7 @@
 //! The program `blaze` against an admin port that answers as a flow does.
 
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener};
 use std::process::{Command, Output};

@@ -13,8 +13,19 @@ use super::options::DemoNode;
 use super::roles::{Consumer, MOVES_FROM, MOVES_TO, MOVING_SERVICE, PUBLISHING_NODE, PlayedTopic};
 use super::stats::{Arrival, Period, SubscriptionStats};
 
+/// Messages that reached a consumer and were not handed to it, since it began to listen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ConsumerCounts {
+    /// They gave way in its queue.
+    pub queue_full: u64,
+    /// They were older than their lifespan.
+    pub lifespan: u64,
+    /// They had come before.
+    pub duplicated: u64,
+}
+
 /// Index of a consumer on the board.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ConsumerId(usize);
 
 /// One topic on its way to one consumer; a line of the report.
@@ -116,8 +127,9 @@ struct ConsumerEntry {
     active: bool,
     route: Vec<String>,
     on_the_way: DropCounter,
-    at_consumer: u64,
+    at_consumer: ConsumerCounts,
     dropped_before: BTreeMap<String, u64>,
+    duplicated_before: u64,
 }
 
 /// Adds up counters of bridges that may be made anew, and then count from 0.
@@ -154,8 +166,13 @@ impl DropCounter {
 impl ConsumerEntry {
     fn dropped(&self) -> BTreeMap<String, u64> {
         let mut total = self.on_the_way.total();
-        if self.at_consumer > 0 {
-            *total.entry(DropReason::QueueFull.as_str().to_owned()).or_default() += self.at_consumer;
+        let ConsumerCounts {
+            queue_full, lifespan, ..
+        } = self.at_consumer;
+        for (reason, count) in [(DropReason::QueueFull, queue_full), (DropReason::Lifespan, lifespan)] {
+            if count > 0 {
+                *total.entry(reason.as_str().to_owned()).or_default() += count;
+            }
         }
         total
     }
@@ -206,8 +223,9 @@ impl Board {
             active: true,
             route: Vec::new(),
             on_the_way: DropCounter::default(),
-            at_consumer: 0,
+            at_consumer: ConsumerCounts::default(),
             dropped_before: BTreeMap::new(),
+            duplicated_before: 0,
         });
         Some(ConsumerId(state.consumers.len() - 1))
     }
@@ -237,10 +255,10 @@ impl Board {
         }
     }
 
-    /// Messages gave way in the consumer's own queue.
-    pub fn dropped_at_consumer(&self, id: ConsumerId, count: u64) {
+    /// Takes over what a consumer's own queue left out.
+    pub fn set_consumer_counts(&self, id: ConsumerId, counts: ConsumerCounts) {
         if let Some(entry) = self.state.lock().consumers.get_mut(id.0) {
-            entry.at_consumer += count;
+            entry.at_consumer = counts;
         }
     }
 
@@ -294,7 +312,10 @@ impl Board {
         } = &mut *state;
         let mut rows = Vec::new();
         for entry in consumers.iter_mut() {
-            let period = entry.stats.take_recent(now);
+            let mut period = entry.stats.take_recent(now);
+            let duplicated = entry.at_consumer.duplicated;
+            period.counters.duplicated += duplicated - entry.duplicated_before.min(duplicated);
+            entry.duplicated_before = duplicated;
             let total = entry.dropped();
             let before = std::mem::replace(&mut entry.dropped_before, total.clone());
             if let Some(publisher) = publishers.get(entry.publisher).filter(|_| entry.active) {

@@ -9,6 +9,7 @@ fn topic(name: &str, large: bool) -> PlayedTopic {
     PlayedTopic {
         name: name.parse().unwrap(),
         service: if large { "camera-driver" } else { "imu-driver" },
+        type_name: String::new(),
         encoding: String::new(),
         rate_hz: 50.0,
         max_bytes: 100,
@@ -68,7 +69,18 @@ fn rows_show_the_last_second_and_the_whole() {
     }
     let rows = board.recent(at(2_000));
     assert_eq!((rows[0].received, rows[0].sent), (50, Some(50)));
+    let counts = ConsumerCounts {
+        queue_full: 0,
+        lifespan: 3,
+        duplicated: 2,
+    };
+    board.set_consumer_counts(recorder, counts);
+    let recent = &board.recent(at(3_000))[0];
+    assert_eq!((recent.duplicated, recent.dropped["lifespan"]), (2, 3));
+    assert_eq!(board.recent(at(4_000))[0].duplicated, 0);
     let total = board.total(at(2_000));
+    assert_eq!(total[0].duplicated, 2);
+    assert_eq!(total[0].dropped, BTreeMap::from([("lifespan".to_owned(), 3)]));
     assert_eq!((total[0].received, total[0].sent, total[0].lost), (100, Some(100), 0));
     assert!((total[0].latency_ms.p99.unwrap() - 2.0).abs() < 0.1);
     assert_eq!(board.first_message_s(), BTreeMap::from([("cloud", 0.001)]));

@@ -160,7 +160,7 @@ mod tests {
         }
     }
 
-    fn bridge(from: &str, to: &str, layer: Option<&str>, dropped: Value) -> Value {
+    fn bridge(from: &str, to: &str, layer: Option<&str>, dropped: &Value) -> Value {
         let end = |label: &str| {
             let (scope, broker) = label.split_once(':').unwrap();
             json!({"scope": scope, "broker": broker})
@@ -174,19 +174,19 @@ mod tests {
         view(&[
             (
                 DemoNode::Robot1,
-                bridge("node:memory", "layer:memory", Some("edge"), json!({})),
+                bridge("node:memory", "layer:memory", Some("edge"), &json!({})),
             ),
             (
                 DemoNode::Robot1,
-                bridge("node:memory", "inter:dds", Some("fog"), json!({"rate_limit": 3})),
+                bridge("node:memory", "inter:dds", Some("fog"), &json!({"rate_limit": 3})),
             ),
             (
                 DemoNode::Robot1,
-                bridge("node:memory", "inter:dds", Some("cloud"), json!({"rate_limit": 7})),
+                bridge("node:memory", "inter:dds", Some("cloud"), &json!({"rate_limit": 7})),
             ),
             (
                 DemoNode::Edge2,
-                bridge("layer:memory", "node:memory", Some("edge"), json!({"echo": 1})),
+                bridge("layer:memory", "node:memory", Some("edge"), &json!({"echo": 1})),
             ),
             (
                 DemoNode::Cloud1,
@@ -194,7 +194,7 @@ mod tests {
                     "inter:dds",
                     "layer:memory",
                     Some("cloud"),
-                    json!({"rate_limit": 1, "lifespan": 2}),
+                    &json!({"rate_limit": 1, "lifespan": 2}),
                 ),
             ),
         ])
@@ -230,7 +230,7 @@ mod tests {
     fn the_part_of_this_process_is_shown_alone() {
         let here = view(&[(
             DemoNode::Cloud1,
-            bridge("inter:dds", "layer:memory", Some("cloud"), json!({})),
+            bridge("inter:dds", "layer:memory", Some("cloud"), &json!({})),
         )]);
         let path = here
             .path(

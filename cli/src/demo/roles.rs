@@ -6,7 +6,9 @@
 //! cloud cloud-1: recorder, analytics (from half time)
 //! ```
 
-use blaze_domain::{Durability, Reliability, TopicName};
+use std::time::Duration;
+
+use blaze_domain::{Reliability, TopicName};
 
 use super::flows::Spot;
 use super::options::DemoNode;
@@ -14,8 +16,8 @@ use super::recording::{RecordedTopic, Recording};
 
 /// From this size on a topic is large: best effort, with a lifespan (as `flow.bandwidth.large_bytes`).
 pub const LARGE_BYTES: usize = 65_536;
-/// Lifespan of a picture in milliseconds.
-pub const PICTURE_LIFESPAN_MS: u32 = 500;
+/// How long a picture is of use.
+pub const PICTURE_LIFESPAN: Duration = Duration::from_millis(500);
 /// The service that moves at half time.
 pub const MOVING_SERVICE: &str = "analytics";
 /// Where it starts.
@@ -32,6 +34,8 @@ pub struct PlayedTopic {
     pub name: TopicName,
     /// Who publishes it.
     pub service: &'static str,
+    /// ROS type, or empty.
+    pub type_name: String,
     /// Media type of the payload.
     pub encoding: String,
     /// Messages a second.
@@ -54,6 +58,7 @@ impl PlayedTopic {
         Self {
             name: topic.name.clone(),
             service,
+            type_name: topic.type_name.clone(),
             encoding: topic.encoding.clone(),
             rate_hz: topic.rate_hz,
             max_bytes: topic.max_bytes,
@@ -71,16 +76,10 @@ impl PlayedTopic {
         }
     }
 
-    /// Nothing is kept for late joiners.
+    /// How long a message is of use; zero = for ever.
     #[must_use]
-    pub fn durability(&self) -> Durability {
-        Durability::Volatile
-    }
-
-    /// Milliseconds after which a message is of no use; 0 = none.
-    #[must_use]
-    pub fn lifespan_ms(&self) -> u32 {
-        if self.large { PICTURE_LIFESPAN_MS } else { 0 }
+    pub fn lifespan(&self) -> Duration {
+        if self.large { PICTURE_LIFESPAN } else { Duration::ZERO }
     }
 }
 

@@ -44,6 +44,9 @@ pub trait Stage {
     /// [`played_topics`](super::roles::played_topics). `None`: the publishers are in another process.
     fn publisher(&self) -> Option<Box<dyn FnMut(usize, bytes::Bytes) + Send>>;
 
+    /// Brings to the board what listeners dropped; called each second and at the end.
+    fn look(&self) -> impl Future<Output = ()>;
+
     /// Completes when the user wants an end, or a flow ended by itself (then with a sentence).
     fn interrupted(&self) -> impl Future<Output = Option<String>>;
 }
@@ -94,7 +97,7 @@ pub async fn run<S: Stage, Out: Write, Err: Write>(
         report.event(played, &pace_text(&pace))?;
     }
     session.drain().await;
-    board.set_view(&FlowView::ask(&stage.admin_ports()).await);
+    session.look().await;
     let interrupted = interruption.is_some();
     session.faults.extend(interruption.flatten());
     let summary = judge(Outcome {
@@ -215,9 +218,15 @@ impl<S: Stage> Session<'_, S> {
     }
 
     async fn tick<Out: Write, Err: Write>(&self, report: &mut Report<Out, Err>) -> Result<(), CliError> {
-        self.board.set_view(&FlowView::ask(&self.stage.admin_ports()).await);
+        self.look().await;
         let now = Instant::now();
         report.rows(now - self.start, &self.board.recent(now))
+    }
+
+    /// Brings routes and drops to the board.
+    async fn look(&self) {
+        self.stage.look().await;
+        self.board.set_view(&FlowView::ask(&self.stage.admin_ports()).await);
     }
 
     fn is_joining(&self) -> bool {

@@ -48,7 +48,7 @@ impl Stage for Wire {
             let sequence = sequences.entry(topic).or_default();
             *sequence += 1;
             published += 1;
-            if topic == 0 && *sequence % lose_every == 0 {
+            if topic == 0 && sequence.is_multiple_of(lose_every) {
                 return;
             }
             let arrival = Arrival {
@@ -63,6 +63,8 @@ impl Stage for Wire {
             }
         }))
     }
+
+    async fn look(&self) {}
 
     async fn interrupted(&self) -> Option<String> {
         std::future::pending().await
