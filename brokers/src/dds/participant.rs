@@ -13,6 +13,7 @@ use rustdds::{
     RTPSEntity, StatusEvented, Subscriber, Topic, TopicKind, no_key,
 };
 
+use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
 use super::watch::{ReaderWatch, RemoteReader};
@@ -248,10 +249,8 @@ impl Participant {
         if self.failed.load(Ordering::Relaxed) {
             return false;
         }
-        // The event loop owns the sockets: when it has unwound, the port is free.
-        let held = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, self.port)).is_err();
         let commands = catch_unwind(AssertUnwindSafe(|| self.dds.assert_liveliness().is_ok())).unwrap_or(false);
-        held && commands
+        !port_is_free(self.port) && commands
     }
 
     /// Ends or blocks the event loop of RustDDS, which then panics or hangs, for tests of those who must notice.

@@ -78,6 +78,8 @@ pub struct DdsConfig {
 pub struct DdsStatus {
     /// Whether a participant runs.
     pub ready: bool,
+    /// Whether a standstill of RustDDS would be noticed; so within a second after the start.
+    pub watched: bool,
     /// For people: what is wrong or unusual; empty when nothing is.
     pub detail: String,
     /// How often RustDDS died and was built anew.

@@ -215,8 +215,10 @@ fn survives(fault: Fault) {
     robot.wait_discovered(&fog.endpoint, DISCOVERY);
     fog.wait_discovered(&robot.endpoint, DISCOVERY);
     robot.reach(&fog, &fog.endpoint);
-    // The probe must have answered once before its silence says anything.
-    std::thread::sleep(Duration::from_millis(800));
+    // Silence says something only after a first answer.
+    wait_for("a first beat", Duration::from_secs(3), || {
+        robot.transport.status().watched.then_some(())
+    });
     *robot.transport.shared.fault.lock() = Some(fault);
     let begin = Instant::now();
     let epoch = wait_for("rebuild", Duration::from_secs(4), || {
