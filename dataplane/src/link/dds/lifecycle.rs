@@ -118,8 +118,11 @@ impl Lifecycle {
         let discarded = std::mem::take(&mut *self.shared.discarded.lock());
         let remains = (writers, discarded, self.generation.take());
         let (done, receiver) = sync_channel(1);
+        let shared = Arc::clone(&self.shared);
+        shared.remains.fetch_add(1, Ordering::Relaxed);
         let thread = thread::Builder::new().name("dds-remains".into()).spawn(move || {
             let _ = catch_unwind(AssertUnwindSafe(|| drop(remains)));
+            shared.remains.fetch_sub(1, Ordering::Relaxed);
             let _ = done.send(());
         });
         match thread {
