@@ -316,11 +316,11 @@ fn parse_topic(topic: &str) -> Option<(Endpoint, Priority)> {
 /// RustDDS keeps that many samples whether they wait or not.
 fn profile(class: Priority, datagram_bytes: usize) -> Profile {
     let bytes = match class {
-        Priority::Control => 1 << 20,
-        Priority::State => 2 << 20,
-        Priority::Bulk => 4 << 20,
+        Priority::Control => 256 << 10,
+        Priority::State => 1 << 20,
+        Priority::Bulk => 2 << 20,
     };
-    let samples = (bytes / datagram_bytes.max(1)).clamp(64, 8192);
+    let samples = (bytes / datagram_bytes.max(1)).clamp(128, 8192);
     Profile::best_effort(u16::try_from(samples).unwrap_or(u16::MAX))
 }
 

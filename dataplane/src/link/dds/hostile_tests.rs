@@ -124,7 +124,9 @@ fn mutate(random: &mut Random, captured: &[Vec<u8>]) -> Vec<u8> {
             let at = 20 + random.below(datagram.len().saturating_sub(24));
             let extreme = [0, 0xff, 0x7f, 0x80][random.below(4)];
             let end = (at + 1 + random.below(8)).min(datagram.len());
-            datagram.get_mut(at..end).map(|bytes| bytes.fill(extreme));
+            if let Some(bytes) = datagram.get_mut(at..end) {
+                bytes.fill(extreme);
+            }
         }
         4 => {
             let other = &captured[random.below(captured.len())];
