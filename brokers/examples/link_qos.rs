@@ -178,7 +178,7 @@ fn subscribe(arguments: &Arguments, participant: &Participant) -> Result<(), Box
         let field = |at: usize| header[at..at + 8].try_into().map_or(0, u64::from_le_bytes);
         let mut tally = shared.lock();
         tally.received += 1;
-        tally.disordered += u64::from(field(0) + 1 <= tally.highest);
+        tally.disordered += u64::from(field(0) < tally.highest);
         tally.highest = tally.highest.max(field(0) + 1);
         tally
             .latencies_us
