@@ -14,6 +14,7 @@
 #[cfg(feature = "fault-injection")]
 mod fault;
 mod participant;
+mod pulse;
 mod reader;
 mod relay;
 mod sample;
@@ -24,6 +25,7 @@ use std::net::IpAddr;
 #[cfg(feature = "fault-injection")]
 pub use fault::Fault;
 pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile, Writer};
+pub use pulse::{Illness, Pulse};
 pub use reader::{Reader, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
 pub use watch::{ReaderWatch, RemoteReader};

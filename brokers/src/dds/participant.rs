@@ -13,6 +13,7 @@ use rustdds::{
     RTPSEntity, StatusEvented, Subscriber, Topic, TopicKind, no_key,
 };
 
+use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
 use super::watch::{ReaderWatch, RemoteReader};
@@ -210,6 +211,7 @@ impl Participant {
         Ok(Writer {
             writer,
             matched: AtomicBool::new(false),
+            keeps: profile.transient_local,
             failed: Arc::clone(&self.failed),
         })
     }
@@ -248,10 +250,8 @@ impl Participant {
         if self.failed.load(Ordering::Relaxed) {
             return false;
         }
-        // The event loop owns the sockets: when it has unwound, the port is free.
-        let held = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, self.port)).is_err();
         let commands = catch_unwind(AssertUnwindSafe(|| self.dds.assert_liveliness().is_ok())).unwrap_or(false);
-        held && commands
+        !port_is_free(self.port) && commands
     }
 
     /// Ends or blocks the event loop of RustDDS, which then panics or hangs, for tests of those who must notice.
@@ -314,15 +314,19 @@ pub(super) fn prefix_of(guid: rustdds::GUID) -> GuidPrefix {
 pub struct Writer {
     writer: no_key::DataWriter<Octets, OctetsAdapter>,
     matched: AtomicBool,
+    /// Late joiners get what was written before they came, so it is written without a reader, too.
+    keeps: bool,
     failed: Arc<AtomicBool>,
 }
 
 impl Writer {
-    /// Hands a sample to RustDDS. Returns whether it was taken and has at least one reader; best effort takes always
-    /// and lets the oldest that still wait give way.
+    /// Hands a sample to RustDDS. Returns whether it was taken: not without a reader, unless it is kept for late joiners,
+    /// and not into the full window of a reliable writer. Best effort lets the oldest that still wait give way.
     pub fn write(&self, octets: Bytes) -> bool {
-        self.contain(|| (self.is_matched_now() && self.writer.write(Octets(octets), None).is_ok()).then_some(()))
-            .is_some()
+        self.contain(|| {
+            ((self.is_matched_now() || self.keeps) && self.writer.write(Octets(octets), None).is_ok()).then_some(())
+        })
+        .is_some()
     }
 
     /// Whether a reader is there.

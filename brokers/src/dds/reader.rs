@@ -94,10 +94,11 @@ pub(super) fn unpark_waker() -> Waker {
     Waker::from(Arc::new(Unpark(thread::current())))
 }
 
-/// A named thread that is asked to stop and joined on drop. A panic in it sets `failed`.
+/// A named thread that is asked to stop and waited for on drop. A panic in it sets `failed`.
 pub(super) struct StoppableThread {
     stop: Arc<AtomicBool>,
     handle: Option<JoinHandle<()>>,
+    waited: bool,
 }
 
 impl StoppableThread {
@@ -119,7 +120,14 @@ impl StoppableThread {
         Ok(Self {
             stop,
             handle: Some(handle),
+            waited: true,
         })
+    }
+
+    /// Is not waited for on drop: it may be in a long call of the system.
+    pub(super) fn unwaited(mut self) -> Self {
+        self.waited = false;
+        self
     }
 
     pub(super) fn is_running(&self) -> bool {
@@ -133,7 +141,7 @@ impl Drop for StoppableThread {
         if let Some(handle) = self.handle.take() {
             handle.thread().unpark();
             // A sink may own the reader that calls it.
-            if handle.thread().id() != thread::current().id() {
+            if self.waited && handle.thread().id() != thread::current().id() {
                 // The body caught its own panic.
                 let _ = handle.join();
             }

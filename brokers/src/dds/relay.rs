@@ -104,12 +104,13 @@ impl Relay {
         })?);
         if !names.is_empty() {
             let (shared, settings) = (Arc::clone(&state), Arc::clone(&config));
-            threads.push(StoppableThread::start("dds-resolve", failed, move |stop| {
+            let resolver = StoppableThread::start("dds-resolve", failed, move |stop| {
                 while !stop.load(Ordering::Relaxed) {
-                    resolve(&settings, &shared, &names);
-                    thread::park_timeout(RESOLVE);
+                    let all = resolve(&settings, &shared, &names);
+                    thread::park_timeout(if all { RESOLVE } else { RETRY });
                 }
-            })?);
+            })?;
+            threads.push(resolver.unwaited());
         }
         Ok(Self {
             state,
@@ -187,7 +188,8 @@ fn note_addresses(config: &RelayConfig, state: &Mutex<State>) -> Vec<String> {
     names
 }
 
-fn resolve(config: &RelayConfig, state: &Mutex<State>, names: &[String]) {
+/// Adds the addresses of names; returns whether all have some.
+fn resolve(config: &RelayConfig, state: &Mutex<State>, names: &[String]) -> bool {
     let mut unresolved = Vec::new();
     for name in names {
         match (name.as_str(), 0).to_socket_addrs() {
@@ -205,7 +207,9 @@ fn resolve(config: &RelayConfig, state: &Mutex<State>, names: &[String]) {
             Err(_) => unresolved.push(name.clone()),
         }
     }
+    let all = unresolved.is_empty();
     state.lock().status.unresolved = unresolved;
+    all
 }
 
 /// The sockets of a relay, as far as the system gave them.

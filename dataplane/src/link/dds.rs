@@ -16,7 +16,7 @@ mod wire;
 use std::collections::{BTreeMap, HashMap};
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::thread::JoinHandle;
 use std::time::Instant;
 
@@ -74,10 +74,14 @@ pub struct DdsConfig {
 pub struct DdsStatus {
     /// Whether a participant runs.
     pub ready: bool,
+    /// Whether a standstill of RustDDS would be noticed; so within a second after the start.
+    pub watched: bool,
     /// For people: what is wrong or unusual; empty when nothing is.
     pub detail: String,
     /// How often RustDDS died and was built anew.
     pub rebuilds: u64,
+    /// Dead participants whose threads have not ended: they hang, and may hold or take memory until the process ends.
+    pub remains: usize,
     /// Datagrams that were not handed to the network: no writer, no reader there yet, or too large.
     pub not_sent: u64,
     /// Datagrams of readers that were not a sequence of octets.
@@ -107,6 +111,7 @@ struct Shared {
     homes: Mutex<HashMap<GuidPrefix, Vec<Ipv4Addr>>>,
     status: Mutex<DdsStatus>,
     not_sent: AtomicU64,
+    remains: AtomicUsize,
     stop: AtomicBool,
     #[cfg(test)]
     fault: Mutex<Option<blaze_brokers::dds::Fault>>,
@@ -148,6 +153,7 @@ impl DdsTransport {
             homes: Mutex::default(),
             status: Mutex::default(),
             not_sent: AtomicU64::new(0),
+            remains: AtomicUsize::new(0),
             stop: AtomicBool::new(false),
             #[cfg(test)]
             fault: Mutex::default(),
@@ -166,6 +172,7 @@ impl DdsTransport {
         let relay = self.shared.relay.status();
         let mut status = self.shared.status.lock().clone();
         status.not_sent = self.shared.not_sent.load(Ordering::Relaxed);
+        status.remains = self.shared.remains.load(Ordering::Relaxed);
         status.addresses = relay.addresses;
         let mut details = Vec::new();
         if !status.detail.is_empty() {
@@ -305,13 +312,15 @@ fn parse_topic(topic: &str) -> Option<(Endpoint, Priority)> {
 /// RustDDS keeps that many samples whether they wait or not.
 fn profile(class: Priority, datagram_bytes: usize) -> Profile {
     let bytes = match class {
-        Priority::Control => 1 << 20,
-        Priority::State => 2 << 20,
-        Priority::Bulk => 4 << 20,
+        Priority::Control => 256 << 10,
+        Priority::State => 1 << 20,
+        Priority::Bulk => 2 << 20,
     };
-    let samples = (bytes / datagram_bytes.max(1)).clamp(64, 8192);
+    let samples = (bytes / datagram_bytes.max(1)).clamp(128, 8192);
     Profile::best_effort(u16::try_from(samples).unwrap_or(u16::MAX))
 }
 
+#[cfg(test)]
+mod hostile_tests;
 #[cfg(test)]
 mod tests;

@@ -4,27 +4,23 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use std::net::{IpAddr, Ipv4Addr};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
-    DdsError, GuidPrefix, Participant, ParticipantConfig, Profile, Reader, ReaderWatch, RemoteReader, Writer,
+    DdsError, GuidPrefix, Illness, Participant, ParticipantConfig, Pulse, Reader, ReaderWatch, RemoteReader,
 };
 use blaze_domain::Priority;
-use bytes::Bytes;
 
 use super::{CLASSES, MAX_HEARD, Shared, TOPIC_PREFIX, index, parse_topic, profile, topic};
 use crate::link::transport::{Endpoint, TransportEvent};
 
 const TICK: Duration = Duration::from_millis(200);
-const PROBE: Duration = Duration::from_millis(400);
-/// A participant that did not answer itself for this long hangs.
-const HANG: Duration = Duration::from_millis(1500);
-/// A pause of this thread after which silence says nothing, because all threads may have paused.
-const STALL: Duration = Duration::from_millis(600);
 /// Hello comes every 500 ms.
 const LIVE: Duration = Duration::from_millis(1200);
+const GOOD_BYE: Duration = Duration::from_secs(1);
 const RETRY: Duration = Duration::from_secs(1);
 
 pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
@@ -41,20 +37,8 @@ pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
 struct Generation {
     _watch: ReaderWatch,
     readers: Vec<Reader>,
-    probe: Probe,
+    pulse: Pulse,
     participant: Participant,
-}
-
-/// Writes to a reader of its own participant.
-struct Probe {
-    writer: Writer,
-    _reader: Reader,
-    answered: Arc<AtomicU64>,
-    sent: u64,
-    last_sent: Instant,
-    /// When the last answer was seen; `None` before the first.
-    last_answer: Option<Instant>,
-    seen: u64,
 }
 
 struct Lifecycle {
@@ -62,7 +46,6 @@ struct Lifecycle {
     local: Endpoint,
     generation: Option<Generation>,
     next_attempt: Instant,
-    last_tick: Instant,
     /// Whether a participant ran before, so that the next one is a new life.
     had_life: bool,
 }
@@ -75,7 +58,6 @@ impl Lifecycle {
             shared,
             generation: None,
             next_attempt: now,
-            last_tick: now,
             had_life: false,
         }
     }
@@ -88,17 +70,16 @@ impl Lifecycle {
             }
             thread::park_timeout(TICK);
         }
-        self.shared.writers.write().clear();
-        self.shared.discarded.lock().clear();
-        drop(self.generation.take());
+        // Others are told of the end, unless RustDDS hangs.
+        if let Some(done) = self.lay_aside() {
+            let _ = done.recv_timeout(GOOD_BYE);
+        }
     }
 
     fn tick(&mut self) {
         let now = Instant::now();
-        let stalled = now.duration_since(self.last_tick) > STALL;
-        self.last_tick = now;
-        if let Some(reason) = self.generation.as_mut().and_then(|it| it.illness(now, stalled)) {
-            self.bury(reason);
+        if let Some(illness) = self.generation.as_mut().and_then(Generation::illness) {
+            self.bury(&illness.to_string());
         }
         if self.generation.is_none() && now >= self.next_attempt {
             self.give_birth(now);
@@ -114,27 +95,43 @@ impl Lifecycle {
         }
     }
 
-    /// Puts a dead participant aside. Its end may hang, so it is left to a thread of its own.
-    fn bury(&mut self, reason: &'static str) {
+    /// Puts a dead participant aside.
+    fn bury(&mut self, reason: &str) {
         tracing::error!(flow = %self.local, reason, "DDS participant died, building a new one");
-        let writers: Vec<_> = self.shared.writers.write().drain().collect();
-        let discarded = std::mem::take(&mut *self.shared.discarded.lock());
+        self.lay_aside();
         self.shared.homes.lock().clear();
         self.shared.heard.lock().clear();
         {
             let mut status = self.shared.status.lock();
             status.ready = false;
+            status.watched = false;
             status.endpoints = 0;
             reason.clone_into(&mut status.detail);
         }
-        let remains = (writers, discarded, self.generation.take());
-        let buried = thread::Builder::new().name("dds-remains".into()).spawn(move || {
-            let _ = catch_unwind(AssertUnwindSafe(|| drop(remains)));
-        });
-        if let Err(error) = buried {
-            tracing::error!(%error, "no thread for the end of a DDS participant");
-        }
         self.next_attempt = Instant::now();
+    }
+
+    /// Drops the participant and all that belongs to it. Its end may hang, so it is left to a thread of its own, which
+    /// tells when it is over.
+    fn lay_aside(&mut self) -> Option<Receiver<()>> {
+        let writers: Vec<_> = self.shared.writers.write().drain().collect();
+        let discarded = std::mem::take(&mut *self.shared.discarded.lock());
+        let remains = (writers, discarded, self.generation.take());
+        let (done, receiver) = sync_channel(1);
+        let shared = Arc::clone(&self.shared);
+        shared.remains.fetch_add(1, Ordering::Relaxed);
+        let thread = thread::Builder::new().name("dds-remains".into()).spawn(move || {
+            let _ = catch_unwind(AssertUnwindSafe(|| drop(remains)));
+            shared.remains.fetch_sub(1, Ordering::Relaxed);
+            let _ = done.send(());
+        });
+        match thread {
+            Ok(_) => Some(receiver),
+            Err(error) => {
+                tracing::error!(%error, "no thread for the end of a DDS participant");
+                None
+            }
+        }
     }
 
     fn give_birth(&mut self, now: Instant) {
@@ -218,7 +215,9 @@ impl Lifecycle {
         drop((homes, heard));
         self.shared.relay.set_live(live);
         if let Some(generation) = &self.generation {
-            self.shared.status.lock().malformed = generation.readers.iter().map(Reader::malformed).sum();
+            let mut status = self.shared.status.lock();
+            status.malformed = generation.readers.iter().map(Reader::malformed).sum();
+            status.watched = generation.pulse.is_felt();
         }
     }
 }
@@ -226,7 +225,7 @@ impl Lifecycle {
 impl Generation {
     fn start(shared: &Arc<Shared>, local: &Endpoint) -> Result<Self, DdsError> {
         let participant = Participant::start(ParticipantConfig::new(shared.config.domain, shared.address))?;
-        let probe = Probe::start(&participant)?;
+        let pulse = Pulse::start(&participant)?;
         let readers = Priority::ALL
             .iter()
             .map(|class| link_reader(&participant, shared, local, *class))
@@ -240,59 +239,17 @@ impl Generation {
         Ok(Self {
             _watch: watch,
             readers,
-            probe,
+            pulse,
             participant,
         })
     }
 
     /// Why it must be replaced, if so.
-    fn illness(&mut self, now: Instant, stalled: bool) -> Option<&'static str> {
+    fn illness(&mut self) -> Option<Illness> {
         if self.readers.iter().any(|reader| !reader.is_running()) {
-            return Some("a reader's thread ended");
+            return Some(Illness::ThreadEnded);
         }
-        if !self.participant.is_alive() {
-            return Some("a thread of RustDDS ended");
-        }
-        self.probe
-            .hangs(now, stalled)
-            .then_some("the event loop of RustDDS hangs")
-    }
-}
-
-impl Probe {
-    fn start(participant: &Participant) -> Result<Self, DdsError> {
-        let name = format!("blaze/probe/{}", participant.prefix());
-        let answered = Arc::<AtomicU64>::default();
-        let seen = Arc::clone(&answered);
-        let reader = participant.reader(
-            &name,
-            Profile::best_effort(16),
-            Box::new(move |_, _| {
-                seen.fetch_add(1, Ordering::Relaxed);
-            }),
-        )?;
-        Ok(Self {
-            writer: participant.writer(&name, Profile::best_effort(16))?,
-            _reader: reader,
-            answered,
-            sent: 0,
-            last_sent: Instant::now(),
-            last_answer: None,
-            seen: 0,
-        })
-    }
-
-    fn hangs(&mut self, now: Instant, stalled: bool) -> bool {
-        let answered = self.answered.load(Ordering::Relaxed);
-        if answered != self.seen || (stalled && self.last_answer.is_some()) {
-            self.seen = answered;
-            self.last_answer = Some(now);
-        }
-        if now.duration_since(self.last_sent) >= PROBE || self.sent == 0 {
-            self.last_sent = now;
-            self.sent += u64::from(self.writer.write(Bytes::from_static(b"?")));
-        }
-        self.last_answer.is_some_and(|at| now.duration_since(at) > HANG)
+        self.pulse.feel(&self.participant).err()
     }
 }
 

@@ -5,20 +5,20 @@ use super::*;
 use blaze_brokers::dds::Fault;
 
 /// A transport and all that it told.
-struct Flow {
-    transport: DdsTransport,
-    events: Arc<Mutex<Vec<TransportEvent>>>,
-    endpoint: Endpoint,
+pub(super) struct Flow {
+    pub(super) transport: DdsTransport,
+    pub(super) events: Arc<Mutex<Vec<TransportEvent>>>,
+    pub(super) endpoint: Endpoint,
 }
 
-fn endpoint(name: &str, epoch: u64) -> Endpoint {
+pub(super) fn endpoint(name: &str, epoch: u64) -> Endpoint {
     Endpoint {
         flow: name.parse().unwrap(),
         epoch,
     }
 }
 
-fn start(domain: u16, name: &str, epoch: u64) -> Flow {
+pub(super) fn start(domain: u16, name: &str, epoch: u64) -> Flow {
     let events = Arc::<Mutex<Vec<TransportEvent>>>::default();
     let log = Arc::clone(&events);
     let lives = Arc::new(AtomicU64::new(epoch));
@@ -42,7 +42,7 @@ fn start(domain: u16, name: &str, epoch: u64) -> Flow {
 }
 
 /// A domain whose ports nobody holds; tests run side by side.
-fn free_domain() -> u16 {
+pub(super) fn free_domain() -> u16 {
     loop {
         let domain = rand::random_range(0..=100);
         let base = 7400 + 250 * domain;
@@ -53,7 +53,7 @@ fn free_domain() -> u16 {
     }
 }
 
-fn wait_for<T>(what: &str, limit: Duration, mut look: impl FnMut() -> Option<T>) -> T {
+pub(super) fn wait_for<T>(what: &str, limit: Duration, mut look: impl FnMut() -> Option<T>) -> T {
     let begin = Instant::now();
     loop {
         if let Some(found) = look() {
@@ -65,7 +65,7 @@ fn wait_for<T>(what: &str, limit: Duration, mut look: impl FnMut() -> Option<T>)
 }
 
 impl Flow {
-    fn wait_discovered(&self, other: &Endpoint, limit: Duration) {
+    pub(super) fn wait_discovered(&self, other: &Endpoint, limit: Duration) {
         wait_for(&format!("discovery of {other}"), limit, || {
             let events = self.events.lock();
             events
@@ -85,7 +85,7 @@ impl Flow {
     }
 
     /// Connects, and waits until datagrams arrive there.
-    fn reach(&self, other: &Flow, to: &Endpoint) {
+    pub(super) fn reach(&self, other: &Flow, to: &Endpoint) {
         self.transport.connect(to);
         for class in Priority::ALL {
             wait_for("first datagram", Duration::from_secs(5), || {
@@ -100,7 +100,7 @@ impl Flow {
     }
 }
 
-const DISCOVERY: Duration = Duration::from_secs(2);
+pub(super) const DISCOVERY: Duration = Duration::from_secs(2);
 
 #[test]
 fn topics_name_endpoint_and_class() {
@@ -215,8 +215,10 @@ fn survives(fault: Fault) {
     robot.wait_discovered(&fog.endpoint, DISCOVERY);
     fog.wait_discovered(&robot.endpoint, DISCOVERY);
     robot.reach(&fog, &fog.endpoint);
-    // The probe must have answered once before its silence says anything.
-    std::thread::sleep(Duration::from_millis(800));
+    // Silence says something only after a first answer.
+    wait_for("a first beat", Duration::from_secs(3), || {
+        robot.transport.status().watched.then_some(())
+    });
     *robot.transport.shared.fault.lock() = Some(fault);
     let begin = Instant::now();
     let epoch = wait_for("rebuild", Duration::from_secs(4), || {

@@ -26,7 +26,7 @@ const SMALLEST_MTU: usize = 576;
 const LOOPBACK_MTU: usize = 65_536;
 /// Datagrams between flows of one host: one packet of the loopback interface, and several fit in a default socket
 /// buffer (208 KiB).
-const LOOPBACK_DATAGRAM: usize = 16 * 1024;
+const LOOPBACK_DATAGRAM: usize = 32 * 1024;
 /// `whole`: RustDDS cuts it into fragments of 256 bytes, five to a packet.
 const WHOLE_DATAGRAM: usize = 60 * 1024;
 
