@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use super::Fixture;
 use super::tools::{
-    DEADLINE, Outcome, Reader, channel, connected, describe, eventually, frame, numbered, open_publisher, publish,
-    tracked, wait_for_health, within, writer,
+    DEADLINE, Outcome, Reader, channel, connected, describe, eventually_within, frame, numbered, open_publisher,
+    publish, tracked, wait_for_health, within, writer,
 };
 use crate::port::{Content, Health, PublishOutcome};
 
@@ -145,9 +145,11 @@ pub async fn publishing_never_waits(fixture: &dyn Fixture) -> Outcome {
     }
     // One message may be in the adapter's hands beside the queue.
     let most = capabilities.queue_bytes + SIZE;
-    eventually(&format!("at most {most} bytes wait for the server"), || {
-        alive.load(Ordering::SeqCst) <= most
-    })
+    eventually_within(
+        Duration::from_secs(2),
+        &format!("at most {most} bytes wait for the server"),
+        || alive.load(Ordering::SeqCst) <= most,
+    )
     .await?;
     fixture.start_server().await?;
     wait_for_health(client.as_ref(), Health::Up).await

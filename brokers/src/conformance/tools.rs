@@ -80,11 +80,16 @@ pub(super) fn pattern(length: usize, seed: u32) -> Bytes {
 }
 
 /// Waits until a condition holds.
-pub(super) async fn eventually(what: &str, mut holds: impl FnMut() -> bool) -> Outcome {
-    let until = Instant::now() + DEADLINE;
+pub(super) async fn eventually(what: &str, holds: impl FnMut() -> bool) -> Outcome {
+    eventually_within(DEADLINE, what, holds).await
+}
+
+/// As [`eventually`], within a time.
+pub(super) async fn eventually_within(time: Duration, what: &str, mut holds: impl FnMut() -> bool) -> Outcome {
+    let until = Instant::now() + time;
     while !holds() {
         if Instant::now() > until {
-            return Err(format!("{what}: not within {} s", DEADLINE.as_secs()));
+            return Err(format!("{what}: not within {} s", time.as_secs()));
         }
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
