@@ -11,6 +11,7 @@
 //! Nothing here blocks a caller on the network, and a panic inside RustDDS never leaves this module: it marks the
 //! participant as failed, and the owner builds a new one.
 
+mod announcement;
 #[cfg(feature = "fault-injection")]
 mod fault;
 mod participant;

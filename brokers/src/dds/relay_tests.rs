@@ -21,58 +21,6 @@ fn config(domain: u16, peers: &[&str]) -> RelayConfig {
     }
 }
 
-/// An SPDP message with one parameter.
-fn announcement(id: u16, value: &[u8]) -> Vec<u8> {
-    let mut payload = vec![0, 3, 0, 0];
-    for (id, value) in [(id, value), (PID_SENTINEL, &[][..])] {
-        payload.extend(id.to_le_bytes());
-        payload.extend(u16::try_from(value.len()).unwrap().to_le_bytes());
-        payload.extend(value);
-    }
-    let mut message = b"RTPS\x02\x04\x01\x12abcdefghijkl".to_vec();
-    message.extend([0x09, 0x01, 8, 0, 1, 2, 3, 4, 5, 6, 7, 8]);
-    message.extend([SUBMESSAGE_DATA, FLAG_LITTLE_ENDIAN | FLAG_DATA]);
-    message.extend(u16::try_from(20 + payload.len()).unwrap().to_le_bytes());
-    message.extend([0, 0, 16, 0, 0, 1, 0, 0xc7]);
-    message.extend(SPDP_WRITER);
-    message.extend([0; 8]);
-    message.extend(payload);
-    message
-}
-
-#[test]
-fn an_announcement_tells_its_participant_and_multicast() {
-    let prefix = GuidPrefix(*b"abcdefghijkl");
-    let mut locator = [0; 24];
-    locator[20..].copy_from_slice(&[239, 255, 0, 1]);
-    for (id, multicast) in [
-        (PID_METATRAFFIC_MULTICAST, true),
-        (PID_DEFAULT_MULTICAST, true),
-        (0x0031, false),
-    ] {
-        let message = announcement(id, &locator);
-        assert_eq!(Announcement::parse(&message), Some(Announcement { prefix, multicast }));
-    }
-    let mut good_bye = announcement(0x0031, &locator);
-    good_bye[33] &= !FLAG_DATA;
-    assert_eq!(Announcement::parse(&good_bye), None);
-}
-
-#[test]
-fn no_bytes_make_the_parser_panic() {
-    let whole = announcement(PID_DEFAULT_MULTICAST, &[0; 24]);
-    for length in 0..whole.len() {
-        let _ = Announcement::parse(&whole[..length]);
-    }
-    for at in 0..whole.len() {
-        for byte in [0, 1, 0x7f, 0x80, 0xff] {
-            let mut changed = whole.clone();
-            changed[at] = byte;
-            let _ = Announcement::parse(&changed);
-        }
-    }
-}
-
 #[test]
 fn addresses_are_bounded_and_those_of_this_host_are_passed_over() {
     let peers = ["10.1.1.1", "127.0.0.1", "0.0.0.0", "239.1.1.1", "::1", "10.1.1.2"];

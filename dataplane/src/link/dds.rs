@@ -188,6 +188,12 @@ impl DdsTransport {
         if !relay.unresolved.is_empty() {
             details.push(format!("peers without an address: {}", relay.unresolved.join(", ")));
         }
+        if status.remains > 0 {
+            details.push(format!(
+                "{} dead DDS participants hang: restart this process if they stay",
+                status.remains
+            ));
+        }
         status.detail = details.join("; ");
         status
     }

@@ -46,6 +46,8 @@ struct Lifecycle {
     local: Endpoint,
     generation: Option<Generation>,
     next_attempt: Instant,
+    /// When the last participant was built.
+    built: Instant,
     /// Whether a participant ran before, so that the next one is a new life.
     had_life: bool,
 }
@@ -58,6 +60,7 @@ impl Lifecycle {
             shared,
             generation: None,
             next_attempt: now,
+            built: now,
             had_life: false,
         }
     }
@@ -108,7 +111,8 @@ impl Lifecycle {
             status.endpoints = 0;
             reason.clone_into(&mut status.detail);
         }
-        self.next_attempt = Instant::now();
+        // One that dies at once is not built in a tight circle.
+        self.next_attempt = self.built + RETRY;
     }
 
     /// Drops the participant and all that belongs to it. Its end may hang, so it is left to a thread of its own, which
@@ -143,6 +147,7 @@ impl Lifecycle {
                 self.shared.relay.set_participant(generation.participant.prefix());
                 tracing::info!(flow = %self.local, participant = ?generation.participant, "DDS participant started");
                 self.generation = Some(generation);
+                self.built = now;
                 let mut status = self.shared.status.lock();
                 status.ready = true;
                 status.detail.clear();

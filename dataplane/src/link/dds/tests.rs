@@ -220,6 +220,9 @@ fn survives(fault: Fault) {
         robot.transport.status().watched.then_some(())
     });
     *robot.transport.shared.fault.lock() = Some(fault);
+    wait_for("injection", Duration::from_secs(2), || {
+        robot.transport.shared.fault.lock().is_none().then_some(())
+    });
     let begin = Instant::now();
     let epoch = wait_for("rebuild", Duration::from_secs(4), || {
         robot.events.lock().iter().find_map(|event| match event {
