@@ -355,14 +355,9 @@ impl Board {
                 .filter(|_| !entry.active)
                 .unwrap_or(end);
             let (count, seconds) = sent(publisher);
-            Some(row(
-                publisher,
-                count,
-                seconds,
-                Some(entry),
-                &entry.stats.total(until),
-                end,
-            ))
+            let mut period = entry.stats.total(until);
+            period.counters.duplicated += entry.at_consumer.duplicated;
+            Some(row(publisher, count, seconds, Some(entry), &period, end))
         });
         heard.chain(unheard(publishers, consumers, end, sent)).collect()
     }
