@@ -1,2 +1,164 @@
-//! BlazeFlow.
-fn main() {}
+//! The BlazeFlow process: parse, build, run.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use blaze_brokers::memory::MemoryHub;
+use blaze_domain::node_file::{LayerBroker as LayerSection, NodeBroker, NodeFile};
+use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
+use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
+use blaze_flow::world::LayerScopeId;
+use blaze_runtime::admin::{CheckStatus, Readiness};
+use blaze_runtime::config::{Current, Loaded, Schema, Sources, WatchSettings, load_typed, parse_override, watch};
+use blaze_runtime::logs::{LogFormat, LogHandle};
+use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
+use blaze_runtime::{logs, ready_line, state};
+use clap::Parser;
+
+/// A shutdown takes at most this long.
+const SHUTDOWN: Duration = Duration::from_secs(5);
+
+/// BlazeFlow: connects whoever publishes a topic with whoever asks for it, on any broker, on any layer.
+#[derive(Parser)]
+#[command(name = "blaze-flow", version)]
+struct Arguments {
+    /// The node file; else BLAZE_CONFIG, ./blaze.yaml, /etc/blaze/blaze.yaml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Only check the configuration: every fault on stderr, exit code 0 or 64.
+    #[arg(long)]
+    check: bool,
+    /// text or json; else as the node file says.
+    #[arg(long, value_name = "FORMAT", value_parser = ["text", "json"])]
+    log_format: Option<String>,
+    /// Overrides one key, as flow.bandwidth.limit_mbps=40; may be repeated.
+    #[arg(long, value_name = "KEY=VALUE", value_parser = parse_override)]
+    set: Vec<(String, String)>,
+}
+
+fn main() -> ExitCode {
+    let mut arguments = Arguments::parse();
+    let mut overrides = std::mem::take(&mut arguments.set);
+    if let Some(format) = &arguments.log_format {
+        overrides.push(("log.format".to_owned(), format.clone()));
+    }
+    let sources = Sources::of_process(arguments.config, overrides);
+    let loaded = match load_typed(&sources, &schema()) {
+        Ok(loaded) => loaded,
+        Err(faults) => {
+            faults.iter().for_each(|fault| eprintln!("{fault}"));
+            return ExitCode::from(exit_code::CONFIGURATION);
+        }
+    };
+    for warning in &loaded.warnings {
+        eprintln!("warning: {warning}");
+    }
+    if arguments.check {
+        return ExitCode::SUCCESS;
+    }
+    match block_on(run(sources.pinned(), loaded)) {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("blaze-flow failed: {error}");
+            ExitCode::from(exit_code::FAILED)
+        }
+    }
+}
+
+/// The node file as this program reads it.
+fn schema() -> Schema<NodeFile> {
+    let remark = |fault: blaze_domain::node_file::Fault| (fault.path, fault.detail);
+    Arc::new(move |value| match NodeFile::read(value) {
+        Ok((file, warnings)) => {
+            let faults = file.check_for_flow();
+            if faults.is_empty() {
+                Ok((file, warnings.into_iter().map(remark).collect()))
+            } else {
+                Err(faults.into_iter().map(remark).collect())
+            }
+        }
+        Err(faults) => Err(faults.into_iter().map(remark).collect()),
+    })
+}
+
+async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
+    let supervisor = Supervisor::new("blaze-flow");
+    let flow = match start(&supervisor, &loaded.value).await {
+        Ok(started) => started,
+        Err(error) => {
+            eprintln!("blaze-flow failed: {error:#}");
+            return ExitCode::from(exit_code::FAILED);
+        }
+    };
+    let (flow, log) = flow;
+    let flow = Arc::new(flow);
+    let reloads = watch(&supervisor, sources, schema(), loaded, WatchSettings::default());
+    supervisor.spawn("reload", TaskPolicy::Essential, follow(Arc::clone(&flow), reloads, log));
+    let announced = Arc::clone(&flow);
+    supervisor.spawn("ready line", TaskPolicy::MayEnd, async move {
+        announced.ready().await;
+        ready_line(&[("admin", announced.admin())])
+    });
+    let readiness: Readiness = flow.readiness().clone();
+    let steps = ShutdownSteps::new(SHUTDOWN)
+        .on(ShutdownPhase::NotReady, "readiness", async move { readiness.stop() })
+        .on(ShutdownPhase::Drain, "flow", async move { flow.drain().await });
+    supervisor.run(steps).await
+}
+
+async fn start(supervisor: &Supervisor, file: &NodeFile) -> anyhow::Result<(RunningFlow, LogHandle)> {
+    let format = if file.log.format.as_str() == "json" { LogFormat::Json } else { LogFormat::Text };
+    let log = logs::init(file.log.level.as_str(), format)?;
+    let directory = state::state_directory(file.state_dir.as_deref())?;
+    if let Some(refused) = &directory.instead_of {
+        tracing::warn!(directory = %directory.path.display(), instead_of = refused, "state is kept elsewhere");
+    }
+    let settings = FlowSettings::try_from(file)?;
+    let node = match &file.brokers.node {
+        None => None,
+        Some(NodeBroker::Memory) => Some(MemoryHub::new(settings.me.to_string())),
+        Some(NodeBroker::Redis(_)) => anyhow::bail!("brokers.node.redis: this version has no Redis adapter; use memory: {{}}"),
+    };
+    let layer = match &file.brokers.layer {
+        None => None,
+        Some(LayerSection::Memory) => Some(MemoryHub::new(settings.me.layer.to_string())),
+        Some(LayerSection::Dds(_) | LayerSection::Kafka(_)) => {
+            anyhow::bail!("brokers.layer: this version has only the memory adapter; use memory: {{}}")
+        }
+    };
+    let options = FlowOptions {
+        settings,
+        node: node.map(|hub| Arc::new(hub.broker()) as Arc<dyn blaze_brokers::Broker>),
+        // Only this process sees it, so nobody shares its identity.
+        layer: layer.map(|hub| LayerBroker { broker: Arc::new(hub.broker()), id: LayerScopeId::private() }),
+        state_dir: Some(directory.path),
+    };
+    Ok((blaze_flow::flow::start(options, supervisor.clone()).await?, log))
+}
+
+/// Takes over what may change while the process runs; a faulty file changes nothing and shows on `/readyz`.
+async fn follow(flow: Arc<RunningFlow>, mut reloads: tokio::sync::watch::Receiver<Current<NodeFile>>, log: LogHandle) {
+    while reloads.changed().await.is_ok() {
+        let current = reloads.borrow_and_update().clone();
+        match &current.faults {
+            Some(faults) => {
+                for fault in faults.iter() {
+                    tracing::error!("{fault}");
+                }
+                let first = faults.first().map(ToString::to_string).unwrap_or_default();
+                flow.readiness().set("config", CheckStatus::Failed, first);
+            }
+            None => {
+                let file = &current.loaded.value;
+                flow.reload(LiveSettings::from(&file.flow));
+                if let Err(error) = log.set_level(file.log.level.as_str()) {
+                    tracing::error!(%error, "log.level");
+                }
+                flow.readiness().set("config", CheckStatus::Ok, "");
+                tracing::info!(limit_mbps = file.flow.bandwidth.limit_mbps, "configuration reloaded");
+            }
+        }
+    }
+}
