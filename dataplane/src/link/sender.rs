@@ -351,6 +351,7 @@ impl SendClass {
             let record = message.record(ctx.now, repair.part, part_bytes, FLAG_REPAIR);
             out.put_part(&record, &message.frame);
             message.parts[repair.part] = Part::Carried(sequence);
+            message.lost -= 1;
             parts.push(repair);
             ctx.counters.repairs += 1;
             self.repairs.pop_front();
@@ -503,7 +504,7 @@ impl SendClass {
             let parts = std::mem::take(&mut sample.parts);
             if is_missing {
                 lost += 1;
-                self.lose(&parts, sequence);
+                self.lose(ctx, &parts, sequence);
             } else {
                 received += 1;
                 self.acknowledge(ctx, &parts);
@@ -521,12 +522,19 @@ impl SendClass {
         }
     }
 
-    fn lose(&mut self, parts: &[PartRef], sequence: u64) {
+    fn lose(&mut self, ctx: &mut SendContext<'_>, parts: &[PartRef], sequence: u64) {
         for part in parts {
-            if let Some(message) = self.messages.get_mut(part.key)
-                && message.parts[part.part] == Part::Carried(sequence)
-            {
-                message.parts[part.part] = Part::Lost;
+            let Some(message) = self.messages.get_mut(part.key) else {
+                continue;
+            };
+            if message.parts[part.part] != Part::Carried(sequence) {
+                continue;
+            }
+            message.parts[part.part] = Part::Lost;
+            message.lost += 1;
+            if message.is_expired(ctx.now) {
+                self.drop_message(part.key, DropReason::Lifespan, ctx.ledger);
+            } else {
                 self.repairs.push_back(*part);
             }
         }
@@ -537,8 +545,11 @@ impl SendClass {
             let Some(message) = self.messages.get_mut(part.key) else {
                 continue;
             };
-            if message.parts[part.part] == Part::Acknowledged {
-                continue;
+            match message.parts[part.part] {
+                Part::Acknowledged => continue,
+                // It came after all, before it was repaired.
+                Part::Lost => message.lost -= 1,
+                Part::Unsent | Part::Carried(_) => {}
             }
             message.parts[part.part] = Part::Acknowledged;
             message.acknowledged += 1;
@@ -609,14 +620,18 @@ impl SendClass {
 
     fn sweep(&mut self, ctx: &mut SendContext<'_>) {
         self.last_sweep = Some(ctx.now);
-        let expired = self.messages.keys(|message| message.is_expired(ctx.now));
+        // Of one that is wholly on the way it is not known whether it arrived in time.
+        let expired = self
+            .messages
+            .keys(|message| message.is_expired(ctx.now) && message.is_to_be_sent());
         for key in &expired {
             self.drop_message(*key, DropReason::Lifespan, ctx.ledger);
         }
         if !expired.is_empty() {
             self.prune_waiting();
         }
-        self.next_expiry = self.messages.iter().filter_map(|message| message.deadline).min();
+        let deadlines = self.messages.iter().filter_map(|message| message.deadline);
+        self.next_expiry = deadlines.filter(|deadline| *deadline > ctx.now).min();
     }
 
     /// When [`SendClass::handle_timeout`] has something to do.
