@@ -93,6 +93,8 @@ pub(crate) struct SendClass {
     probe_at: Option<Instant>,
     probe_due: bool,
     last_probe: Option<Instant>,
+    /// The next probe tells something that the receiver must learn: it is repeated until reported.
+    announce: bool,
     /// Samples that the last Feedback misses and that may still come.
     recheck: Option<(Instant, u64)>,
     missing: SmallVec<[(u64, u64); 8]>,
@@ -137,6 +139,7 @@ impl SendClass {
             probe_at: None,
             probe_due: false,
             last_probe: None,
+            announce: false,
             recheck: None,
             missing: SmallVec::new(),
             next_expiry: None,
@@ -208,6 +211,7 @@ impl SendClass {
                 }
                 // The receiver may hold what follows it until it knows.
                 self.probe_due = true;
+                self.announce = true;
             }
         }
     }
@@ -235,7 +239,11 @@ impl SendClass {
         for message in self.messages.iter() {
             ledger.dropped(message.lane, message.bytes(), reason);
         }
+        let used = self.next_number > 1;
         *self = Self::new(self.class, link_epoch, self.limits);
+        // What the receiver still has of the old epoch is of no use.
+        self.probe_due = used;
+        self.announce = used;
     }
 
     /// Drops what a lane has waiting; what is started goes on.
@@ -316,6 +324,7 @@ impl SendClass {
         self.last_user_sequence = sequence;
         self.probe_at = Some(ctx.now + (ctx.round_trip * 2).max(Duration::from_millis(100)));
         self.probe_due = false;
+        self.announce = false;
         Some((datagram, user_bytes))
     }
 
@@ -653,11 +662,14 @@ impl SendClass {
         }
         self.probe_due = false;
         self.last_probe = Some(ctx.now);
-        self.probe_at = (self.highest_reported < self.last_user_sequence).then(|| ctx.now + spacing);
         let next_number = self.next_number;
         // A probe repeats the number of the one before it if nothing came between, so that unanswered ones do not pile up.
         let repeats = self.in_flight.back().is_some_and(|last| last.probe && !last.settled);
         let sequence = self.next_sequence() - u64::from(repeats);
+        if std::mem::take(&mut self.announce) {
+            self.last_user_sequence = sequence;
+        }
+        self.probe_at = (self.highest_reported < self.last_user_sequence).then(|| ctx.now + spacing);
         let mut header = self.header(ctx, sequence, next_number);
         if repeats {
             header.unsettled -= 1;

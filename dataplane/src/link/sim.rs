@@ -227,7 +227,7 @@ pub(crate) struct Sim {
     pub start: Instant,
     pub network: Network,
     pub nodes: Vec<Node>,
-    /// Called with each delivery, so that answers can be sent.
+    /// Last sequence of each stream of each flow.
     sequences: HashMap<(usize, u32), u64>,
 }
 
@@ -519,11 +519,6 @@ impl Sim {
             self.run_until(next);
             self.now += Duration::from_micros(1);
         }
-    }
-
-    /// Since the start.
-    pub(crate) fn elapsed(&self) -> Duration {
-        self.now - self.start
     }
 
     /// Sequences of one stream that one flow delivered, as they came.
