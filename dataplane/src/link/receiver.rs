@@ -196,6 +196,8 @@ impl ReceiveClass {
         if header.records == 0 {
             self.feedback_due = true;
         }
+        // Floors only rise, so those of a sample that came before are as good.
+        self.give_up_below(inbox, u64::from(header.message_floor));
         let sequence = header.link_sequence;
         if sequence <= self.sequence_floor || self.sequences.contains(sequence) {
             return Admission::Repeated;
@@ -214,7 +216,6 @@ impl ReceiveClass {
             self.sequence_floor = floor;
             self.sequences.remove_through(floor);
         }
-        self.give_up_below(inbox, u64::from(header.message_floor));
         if self.samples >= FEEDBACK_SAMPLES {
             self.feedback_due = true;
         } else if self.feedback_at.is_none() {

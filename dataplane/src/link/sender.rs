@@ -43,6 +43,8 @@ struct Sample {
     next_number: u32,
     settled: bool,
     probe: bool,
+    /// What it is the first to tell.
+    announces: Option<u32>,
     parts: SmallVec<[PartRef; 1]>,
 }
 
@@ -93,8 +95,8 @@ pub(crate) struct SendClass {
     probe_at: Option<Instant>,
     probe_due: bool,
     last_probe: Option<Instant>,
-    /// The next probe tells something that the receiver must learn: it is repeated until reported.
-    announce: bool,
+    /// The receiver must learn that this message was given up, or (0) that a link epoch began.
+    announce: Option<u32>,
     /// Samples that the last Feedback misses and that may still come.
     recheck: Option<(Instant, u64)>,
     missing: SmallVec<[(u64, u64); 8]>,
@@ -139,7 +141,7 @@ impl SendClass {
             probe_at: None,
             probe_due: false,
             last_probe: None,
-            announce: false,
+            announce: None,
             recheck: None,
             missing: SmallVec::new(),
             next_expiry: None,
@@ -211,7 +213,7 @@ impl SendClass {
                 }
                 // The receiver may hold what follows it until it knows.
                 self.probe_due = true;
-                self.announce = true;
+                self.announce = self.announce.max(Some(message.number));
             }
         }
     }
@@ -239,11 +241,12 @@ impl SendClass {
         for message in self.messages.iter() {
             ledger.dropped(message.lane, message.bytes(), reason);
         }
-        let used = self.next_number > 1;
+        let untold = self.announce.is_some() || self.highest_reported < self.last_user_sequence;
+        let used = self.next_number > 1 || untold;
         *self = Self::new(self.class, link_epoch, self.limits);
         // What the receiver still has of the old epoch is of no use.
         self.probe_due = used;
-        self.announce = used;
+        self.announce = used.then_some(0);
     }
 
     /// Drops what a lane has waiting; what is started goes on.
@@ -308,6 +311,7 @@ impl SendClass {
         }
         let user_bytes = out.content_bytes();
         let header = self.header(ctx, sequence, next_number);
+        let announces = self.announcement(&header);
         let datagram = out.finish(&header);
         if self.outstanding == 0 {
             self.outstanding_since = Some(ctx.now);
@@ -319,13 +323,18 @@ impl SendClass {
             next_number,
             settled: false,
             probe: false,
+            announces,
             parts,
         });
         self.last_user_sequence = sequence;
         self.probe_at = Some(ctx.now + (ctx.round_trip * 2).max(Duration::from_millis(100)));
         self.probe_due = false;
-        self.announce = false;
         Some((datagram, user_bytes))
+    }
+
+    /// What a header tells that the receiver must learn.
+    fn announcement(&mut self, header: &LinkHeader) -> Option<u32> {
+        self.announce.take_if(|number| *number < header.message_floor)
     }
 
     fn has_credit(&self) -> bool {
@@ -477,7 +486,7 @@ impl SendClass {
             self.settle(ctx, view.highest_sequence);
             self.rate.total(ctx.now, view.received_bytes);
         }
-        if self.highest_reported >= self.last_user_sequence {
+        if self.highest_reported >= self.last_user_sequence && self.announce.is_none() {
             self.probe_at = None;
         }
         self.settle_delivered(ctx, view.delivered_message);
@@ -511,6 +520,10 @@ impl SendClass {
             sample.settled = true;
             self.outstanding = self.outstanding.saturating_sub(sample.bytes as usize);
             let parts = std::mem::take(&mut sample.parts);
+            if is_missing && sample.announces.is_some() {
+                self.announce = self.announce.max(sample.announces);
+                self.probe_due = true;
+            }
             if is_missing {
                 lost += 1;
                 self.lose(ctx, &parts, sequence);
@@ -664,14 +677,12 @@ impl SendClass {
         self.last_probe = Some(ctx.now);
         let next_number = self.next_number;
         // A probe repeats the number of the one before it if nothing came between, so that unanswered ones do not pile up.
-        let repeats = self.in_flight.back().is_some_and(|last| last.probe && !last.settled);
-        let sequence = self.next_sequence() - u64::from(repeats);
-        if std::mem::take(&mut self.announce) {
-            self.last_user_sequence = sequence;
-        }
-        self.probe_at = (self.highest_reported < self.last_user_sequence).then(|| ctx.now + spacing);
-        let mut header = self.header(ctx, sequence, next_number);
+        let unanswered = self.in_flight.back().is_some_and(|last| last.probe && !last.settled);
+        let mut header = self.header(ctx, self.next_sequence(), next_number);
+        let announces = self.announcement(&header);
+        let repeats = unanswered && announces.is_none();
         if repeats {
+            header.link_sequence -= 1;
             header.unsettled -= 1;
         } else {
             self.in_flight.push_back(Sample {
@@ -680,9 +691,15 @@ impl SendClass {
                 next_number,
                 settled: false,
                 probe: true,
+                announces,
                 parts: SmallVec::new(),
             });
         }
+        if announces.is_some() {
+            self.last_user_sequence = header.link_sequence;
+        }
+        let unreported = self.highest_reported < self.last_user_sequence || self.announce.is_some();
+        self.probe_at = unreported.then(|| ctx.now + spacing);
         ctx.counters.probes += 1;
         Some(DatagramBuilder::new(HEADER_BYTES).finish(&header))
     }

@@ -165,7 +165,7 @@ fn an_outage_shorter_than_down_loses_nothing_reliable() {
                 },
             )
             .unwrap();
-            sim.run_ms(23);
+            sim.run_ms(18);
             if step == 99 {
                 sim.network.set_partition(&a, &b, false);
             }
