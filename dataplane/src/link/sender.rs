@@ -9,6 +9,9 @@
 //! A message gets its number when its first byte leaves, so what gives way before leaves no gap. Best-effort messages of
 //! one part are out when they are sent; the others are kept until each part is acknowledged.
 
+mod acknowledge;
+mod timing;
+
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
@@ -169,6 +172,12 @@ impl SendClass {
 
     pub(crate) fn outstanding_since(&self) -> Option<Instant> {
         self.outstanding_since
+    }
+
+    /// Leaves out numbers, as if that many messages had been sent.
+    #[cfg(test)]
+    pub(crate) fn skip_to_last_numbers(&mut self, left: u32) {
+        self.next_number = LAST_NUMBER - left;
     }
 
     /// Bytes that wait or may have to be repaired.
@@ -468,239 +477,5 @@ impl SendClass {
         if self.streams.len() > self.limits.streams {
             self.streams.pop_lru();
         }
-    }
-
-    /// Takes what the receiver reports. Returns whether it is of this link epoch.
-    pub(crate) fn feedback(&mut self, ctx: &mut SendContext<'_>, view: &FeedbackView<'_>) -> bool {
-        if view.link_epoch != self.link_epoch || view.highest_sequence >= self.next_sequence() {
-            return false;
-        }
-        if view.highest_sequence >= self.highest_reported {
-            self.highest_reported = view.highest_sequence;
-            self.window = view.window_bytes;
-            self.missing.clear();
-            for pair in view.missing.chunks_exact(2) {
-                self.missing
-                    .push((pair[0], pair[0].saturating_add(pair[1].saturating_sub(1))));
-            }
-            self.settle(ctx, view.highest_sequence);
-            self.rate.total(ctx.now, view.received_bytes);
-        }
-        if self.highest_reported >= self.last_user_sequence && self.announce.is_none() {
-            self.probe_at = None;
-        }
-        self.settle_delivered(ctx, view.delivered_message);
-        self.renew_numbers();
-        true
-    }
-
-    /// Goes through the samples up to `highest`: those not missing are received; of those missing, some are lost.
-    fn settle(&mut self, ctx: &mut SendContext<'_>, highest: u64) {
-        let late = ctx.round_trip + ctx.round_trip / 8 + Duration::from_millis(2);
-        let (mut received, mut lost) = (0, 0);
-        let mut range = 0;
-        self.recheck = None;
-        let count = usize::try_from((highest + 1).saturating_sub(self.base)).unwrap_or(usize::MAX);
-        for at in 0..count.min(self.in_flight.len()) {
-            let sequence = self.base + at as u64;
-            while self.missing.get(range).is_some_and(|missing| missing.1 < sequence) {
-                range += 1;
-            }
-            let is_missing = self.missing.get(range).is_some_and(|missing| missing.0 <= sequence);
-            let sample = &mut self.in_flight[at];
-            if sample.settled {
-                continue;
-            }
-            let lost_at = sample.sent + late;
-            if is_missing && highest - sequence < REORDERING && ctx.now < lost_at {
-                let at = self.recheck.map_or(lost_at, |next| next.0.min(lost_at));
-                self.recheck = Some((at, highest));
-                continue;
-            }
-            sample.settled = true;
-            self.outstanding = self.outstanding.saturating_sub(sample.bytes as usize);
-            let parts = std::mem::take(&mut sample.parts);
-            if is_missing && sample.announces.is_some() {
-                self.announce = self.announce.max(sample.announces);
-                self.probe_due = true;
-            }
-            if is_missing {
-                lost += 1;
-                self.lose(ctx, &parts, sequence);
-            } else {
-                received += 1;
-                self.acknowledge(ctx, &parts);
-            }
-        }
-        while self.in_flight.front().is_some_and(|sample| sample.settled) {
-            self.in_flight.pop_front();
-            self.base += 1;
-        }
-        if self.outstanding == 0 {
-            self.outstanding_since = None;
-        }
-        if received + lost > 0 {
-            self.loss.add(ctx.now, received, lost);
-        }
-    }
-
-    fn lose(&mut self, ctx: &mut SendContext<'_>, parts: &[PartRef], sequence: u64) {
-        for part in parts {
-            let Some(message) = self.messages.get_mut(part.key) else {
-                continue;
-            };
-            if message.parts[part.part] != Part::Carried(sequence) {
-                continue;
-            }
-            message.parts[part.part] = Part::Lost;
-            message.lost += 1;
-            if message.is_expired(ctx.now) {
-                self.drop_message(part.key, DropReason::Lifespan, ctx.ledger);
-            } else {
-                self.repairs.push_back(*part);
-            }
-        }
-    }
-
-    fn acknowledge(&mut self, ctx: &mut SendContext<'_>, parts: &[PartRef]) {
-        for part in parts {
-            let Some(message) = self.messages.get_mut(part.key) else {
-                continue;
-            };
-            match message.parts[part.part] {
-                Part::Acknowledged => continue,
-                // It came after all, before it was repaired.
-                Part::Lost => message.lost -= 1,
-                Part::Unsent | Part::Carried(_) => {}
-            }
-            message.parts[part.part] = Part::Acknowledged;
-            message.acknowledged += 1;
-            if message.acknowledged == message.parts.len()
-                && let Some(message) = self.take(part.key)
-            {
-                ctx.ledger.out(message.lane, message.bytes(), message.waited(ctx.now));
-            }
-        }
-    }
-
-    /// Settles what the receiver is through with: delivered, or given up there before it was complete.
-    fn settle_delivered(&mut self, ctx: &mut SendContext<'_>, delivered: u32) {
-        if delivered >= self.next_number {
-            return;
-        }
-        while let Some(&(number, key)) = self.started.front()
-            && number <= delivered
-        {
-            self.started.pop_front();
-            let Some(message) = self.messages.get(key) else {
-                continue;
-            };
-            if !message.is_sent() {
-                self.drop_message(key, DropReason::ReassemblyTimeout, ctx.ledger);
-            } else if let Some(message) = self.take(key) {
-                ctx.ledger.out(message.lane, message.bytes(), message.waited(ctx.now));
-            }
-        }
-    }
-
-    /// Begins a new link epoch when the numbers are used up and nothing is on the way.
-    fn renew_numbers(&mut self) {
-        if self.next_number < LAST_NUMBER || self.started_bytes > 0 || !self.in_flight.is_empty() {
-            return;
-        }
-        self.link_epoch = self.link_epoch.saturating_add(1);
-        self.next_number = 1;
-        self.base = 1;
-        self.last_user_sequence = 0;
-        self.highest_reported = 0;
-        self.started.clear();
-        self.streams.clear();
-        self.missing.clear();
-    }
-
-    /// Does what time has made due.
-    pub(crate) fn handle_timeout(&mut self, ctx: &mut SendContext<'_>) {
-        if self.probe_at.is_some_and(|at| at <= ctx.now) {
-            self.probe_due = true;
-        }
-        if let Some((at, highest)) = self.recheck
-            && at <= ctx.now
-        {
-            self.settle(ctx, highest);
-            self.renew_numbers();
-        }
-        if self.sweep_at().is_some_and(|at| at <= ctx.now) {
-            self.sweep(ctx);
-        }
-        self.messages.shrink_if_empty();
-    }
-
-    fn sweep_at(&self) -> Option<Instant> {
-        let next = self.next_expiry?;
-        Some(self.last_sweep.map_or(next, |last| next.max(last + SWEEP)))
-    }
-
-    fn sweep(&mut self, ctx: &mut SendContext<'_>) {
-        self.last_sweep = Some(ctx.now);
-        // Of one that is wholly on the way it is not known whether it arrived in time.
-        let expired = self
-            .messages
-            .keys(|message| message.is_expired(ctx.now) && message.is_to_be_sent());
-        for key in &expired {
-            self.drop_message(*key, DropReason::Lifespan, ctx.ledger);
-        }
-        if !expired.is_empty() {
-            self.prune_waiting();
-        }
-        let deadlines = self.messages.iter().filter_map(|message| message.deadline);
-        self.next_expiry = deadlines.filter(|deadline| *deadline > ctx.now).min();
-    }
-
-    /// When [`SendClass::handle_timeout`] has something to do.
-    pub(crate) fn next_timeout(&self) -> Option<Instant> {
-        let recheck = self.recheck.map(|recheck| recheck.0);
-        let probe = if self.probe_due { None } else { self.probe_at };
-        [probe, recheck, self.sweep_at()].into_iter().flatten().min()
-    }
-
-    /// A sample without records, if one is due: makes the receiver report at once.
-    pub(crate) fn probe(&mut self, ctx: &mut SendContext<'_>) -> Option<bytes::Bytes> {
-        let spacing = ctx.round_trip.max(Duration::from_millis(50));
-        if !self.probe_due || self.last_probe.is_some_and(|last| ctx.now < last + spacing) {
-            if self.probe_due {
-                self.probe_at = self.last_probe.map(|last| last + spacing);
-                self.probe_due = false;
-            }
-            return None;
-        }
-        self.probe_due = false;
-        self.last_probe = Some(ctx.now);
-        let next_number = self.next_number;
-        // A probe repeats the number of the one before it if nothing came between, so that unanswered ones do not pile up.
-        let unanswered = self.in_flight.back().is_some_and(|last| last.probe && !last.settled);
-        let mut header = self.header(ctx, self.next_sequence(), next_number);
-        let announces = self.announcement(&header);
-        let repeats = unanswered && announces.is_none();
-        if repeats {
-            header.link_sequence -= 1;
-            header.unsettled -= 1;
-        } else {
-            self.in_flight.push_back(Sample {
-                sent: ctx.now,
-                bytes: 0,
-                next_number,
-                settled: false,
-                probe: true,
-                announces,
-                parts: SmallVec::new(),
-            });
-        }
-        if announces.is_some() {
-            self.last_user_sequence = header.link_sequence;
-        }
-        let unreported = self.highest_reported < self.last_user_sequence || self.announce.is_some();
-        self.probe_at = unreported.then(|| ctx.now + spacing);
-        ctx.counters.probes += 1;
-        Some(DatagramBuilder::new(HEADER_BYTES).finish(&header))
     }
 }

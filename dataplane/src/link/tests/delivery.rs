@@ -176,6 +176,9 @@ fn an_outage_shorter_than_down_loses_nothing_reliable() {
             .filter(|event| matches!(event.1, LinkEvent::PeerDown { .. }))
             .count();
         assert_eq!(downs, 0, "seed {seed}");
+        let mut events = sim.nodes[0].events.iter();
+        let recovered = events.any(|(_, event)| matches!(event, LinkEvent::PeerRecovered { .. }));
+        assert!(recovered, "seed {seed}: it was suspect meanwhile");
         assert_eq!(
             sim.sequences(1, 1),
             (1..=100).collect::<Vec<_>>(),
@@ -248,4 +251,72 @@ fn small_messages_share_a_datagram_and_none_waits() {
     sim.run_ms(6);
     assert_eq!(sim.sequences(1, 1).len(), 6);
     assert_eq!(sim.nodes[0].sent_datagrams - before, 1);
+}
+
+#[test]
+fn used_up_message_numbers_begin_a_new_link_epoch() {
+    let mut sim = Sim::new(
+        1,
+        Weather {
+            loss: 0.05,
+            ..Weather::delay(10)
+        },
+        &["edge/a", "fog/b"],
+    );
+    sim.run_ms(1_200);
+    sim.publish(0, 1, Post::reliable(1)).unwrap();
+    sim.run_ms(500);
+    sim.nodes[0].engine.peers[0].as_mut().unwrap().send[1].skip_to_last_numbers(20);
+    for _ in 0..60 {
+        sim.publish(0, 1, Post::reliable(1)).unwrap();
+        sim.publish(0, 1, Post::small(2)).unwrap();
+        sim.run_ms(5);
+    }
+    sim.run_ms(2_000);
+    assert_eq!(sim.sequences(1, 1), (1..=61).collect::<Vec<_>>());
+    sim.check_deliveries();
+    sim.check_accounts();
+    assert!(sim.nodes[0].engine.is_drained());
+}
+
+#[test]
+fn feedback_comes_as_often_as_agreed() {
+    let count = std::rc::Rc::new(std::cell::Cell::new(0));
+    let seen = std::rc::Rc::clone(&count);
+    let mut sim = Sim::new(1, Weather::delay(10), &["edge/a", "fog/b"]);
+    sim.run_ms(1_200);
+    sim.network.censor = Some(Box::new(move |from, _, _, datagram| {
+        // A Hello tells the layer's name, a Feedback no name at all.
+        let hello = datagram.windows(3).any(|bytes| bytes == b"fog");
+        if from.flow.layer.as_str() == "fog" && !hello {
+            seen.set(seen.get() + 1);
+        }
+        false
+    }));
+    let per_second = |sim: &mut Sim, posts: u64, every: u64| {
+        count.set(0);
+        for _ in 0..1_000 / every {
+            for _ in 0..posts {
+                sim.publish(
+                    0,
+                    1,
+                    Post {
+                        bytes: 1_000,
+                        ..Post::small(1)
+                    },
+                )
+                .unwrap();
+            }
+            sim.run_ms(every);
+        }
+        count.get()
+    };
+    assert_eq!(per_second(&mut sim, 0, 1_000), 0, "nothing was ever sent");
+    let busy = per_second(&mut sim, 1, 10);
+    assert!((18..=21).contains(&busy), "every 50 ms: {busy}");
+    let flood = per_second(&mut sim, 5, 1);
+    assert!((74..=82).contains(&flood), "every 64 samples: {flood}");
+    sim.run_ms(100);
+    let idle = per_second(&mut sim, 0, 1_000);
+    assert!((0..=2).contains(&idle), "every 500 ms, some with a Hello: {idle}");
 }

@@ -324,3 +324,30 @@ fn whatever_happens_accounts_balance_and_nothing_comes_twice() {
         }
     }
 }
+
+#[test]
+fn an_uneven_path_keeps_the_clock_within_its_error() {
+    let mut sim = Sim::new(1, Weather::delay(10), &["edge/a", "fog/b"]);
+    let (a, b) = (sim.id(0), sim.id(1));
+    sim.network.set_path(&a, &b, Weather::delay(70));
+    sim.network.set_path(
+        &b,
+        &a,
+        Weather {
+            jitter: Duration::from_millis(30),
+            ..Weather::delay(5)
+        },
+    );
+    sim.run_ms(6_000);
+    let info = sim.nodes[0].engine.peer(&b).unwrap();
+    let (offset, error) = (info.clock_offset_ns.unwrap(), info.clock_error.unwrap());
+    assert!(
+        error < Duration::from_millis(45),
+        "the best of eight exchanges: {error:?}"
+    );
+    assert!(
+        u128::from(offset.unsigned_abs()) <= error.as_nanos(),
+        "{offset} ns, {error:?}"
+    );
+    assert!(info.rtt.unwrap() > Duration::from_millis(75));
+}
