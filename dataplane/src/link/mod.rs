@@ -1,27 +1,31 @@
 //! The inter scope: flow to flow.
 //!
 //! ```text
-//! engine      peers, priorities, who is served next            addresses  where flows are
-//!  ├ control  LinkControl: Hello, Feedback, Goodbye            clock      round trips, offsets, loss
-//!  ├ peer     one peer's life                                  event      what goes in and comes out
+//! engine       messages in, events out                        addresses  where flows are
+//!  ├ lifecycle  peers come and go                              clock      round trips, offsets, loss
+//!  ├ transmit   who is served next; Hello, Feedback            event      what goes in and comes out
+//!  ├ receive    LinkControl and messages
+//!  ├ peer       one peer: its clocks, and of each class
 //!  │  ├ sender    queue, samples on the way, repair            outgoing   messages on their way out
-//!  │  └ receiver  what came, what waits, what is missing       assembly, ranges
-//!  └ wire     datagrams and records
+//!  │  └ receiver  what came, what waits, what is missing       assembly   unfinished ones; ranges
+//!  └ wire       datagrams and records
 //! transport   carries datagrams
 //! ```
 
 mod addresses;
 mod assembly;
 mod clock;
-mod control;
 pub mod dds;
 mod engine;
 mod event;
+mod lifecycle;
 mod outgoing;
 mod peer;
 mod ranges;
+mod receive;
 mod receiver;
 mod sender;
+mod transmit;
 pub mod transport;
 mod wire;
 

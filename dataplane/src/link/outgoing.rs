@@ -39,6 +39,8 @@ pub(crate) struct Outgoing {
     /// The first part that was never sent.
     pub next_part: usize,
     pub acknowledged: usize,
+    /// Parts that are [`Part::Lost`].
+    pub lost: usize,
 }
 
 impl Outgoing {
@@ -59,6 +61,7 @@ impl Outgoing {
             parts: smallvec![Part::Unsent; count],
             next_part: 0,
             acknowledged: 0,
+            lost: 0,
             frame: submit.frame,
         }
     }
@@ -77,6 +80,11 @@ impl Outgoing {
 
     pub(crate) fn is_expired(&self, now: Instant) -> bool {
         self.deadline.is_some_and(|deadline| deadline <= now)
+    }
+
+    /// Whether there is anything left to send; otherwise its fate is on the way.
+    pub(crate) fn is_to_be_sent(&self) -> bool {
+        self.lost > 0 || !self.is_sent()
     }
 
     pub(crate) fn waited(&self, now: Instant) -> Duration {

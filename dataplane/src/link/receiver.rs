@@ -8,13 +8,15 @@
 //!
 //! Each message is settled once: delivered, dropped or given up. A settled one is never looked at again.
 
+mod settle;
+mod timing;
+
 use std::collections::{BTreeMap, HashMap};
 use std::hash::{BuildHasher, RandomState};
 use std::time::{Duration, Instant};
 
 use blaze_domain::{DropReason, FlowId};
 use blaze_proto::Frame;
-use blaze_proto::link::link_control::Feedback;
 use bytes::Bytes;
 use lru::LruCache;
 use smallvec::SmallVec;
@@ -196,6 +198,8 @@ impl ReceiveClass {
         if header.records == 0 {
             self.feedback_due = true;
         }
+        // Floors only rise, so those of a sample that came before are as good.
+        self.give_up_below(inbox, u64::from(header.message_floor));
         let sequence = header.link_sequence;
         if sequence <= self.sequence_floor || self.sequences.contains(sequence) {
             return Admission::Repeated;
@@ -214,7 +218,6 @@ impl ReceiveClass {
             self.sequence_floor = floor;
             self.sequences.remove_through(floor);
         }
-        self.give_up_below(inbox, u64::from(header.message_floor));
         if self.samples >= FEEDBACK_SAMPLES {
             self.feedback_due = true;
         } else if self.feedback_at.is_none() {
@@ -371,243 +374,6 @@ impl ReceiveClass {
             frame: frame.with_hops_and_age(u32::from(hops), age_us),
             at: inbox.now,
         });
-    }
-
-    /// Notes that a message is delivered or given up, and hands out what waited for it.
-    fn settle(&mut self, inbox: &mut Inbox<'_>, number: u32) {
-        let mut next: SmallVec<[u32; 4]> = SmallVec::from_slice(&[number]);
-        while let Some(number) = next.pop() {
-            self.note_settled(number);
-            let Some(mut waiting) = self.waiters.remove(&number) else {
-                continue;
-            };
-            waiting.sort_unstable();
-            for number in waiting {
-                if let Some(held) = self.held.remove(&number) {
-                    self.reserved = self.reserved.saturating_sub(held.bytes);
-                    self.deliver(inbox, number, held.message);
-                    next.push(number);
-                }
-            }
-        }
-        if self.settled.len() > MAX_MESSAGE_RANGES
-            && let Some((_, end)) = self.settled.first()
-        {
-            self.give_up_below(inbox, end + 1);
-        }
-    }
-
-    fn note_settled(&mut self, number: u32) {
-        self.settled.insert(u64::from(number), u64::from(number));
-        while let Some((first, last)) = self.settled.first()
-            && first <= self.message_floor
-        {
-            self.message_floor = self.message_floor.max(last + 1);
-            self.settled.remove_through(last);
-        }
-    }
-
-    /// Everything below `floor` that has not come is given up.
-    fn give_up_below(&mut self, inbox: &mut Inbox<'_>, floor: u64) {
-        if floor <= self.message_floor {
-            return;
-        }
-        self.message_floor = floor;
-        self.settled.remove_through(floor - 1);
-        if let Some((first, last)) = self.settled.first()
-            && first <= floor
-        {
-            self.message_floor = last + 1;
-            self.settled.remove_through(last);
-        }
-        if !self.assemblies.is_empty() {
-            let floor = self.message_floor;
-            let gone: Vec<u32> = self
-                .assemblies
-                .keys()
-                .copied()
-                .filter(|n| u64::from(*n) < floor)
-                .collect();
-            for number in gone {
-                self.drop_assembly(inbox, number, DropReason::ReassemblyTimeout);
-            }
-        }
-        self.release_ready(inbox);
-    }
-
-    /// Hands out what waits for something that is settled by now, in order.
-    fn release_ready(&mut self, inbox: &mut Inbox<'_>) {
-        if self.held.is_empty() {
-            return;
-        }
-        let numbers: Vec<u32> = self.held.keys().copied().collect();
-        for number in numbers {
-            if let Some(before) = self.held.get(&number).map(|held| held.before)
-                && self.is_settled(before)
-            {
-                self.settle_held(inbox, number);
-            }
-        }
-    }
-
-    /// Hands out one held message and what waited for it.
-    fn settle_held(&mut self, inbox: &mut Inbox<'_>, number: u32) {
-        let Some(held) = self.held.remove(&number) else { return };
-        self.reserved = self.reserved.saturating_sub(held.bytes);
-        if let Some(waiting) = self.waiters.get_mut(&held.before) {
-            waiting.retain(|waiter| *waiter != number);
-            if waiting.is_empty() {
-                self.waiters.remove(&held.before);
-            }
-        }
-        self.deliver(inbox, number, held.message);
-        self.settle(inbox, number);
-    }
-
-    fn drop_assembly(&mut self, inbox: &mut Inbox<'_>, number: u32, reason: DropReason) {
-        if let Some(assembly) = self.remove_assembly(number) {
-            inbox.dropped(assembly.topic(), reason);
-        }
-    }
-
-    /// Stops waiting for the message that is behind all that this held one waits for.
-    fn give_up_before(&mut self, inbox: &mut Inbox<'_>, number: u32) {
-        let mut at = number;
-        while let Some(held) = self.held.get(&at) {
-            at = held.before;
-        }
-        if at != number {
-            self.drop_assembly(inbox, at, DropReason::ReassemblyTimeout);
-            self.settle(inbox, at);
-        }
-    }
-
-    /// Hands out all complete messages in order and drops the unfinished ones: nothing more is expected.
-    pub(crate) fn release_all(&mut self, inbox: &mut Inbox<'_>) {
-        let unfinished: Vec<u32> = self.assemblies.keys().copied().collect();
-        for number in unfinished {
-            self.drop_assembly(inbox, number, DropReason::ReassemblyTimeout);
-            self.settle(inbox, number);
-        }
-        while let Some((&number, _)) = self.held.first_key_value() {
-            self.give_up_before(inbox, number);
-        }
-    }
-
-    /// Frees memory: drops the oldest unfinished message, or stops waiting. Returns whether there was anything to free.
-    pub(crate) fn evict(&mut self, inbox: &mut Inbox<'_>) -> bool {
-        let oldest = self.assemblies.iter().min_by_key(|(_, assembly)| assembly.first_part);
-        if let Some(number) = oldest.map(|(number, _)| *number) {
-            inbox.counters.reassembly_evicted += 1;
-            self.drop_assembly(inbox, number, DropReason::QueueFull);
-            self.settle(inbox, number);
-            return true;
-        }
-        let Some((&number, _)) = self.held.first_key_value() else {
-            return false;
-        };
-        self.give_up_before(inbox, number);
-        true
-    }
-
-    /// When something has to be done: report, or give up.
-    pub(crate) fn next_timeout(&self, connected: bool) -> Option<Instant> {
-        let idle = self.last_feedback.map(|last| last + FEEDBACK_IDLE);
-        let feedback = if self.feedback_due || !connected {
-            None
-        } else {
-            self.feedback_at.or(idle)
-        };
-        [feedback, self.sweep_at, self.hand_out_at].into_iter().flatten().min()
-    }
-
-    /// Does what time has made due.
-    pub(crate) fn handle_timeout(&mut self, inbox: &mut Inbox<'_>) {
-        let now = inbox.now;
-        let idle = self.last_feedback.map(|last| last + FEEDBACK_IDLE);
-        if self.feedback_at.or(idle).is_some_and(|at| at <= now) {
-            self.feedback_due = true;
-        }
-        if self.hand_out_at.is_some_and(|at| at <= now) {
-            self.hand_out(inbox, |_, held| held.hand_out_at().is_some_and(|at| at <= now));
-            self.hand_out_at = self.held.values().filter_map(Held::hand_out_at).min();
-        }
-        if self.sweep_at.is_some_and(|at| at <= now) {
-            self.sweep(inbox);
-        }
-    }
-
-    fn is_overdue(&self, now: Instant, since: Instant, active: Duration) -> bool {
-        self.active.saturating_sub(active) >= PATIENCE || now.saturating_duration_since(since) >= LONGEST_PATIENCE
-    }
-
-    /// Hands out the held messages that must not wait any longer.
-    fn hand_out(&mut self, inbox: &mut Inbox<'_>, must: impl Fn(&Self, &Held) -> bool) {
-        let numbers = (self.held.iter())
-            .filter(|(_, held)| must(self, held))
-            .map(|(number, _)| *number);
-        for number in numbers.collect::<Vec<_>>() {
-            self.give_up_before(inbox, number);
-        }
-    }
-
-    fn sweep(&mut self, inbox: &mut Inbox<'_>) {
-        let now = inbox.now;
-        self.hand_out(inbox, |class, held| class.is_overdue(now, held.since, held.active));
-        let mut gone = Vec::new();
-        for (number, assembly) in &self.assemblies {
-            if assembly.expires.is_some_and(|at| at <= now) {
-                gone.push((*number, DropReason::Lifespan));
-            } else if self.is_overdue(now, assembly.last_part, assembly.active) {
-                gone.push((*number, DropReason::ReassemblyTimeout));
-            }
-        }
-        for (number, reason) in gone {
-            self.drop_assembly(inbox, number, reason);
-            self.settle(inbox, number);
-        }
-        let idle = self.assemblies.is_empty() && self.held.is_empty();
-        self.sweep_at = (!idle).then(|| now + SWEEP);
-    }
-
-    /// Whether a Feedback is to be sent.
-    pub(crate) fn feedback_due(&self) -> bool {
-        self.feedback_due && self.link_epoch != 0
-    }
-
-    /// What to report now. `share` is how much memory this peer may still take.
-    pub(crate) fn feedback(&mut self, now: Instant, class_code: u8, share: u64) -> Feedback {
-        self.feedback_due = false;
-        self.feedback_at = None;
-        self.samples = 0;
-        self.last_feedback = Some(now);
-        let mut highest = self.sequences.last().unwrap_or(self.sequence_floor);
-        let mut missing = Vec::new();
-        let mut gaps = self.sequences.gaps(self.sequence_floor);
-        for (first, last) in gaps.by_ref().take(MISSING_RANGES) {
-            missing.extend([first, last - first + 1]);
-        }
-        // What lies beyond the last range that fits is not told yet.
-        if let (Some((next, _)), true) = (gaps.next(), missing.len() >= 2) {
-            let end = missing[missing.len() - 2] + missing[missing.len() - 1] - 1;
-            debug_assert!(end < next);
-            highest = end;
-        }
-        let (echo_send_ns, echo_held_ns) = self.echo.map_or((0, 0), |(sent, at)| {
-            let held = now.saturating_duration_since(at);
-            (sent, u64::try_from(held.as_nanos()).unwrap_or(u64::MAX))
-        });
-        Feedback {
-            link_epoch: self.link_epoch,
-            link_class: u32::from(class_code),
-            highest_sequence: highest,
-            missing,
-            received_bytes: self.received_bytes,
-            window_bytes: share + self.expected() as u64,
-            delivered_message: u32::try_from(self.message_floor - 1).unwrap_or(u32::MAX),
-            echo_send_ns,
-            echo_held_ns,
-        }
     }
 }
 

@@ -9,6 +9,9 @@
 //! A message gets its number when its first byte leaves, so what gives way before leaves no gap. Best-effort messages of
 //! one part are out when they are sent; the others are kept until each part is acknowledged.
 
+mod acknowledge;
+mod timing;
+
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
@@ -43,6 +46,8 @@ struct Sample {
     next_number: u32,
     settled: bool,
     probe: bool,
+    /// What it is the first to tell.
+    announces: Option<u32>,
     parts: SmallVec<[PartRef; 1]>,
 }
 
@@ -93,6 +98,8 @@ pub(crate) struct SendClass {
     probe_at: Option<Instant>,
     probe_due: bool,
     last_probe: Option<Instant>,
+    /// The receiver must learn that this message was given up, or (0) that a link epoch began.
+    announce: Option<u32>,
     /// Samples that the last Feedback misses and that may still come.
     recheck: Option<(Instant, u64)>,
     missing: SmallVec<[(u64, u64); 8]>,
@@ -137,6 +144,7 @@ impl SendClass {
             probe_at: None,
             probe_due: false,
             last_probe: None,
+            announce: None,
             recheck: None,
             missing: SmallVec::new(),
             next_expiry: None,
@@ -164,6 +172,12 @@ impl SendClass {
 
     pub(crate) fn outstanding_since(&self) -> Option<Instant> {
         self.outstanding_since
+    }
+
+    /// Leaves out numbers, as if that many messages had been sent.
+    #[cfg(test)]
+    pub(crate) fn skip_to_last_numbers(&mut self, left: u32) {
+        self.next_number = LAST_NUMBER - left;
     }
 
     /// Bytes that wait or may have to be repaired.
@@ -208,6 +222,7 @@ impl SendClass {
                 }
                 // The receiver may hold what follows it until it knows.
                 self.probe_due = true;
+                self.announce = self.announce.max(Some(message.number));
             }
         }
     }
@@ -235,7 +250,12 @@ impl SendClass {
         for message in self.messages.iter() {
             ledger.dropped(message.lane, message.bytes(), reason);
         }
+        let untold = self.announce.is_some() || self.highest_reported < self.last_user_sequence;
+        let used = self.next_number > 1 || untold;
         *self = Self::new(self.class, link_epoch, self.limits);
+        // What the receiver still has of the old epoch is of no use.
+        self.probe_due = used;
+        self.announce = used.then_some(0);
     }
 
     /// Drops what a lane has waiting; what is started goes on.
@@ -300,6 +320,7 @@ impl SendClass {
         }
         let user_bytes = out.content_bytes();
         let header = self.header(ctx, sequence, next_number);
+        let announces = self.announcement(&header);
         let datagram = out.finish(&header);
         if self.outstanding == 0 {
             self.outstanding_since = Some(ctx.now);
@@ -311,12 +332,18 @@ impl SendClass {
             next_number,
             settled: false,
             probe: false,
+            announces,
             parts,
         });
         self.last_user_sequence = sequence;
         self.probe_at = Some(ctx.now + (ctx.round_trip * 2).max(Duration::from_millis(100)));
         self.probe_due = false;
         Some((datagram, user_bytes))
+    }
+
+    /// What a header tells that the receiver must learn.
+    fn announcement(&mut self, header: &LinkHeader) -> Option<u32> {
+        self.announce.take_if(|number| *number < header.message_floor)
     }
 
     fn has_credit(&self) -> bool {
@@ -351,6 +378,7 @@ impl SendClass {
             let record = message.record(ctx.now, repair.part, part_bytes, FLAG_REPAIR);
             out.put_part(&record, &message.frame);
             message.parts[repair.part] = Part::Carried(sequence);
+            message.lost -= 1;
             parts.push(repair);
             ctx.counters.repairs += 1;
             self.repairs.pop_front();
@@ -449,214 +477,5 @@ impl SendClass {
         if self.streams.len() > self.limits.streams {
             self.streams.pop_lru();
         }
-    }
-
-    /// Takes what the receiver reports. Returns whether it is of this link epoch.
-    pub(crate) fn feedback(&mut self, ctx: &mut SendContext<'_>, view: &FeedbackView<'_>) -> bool {
-        if view.link_epoch != self.link_epoch || view.highest_sequence >= self.next_sequence() {
-            return false;
-        }
-        if view.highest_sequence >= self.highest_reported {
-            self.highest_reported = view.highest_sequence;
-            self.window = view.window_bytes;
-            self.missing.clear();
-            for pair in view.missing.chunks_exact(2) {
-                self.missing
-                    .push((pair[0], pair[0].saturating_add(pair[1].saturating_sub(1))));
-            }
-            self.settle(ctx, view.highest_sequence);
-            self.rate.total(ctx.now, view.received_bytes);
-        }
-        if self.highest_reported >= self.last_user_sequence {
-            self.probe_at = None;
-        }
-        self.settle_delivered(ctx, view.delivered_message);
-        self.renew_numbers();
-        true
-    }
-
-    /// Goes through the samples up to `highest`: those not missing are received; of those missing, some are lost.
-    fn settle(&mut self, ctx: &mut SendContext<'_>, highest: u64) {
-        let late = ctx.round_trip + ctx.round_trip / 8 + Duration::from_millis(2);
-        let (mut received, mut lost) = (0, 0);
-        let mut range = 0;
-        self.recheck = None;
-        let count = usize::try_from((highest + 1).saturating_sub(self.base)).unwrap_or(usize::MAX);
-        for at in 0..count.min(self.in_flight.len()) {
-            let sequence = self.base + at as u64;
-            while self.missing.get(range).is_some_and(|missing| missing.1 < sequence) {
-                range += 1;
-            }
-            let is_missing = self.missing.get(range).is_some_and(|missing| missing.0 <= sequence);
-            let sample = &mut self.in_flight[at];
-            if sample.settled {
-                continue;
-            }
-            let lost_at = sample.sent + late;
-            if is_missing && highest - sequence < REORDERING && ctx.now < lost_at {
-                let at = self.recheck.map_or(lost_at, |next| next.0.min(lost_at));
-                self.recheck = Some((at, highest));
-                continue;
-            }
-            sample.settled = true;
-            self.outstanding = self.outstanding.saturating_sub(sample.bytes as usize);
-            let parts = std::mem::take(&mut sample.parts);
-            if is_missing {
-                lost += 1;
-                self.lose(&parts, sequence);
-            } else {
-                received += 1;
-                self.acknowledge(ctx, &parts);
-            }
-        }
-        while self.in_flight.front().is_some_and(|sample| sample.settled) {
-            self.in_flight.pop_front();
-            self.base += 1;
-        }
-        if self.outstanding == 0 {
-            self.outstanding_since = None;
-        }
-        if received + lost > 0 {
-            self.loss.add(ctx.now, received, lost);
-        }
-    }
-
-    fn lose(&mut self, parts: &[PartRef], sequence: u64) {
-        for part in parts {
-            if let Some(message) = self.messages.get_mut(part.key)
-                && message.parts[part.part] == Part::Carried(sequence)
-            {
-                message.parts[part.part] = Part::Lost;
-                self.repairs.push_back(*part);
-            }
-        }
-    }
-
-    fn acknowledge(&mut self, ctx: &mut SendContext<'_>, parts: &[PartRef]) {
-        for part in parts {
-            let Some(message) = self.messages.get_mut(part.key) else {
-                continue;
-            };
-            if message.parts[part.part] == Part::Acknowledged {
-                continue;
-            }
-            message.parts[part.part] = Part::Acknowledged;
-            message.acknowledged += 1;
-            if message.acknowledged == message.parts.len()
-                && let Some(message) = self.take(part.key)
-            {
-                ctx.ledger.out(message.lane, message.bytes(), message.waited(ctx.now));
-            }
-        }
-    }
-
-    /// Settles what the receiver is through with: delivered, or given up there before it was complete.
-    fn settle_delivered(&mut self, ctx: &mut SendContext<'_>, delivered: u32) {
-        if delivered >= self.next_number {
-            return;
-        }
-        while let Some(&(number, key)) = self.started.front()
-            && number <= delivered
-        {
-            self.started.pop_front();
-            let Some(message) = self.messages.get(key) else {
-                continue;
-            };
-            if !message.is_sent() {
-                self.drop_message(key, DropReason::ReassemblyTimeout, ctx.ledger);
-            } else if let Some(message) = self.take(key) {
-                ctx.ledger.out(message.lane, message.bytes(), message.waited(ctx.now));
-            }
-        }
-    }
-
-    /// Begins a new link epoch when the numbers are used up and nothing is on the way.
-    fn renew_numbers(&mut self) {
-        if self.next_number < LAST_NUMBER || self.started_bytes > 0 || !self.in_flight.is_empty() {
-            return;
-        }
-        self.link_epoch = self.link_epoch.saturating_add(1);
-        self.next_number = 1;
-        self.base = 1;
-        self.last_user_sequence = 0;
-        self.highest_reported = 0;
-        self.started.clear();
-        self.streams.clear();
-        self.missing.clear();
-    }
-
-    /// Does what time has made due.
-    pub(crate) fn handle_timeout(&mut self, ctx: &mut SendContext<'_>) {
-        if self.probe_at.is_some_and(|at| at <= ctx.now) {
-            self.probe_due = true;
-        }
-        if let Some((at, highest)) = self.recheck
-            && at <= ctx.now
-        {
-            self.settle(ctx, highest);
-            self.renew_numbers();
-        }
-        if self.sweep_at().is_some_and(|at| at <= ctx.now) {
-            self.sweep(ctx);
-        }
-        self.messages.shrink_if_empty();
-    }
-
-    fn sweep_at(&self) -> Option<Instant> {
-        let next = self.next_expiry?;
-        Some(self.last_sweep.map_or(next, |last| next.max(last + SWEEP)))
-    }
-
-    fn sweep(&mut self, ctx: &mut SendContext<'_>) {
-        self.last_sweep = Some(ctx.now);
-        let expired = self.messages.keys(|message| message.is_expired(ctx.now));
-        for key in &expired {
-            self.drop_message(*key, DropReason::Lifespan, ctx.ledger);
-        }
-        if !expired.is_empty() {
-            self.prune_waiting();
-        }
-        self.next_expiry = self.messages.iter().filter_map(|message| message.deadline).min();
-    }
-
-    /// When [`SendClass::handle_timeout`] has something to do.
-    pub(crate) fn next_timeout(&self) -> Option<Instant> {
-        let recheck = self.recheck.map(|recheck| recheck.0);
-        let probe = if self.probe_due { None } else { self.probe_at };
-        [probe, recheck, self.sweep_at()].into_iter().flatten().min()
-    }
-
-    /// A sample without records, if one is due: makes the receiver report at once.
-    pub(crate) fn probe(&mut self, ctx: &mut SendContext<'_>) -> Option<bytes::Bytes> {
-        let spacing = ctx.round_trip.max(Duration::from_millis(50));
-        if !self.probe_due || self.last_probe.is_some_and(|last| ctx.now < last + spacing) {
-            if self.probe_due {
-                self.probe_at = self.last_probe.map(|last| last + spacing);
-                self.probe_due = false;
-            }
-            return None;
-        }
-        self.probe_due = false;
-        self.last_probe = Some(ctx.now);
-        self.probe_at = (self.highest_reported < self.last_user_sequence).then(|| ctx.now + spacing);
-        let next_number = self.next_number;
-        // A probe repeats the number of the one before it if nothing came between, so that unanswered ones do not pile up.
-        let repeats = self.in_flight.back().is_some_and(|last| last.probe && !last.settled);
-        let sequence = self.next_sequence() - u64::from(repeats);
-        let mut header = self.header(ctx, sequence, next_number);
-        if repeats {
-            header.unsettled -= 1;
-        } else {
-            self.in_flight.push_back(Sample {
-                sent: ctx.now,
-                bytes: 0,
-                next_number,
-                settled: false,
-                probe: true,
-                parts: SmallVec::new(),
-            });
-        }
-        ctx.counters.probes += 1;
-        Some(DatagramBuilder::new(HEADER_BYTES).finish(&header))
     }
 }

@@ -427,7 +427,8 @@ mod tests {
         #[test]
         fn random_datagrams_never_panic(mut bytes in proptest::collection::vec(any::<u8>(), 0..400), ours: bool) {
             if ours && bytes.len() > 4 {
-                bytes[..4].copy_from_slice(&[VERSION, 2, bytes[2] % 4, 0]);
+                let records = bytes[2] % 4;
+                bytes[..4].copy_from_slice(&[VERSION, 2, records, 0]);
             }
             if let Ok(datagram) = Datagram::parse(Bytes::from(bytes), Priority::State) {
                 let mut content = 0;

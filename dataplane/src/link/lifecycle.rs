@@ -1,0 +1,209 @@
+//! Peers come and go: found, up, suspect, down, forgotten, replaced by a newer life.
+
+use std::time::Instant;
+
+use super::engine::Engine;
+use super::event::{DownReason, LinkEvent};
+use super::peer::{HELLO_EVERY, Peer, Phase};
+use super::receiver::Inbox;
+use super::sender::{SendContext, SendLimits};
+use super::transport::Endpoint;
+use super::wire::SenderId;
+
+impl Engine {
+    /// The transport can write to an endpoint.
+    pub fn peer_discovered(&mut self, now: Instant, endpoint: Endpoint) {
+        if let Some(at) = self.place_of(now, endpoint)
+            && let Some(peer) = &mut self.peers[at]
+            && peer.phase != Phase::Gone
+        {
+            peer.hello_due = true;
+            peer.hello_at = now + HELLO_EVERY;
+        }
+    }
+
+    /// The transport no longer sees an endpoint. One that says Hello stays; one that never did is forgotten.
+    pub fn peer_lost(&mut self, _now: Instant, endpoint: &Endpoint) {
+        if let Some(&at) = self.by_flow.get(&endpoint.flow)
+            && let Some(peer) = &self.peers[at]
+            && peer.endpoint == *endpoint
+            && peer.phase == Phase::Connecting
+        {
+            self.remove(at);
+        }
+    }
+
+    /// The place of an endpoint, made if it is new; a newer life replaces an older one. `None`: an older life, this flow
+    /// itself, or no room.
+    pub(super) fn place_of(&mut self, now: Instant, endpoint: Endpoint) -> Option<usize> {
+        if endpoint.flow == self.config.me {
+            return None;
+        }
+        if let Some(&at) = self.by_flow.get(&endpoint.flow) {
+            let known = self.peers[at].as_ref().map_or(0, |peer| peer.endpoint.epoch);
+            if endpoint.epoch == known {
+                return Some(at);
+            }
+            if endpoint.epoch < known {
+                self.counters.stale += 1;
+                return None;
+            }
+            self.take_down(now, at, DownReason::NewEpoch);
+            self.remove(at);
+        }
+        let at = self.free_place()?;
+        let limits = [0, 1, 2].map(|class| SendLimits {
+            queue_bytes: self.config.limits.queue_bytes[class],
+            streams: self.config.limits.streams,
+            max_datagram: self.config.max_datagram,
+        });
+        let peer = Peer::new(now, endpoint, self.next_link_epoch, limits, self.config.limits.streams);
+        self.next_link_epoch = self.next_link_epoch.saturating_add(3);
+        self.by_flow.insert(peer.endpoint.flow.clone(), at);
+        self.by_sender.insert(peer.sender, at);
+        self.peers[at] = Some(peer);
+        Some(at)
+    }
+
+    fn free_place(&mut self) -> Option<usize> {
+        if let Some(at) = self.peers.iter().position(Option::is_none) {
+            return Some(at);
+        }
+        if self.peers.len() < self.config.limits.peers {
+            self.peers.push(None);
+            return Some(self.peers.len() - 1);
+        }
+        let idle = self.peers.iter().enumerate().filter_map(|(at, peer)| {
+            let peer = peer.as_ref().filter(|peer| !peer.is_connected())?;
+            Some((peer.last_hello.unwrap_or(peer.since), at))
+        });
+        let Some((_, at)) = idle.min() else {
+            self.counters.peers_refused += 1;
+            return None;
+        };
+        self.forget(at);
+        Some(at)
+    }
+
+    /// This flow begins a new life: peers are dropped and have to be found again.
+    pub fn restart(&mut self, now: Instant, epoch: u64) {
+        for at in 0..self.peers.len() {
+            self.take_down(now, at, DownReason::Restarted);
+            self.remove(at);
+        }
+        self.config.epoch = epoch;
+        self.sender = SenderId::of(&self.config.me, epoch);
+    }
+
+    /// Drops what waits for a peer, hands out what waits from it, and says so if it was up.
+    pub(super) fn take_down(&mut self, now: Instant, at: usize, reason: DownReason) {
+        let Some(peer) = self.peers.get_mut(at).and_then(Option::as_mut) else {
+            return;
+        };
+        let was_connected = peer.is_connected();
+        self.next_link_epoch = peer.drop_outgoing(self.next_link_epoch, &mut self.ledger);
+        let half_round_trip = peer.round_trip.measured().unwrap_or_default() / 2;
+        let mut inbox = Inbox {
+            now,
+            from: &peer.endpoint.flow,
+            half_round_trip,
+            events: &mut self.ledger.events,
+            counters: &mut self.counters,
+            hasher: &self.hasher,
+        };
+        for class in &mut peer.receive {
+            class.release_all(&mut inbox);
+        }
+        if peer.phase != Phase::Gone {
+            peer.phase = Phase::Down;
+        }
+        peer.since = now;
+        if was_connected {
+            self.ledger.events.push_back(LinkEvent::PeerDown {
+                flow: peer.endpoint.flow.clone(),
+                epoch: peer.endpoint.epoch,
+                reason,
+            });
+        }
+    }
+
+    fn remove(&mut self, at: usize) {
+        if let Some(peer) = self.peers.get_mut(at).and_then(Option::take) {
+            self.by_flow.remove(&peer.endpoint.flow);
+            self.by_sender.remove(&peer.sender);
+        }
+    }
+
+    /// Removes a peer that is not connected, and says so if it was known by name.
+    fn forget(&mut self, at: usize) {
+        let Some(peer) = self.peers.get(at).and_then(Option::as_ref) else {
+            return;
+        };
+        if peer.phase == Phase::Down {
+            self.ledger.events.push_back(LinkEvent::PeerForgotten {
+                flow: peer.endpoint.flow.clone(),
+                epoch: peer.endpoint.epoch,
+            });
+        }
+        self.remove(at);
+    }
+
+    /// Does what time has made due.
+    pub fn handle_timeout(&mut self, now: Instant) {
+        for at in 0..self.peers.len() {
+            self.advance_phase(now, at);
+            self.advance_classes(now, at);
+        }
+    }
+
+    fn advance_phase(&mut self, now: Instant, at: usize) {
+        let Some(peer) = &mut self.peers[at] else { return };
+        if peer.hello_at <= now && peer.phase != Phase::Gone {
+            peer.hello_due = true;
+            peer.hello_at = now + HELLO_EVERY;
+        }
+        if peer.silent_at().is_some_and(|silent| silent <= now) {
+            if peer.is_connected() {
+                self.take_down(now, at, DownReason::Silent);
+            } else {
+                self.forget(at);
+            }
+        } else if peer.suspect_at().is_some_and(|suspect| suspect <= now) {
+            peer.phase = Phase::Suspect;
+            self.ledger.events.push_back(LinkEvent::PeerSuspect {
+                flow: peer.endpoint.flow.clone(),
+            });
+        }
+    }
+
+    fn advance_classes(&mut self, now: Instant, at: usize) {
+        let Some(peer) = &mut self.peers[at] else { return };
+        let connected = peer.is_connected();
+        let mut ctx = SendContext {
+            now,
+            send_ns: self.clocks.monotonic_ns(now),
+            sender: self.sender,
+            round_trip: peer.round_trip.get(),
+            ledger: &mut self.ledger,
+            counters: &mut self.counters,
+        };
+        for class in &mut peer.send {
+            if class.next_timeout().is_some_and(|due| due <= now) {
+                class.handle_timeout(&mut ctx);
+            }
+        }
+        let mut inbox = Inbox {
+            now,
+            from: &peer.endpoint.flow,
+            half_round_trip: peer.round_trip.measured().unwrap_or_default() / 2,
+            events: &mut self.ledger.events,
+            counters: &mut self.counters,
+            hasher: &self.hasher,
+        };
+        for class in &mut peer.receive {
+            if class.next_timeout(connected).is_some_and(|due| due <= now) {
+                class.handle_timeout(&mut inbox);
+            }
+        }
+    }
+}
