@@ -7,6 +7,7 @@
 
 pub mod board;
 pub mod camera;
+mod compose;
 pub mod domain_id;
 pub mod flows;
 pub mod options;
@@ -19,15 +20,4 @@ pub mod session;
 pub mod stats;
 pub mod verdict;
 
-use crate::exit::{CliError, Exit};
-use crate::output::Format;
-
-/// Runs the demo.
-///
-/// # Errors
-/// See [`CliError`].
-pub async fn run(options: options::DemoOptions, format: Format) -> Result<Exit, CliError> {
-    options.check()?;
-    report::Style::choose(format)?;
-    Err(CliError::Failed("the demo is not part of this build".to_owned()))
-}
+pub use compose::run;
