@@ -7,7 +7,7 @@
 
 pub mod board;
 pub mod camera;
-mod compose;
+pub mod compose;
 pub mod domain_id;
 pub mod flows;
 pub mod options;

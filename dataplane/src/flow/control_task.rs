@@ -15,7 +15,7 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::Shared;
-use super::plane::wall_ns;
+use super::plane::{News, wall_ns};
 use crate::control::Output;
 use crate::world::FlowState;
 
@@ -86,13 +86,13 @@ impl ControlTask {
         let mut outputs = Vec::new();
         {
             let mut control = self.shared.control.lock();
-            for event in self.shared.plane.take_news() {
-                if let crate::link::LinkEvent::Addresses(addresses) = &event {
-                    if let Some(transport) = &self.shared.transport {
-                        transport.learn(addresses);
-                    }
+            for news in self.shared.plane.take_news() {
+                if let Some(transport) = &self.shared.transport {
+                    transport.follow(&news);
                 }
-                control.link_event(now, event);
+                if let News::Link(event) = news {
+                    control.link_event(now, event);
+                }
             }
             control.tick(now, wall_ms());
             outputs.extend(std::iter::from_fn(|| control.poll()));

@@ -37,10 +37,10 @@ use crate::control::{ControlConfig, ControlCore};
 use crate::lane::core::{DataConfig, DataCore};
 use crate::link::dds::{DdsConfig, DdsStatus, DdsTransport};
 use crate::link::transport::{Endpoint, Transport};
-use crate::link::{Engine, EngineConfig, Limits};
+use crate::link::{DownReason, Engine, EngineConfig, Limits, LinkEvent};
 use crate::world::LayerScopeId;
 use pacing::Egress;
-use plane::{Plane, wall_ns};
+use plane::{News, Plane, wall_ns};
 pub use routes::LocalBrokers;
 use routes::Routes;
 use settings::{FlowSettings, InterSettings, LiveSettings};
@@ -72,8 +72,22 @@ pub(crate) struct InterTransport {
 }
 
 impl InterTransport {
-    fn learn(&self, addresses: &[String]) {
-        self.dds.learn_addresses(addresses);
+    /// Makes and drops writers as peers come and go. Of a peer that is down the control writer stays: it carries Hello
+    /// until the peer is forgotten, says Goodbye or begins a new life.
+    fn follow(&self, news: &News) {
+        let endpoint = |flow: &FlowId, epoch: u64| Endpoint { flow: flow.clone(), epoch };
+        match news {
+            News::Discovered(found) => self.dds.connect(found),
+            News::Link(LinkEvent::PeerUp { flow, epoch }) => self.dds.connect(&endpoint(flow, *epoch)),
+            News::Link(LinkEvent::PeerDown { flow, epoch, reason: DownReason::Silent }) => {
+                self.dds.disconnect(&endpoint(flow, *epoch), &[Priority::State, Priority::Bulk]);
+            }
+            News::Link(LinkEvent::PeerDown { flow, epoch, .. } | LinkEvent::PeerForgotten { flow, epoch }) => {
+                self.dds.disconnect(&endpoint(flow, *epoch), Priority::ALL);
+            }
+            News::Link(LinkEvent::Addresses(addresses)) => self.dds.learn_addresses(addresses),
+            News::Link(_) => {}
+        }
     }
 
     fn status(&self) -> DdsStatus {

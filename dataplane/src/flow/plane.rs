@@ -15,12 +15,21 @@ use tokio::sync::Notify;
 
 use crate::lane::core::{DataCore, LaneLink};
 use crate::lane::path::TopicId;
-use crate::link::transport::TransportEvent;
+use crate::link::transport::{Endpoint, TransportEvent};
 use crate::link::{Engine, LaneId, LinkEvent, Submit, Transmit};
 
 /// Link events that wait for the control core; Hellos and registry messages beyond it are dropped and repaired by the
 /// next digest.
 const MAX_NEWS: usize = 10_000;
+
+/// What the control task is told.
+#[derive(Debug)]
+pub enum News {
+    /// Something happened on the link.
+    Link(LinkEvent),
+    /// An endpoint was found: writers to it are to be made.
+    Discovered(Endpoint),
+}
 
 /// Nanoseconds since 1970.
 #[must_use]
@@ -107,7 +116,7 @@ pub struct Plane {
     state: Mutex<PlaneState>,
     /// The pacer waits here while it has nothing to send.
     work: Condvar,
-    news: Mutex<VecDeque<LinkEvent>>,
+    news: Mutex<VecDeque<News>>,
     news_dropped: AtomicU64,
     news_waits: Notify,
 }
@@ -151,6 +160,10 @@ impl Plane {
 
     /// Takes what the transport found.
     pub fn transport_event(&self, event: TransportEvent) {
+        if let TransportEvent::Discovered(endpoint) = &event {
+            self.news.lock().push_back(News::Discovered(endpoint.clone()));
+            self.news_waits.notify_one();
+        }
         self.with(|state| {
             let Some(engine) = &mut state.engine else { return };
             let now = Instant::now();
@@ -189,7 +202,7 @@ impl Plane {
     }
 
     /// What the link has to say to the control core since the last call.
-    pub fn take_news(&self) -> Vec<LinkEvent> {
+    pub fn take_news(&self) -> Vec<News> {
         self.news.lock().drain(..).collect()
     }
 
@@ -216,7 +229,7 @@ impl Plane {
                 self.news_dropped.fetch_add(1, Ordering::Relaxed);
                 continue;
             }
-            news.push_back(event);
+            news.push_back(News::Link(event));
         }
         drop(news);
         self.news_waits.notify_one();
