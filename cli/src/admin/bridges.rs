@@ -14,7 +14,7 @@ use crate::output::{Align, number, render_table};
 #[derive(Debug, Clone, Deserialize)]
 pub struct Bridges {
     /// `layer/node` of the flow that answers.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::text_or_null")]
     pub flow: String,
     /// Its bridges.
     pub bridges: Vec<Bridge>,
@@ -53,7 +53,7 @@ pub struct Place {
     /// `node`, `layer` or `inter`.
     pub scope: String,
     /// Message system: `memory`, `dds`, …
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::text_or_null")]
     pub broker: String,
     /// Destination layer, where `scope` is `inter`.
     #[serde(default)]

@@ -6,6 +6,7 @@ mod topics;
 mod why;
 
 use serde::de::DeserializeOwned;
+use serde::{Deserialize as _, Deserializer};
 use serde_json::Value;
 
 use crate::args::{FlowAddress, WhyOptions};
@@ -105,6 +106,11 @@ pub fn typed<T: DeserializeOwned>(flow: &FlowAddress, value: &Value) -> Result<T
         address: flow.to_string(),
         reason: error.to_string(),
     })
+}
+
+/// A text that may be missing or `null`: then it is empty.
+fn text_or_null<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
+    Ok(Option::deserialize(deserializer)?.unwrap_or_default())
 }
 
 /// Who answered, above a table.

@@ -16,7 +16,7 @@ struct Peers {
 #[derive(Debug, Deserialize)]
 struct Peer {
     flow: String,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::text_or_null")]
     kind: String,
     state: String,
     #[serde(default)]
@@ -83,7 +83,7 @@ mod tests {
             {"flow": "fog/fog-1", "layer": "fog", "kind": "fog", "epoch": 7, "version": 3, "state": "up",
              "last_heard_ms": 120, "rtt_ms": 0.4, "clock_offset_ms": -0.01, "clock_error_ms": 0.2, "loss": 0.015,
              "address": "10.0.3.1"},
-            {"flow": "cloud/cloud-1", "state": "down"}]});
+            {"flow": "cloud/cloud-1", "kind": null, "rtt_ms": null, "state": "down"}]});
         let flow = "127.0.0.1:9101".parse().unwrap();
         assert_eq!(
             table(&flow, &value, None).unwrap(),

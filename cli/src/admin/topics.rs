@@ -30,11 +30,11 @@ pub(super) struct Topic {
 
 #[derive(Debug, Deserialize)]
 struct Lease {
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::text_or_null")]
     layer: String,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::text_or_null")]
     node: String,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::text_or_null")]
     service: String,
     #[serde(default)]
     max_rate_hz: Option<f64>,

@@ -10,7 +10,7 @@ pub(super) struct Why {
     #[serde(default)]
     to: Option<Value>,
     verdict: Verdict,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::text_or_null")]
     pub(super) code: String,
     #[serde(default)]
     remedy: Option<String>,
@@ -28,11 +28,11 @@ enum Verdict {
 
 #[derive(Debug, Deserialize)]
 struct Step {
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::text_or_null")]
     flow: String,
     step: String,
     ok: bool,
-    #[serde(default)]
+    #[serde(default, deserialize_with = "super::text_or_null")]
     code: String,
     #[serde(default)]
     detail: Option<String>,

@@ -76,11 +76,7 @@ pub async fn run(options: DemoOptions, format: Format) -> Result<Exit, CliError>
 }
 
 /// Starts nodes and publishers while the recordings are read.
-async fn prepare(
-    options: &DemoOptions,
-    supervisor: Supervisor,
-    start: Instant,
-) -> Result<(System, Script), CliError> {
+async fn prepare(options: &DemoOptions, supervisor: Supervisor, start: Instant) -> Result<(System, Script), CliError> {
     let files = options.record.clone();
     let reading = tokio::task::spawn_blocking(move || match files.as_slice() {
         [] => recording::load_built_in(),
@@ -124,7 +120,10 @@ fn tell_skipped(recordings: &[Recording]) {
             eprintln!("blaze: {file}: {} is not played: {}", skipped.topic, skipped.reason);
         }
         if recording.unusable_messages > 0 {
-            eprintln!("blaze: {file}: {} messages cannot be played", recording.unusable_messages);
+            eprintln!(
+                "blaze: {file}: {} messages cannot be played",
+                recording.unusable_messages
+            );
         }
     }
 }
@@ -148,11 +147,17 @@ async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<N
         Some(IpAddr::V4(address)) => address,
         Some(IpAddr::V6(_)) | None => Ipv4Addr::LOCALHOST,
     };
-    let reserved = if options.is_complete() { domain_id::reserve(listen) } else { None };
+    let reserved = if options.is_complete() {
+        domain_id::reserve(listen)
+    } else {
+        None
+    };
     let domain = match &reserved {
         Some(reserved) => reserved.domain,
         None if options.is_complete() => {
-            return Err(CliError::Failed("every DDS domain from 20 to 100 is in use on this host".to_owned()));
+            return Err(CliError::Failed(
+                "every DDS domain from 20 to 100 is in use on this host".to_owned(),
+            ));
         }
         None => DEFAULT_DOMAIN,
     };
@@ -173,15 +178,26 @@ async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<N
         let flow_options = FlowOptions {
             settings,
             node: Some(Arc::new(node_hub.broker())),
-            layer: Some(LayerBroker { broker: Arc::new(layer_hub.broker()), id }),
+            layer: Some(LayerBroker {
+                broker: Arc::new(layer_hub.broker()),
+                id,
+            }),
             state_dir: None,
         };
         let flow = blaze_flow::flow::start(flow_options, supervisor.child(node.name()))
             .await
             .map_err(|error| CliError::Failed(format!("{} does not start: {error:#}", node.name())))?;
-        running.push(RunningNode { node, node_hub, layer_hub, flow });
+        running.push(RunningNode {
+            node,
+            node_hub,
+            layer_hub,
+            flow,
+        });
     }
-    Ok(Nodes { running, _domain: reserved })
+    Ok(Nodes {
+        running,
+        _domain: reserved,
+    })
 }
 
 /// Different in each process: layer hubs of two processes are not connected.
@@ -190,12 +206,7 @@ fn random_u64() -> u64 {
 }
 
 /// What a node of the demo has in its node file, with the user's `--set` on top.
-fn settings_of(
-    node: DemoNode,
-    options: &DemoOptions,
-    listen: Ipv4Addr,
-    domain: u16,
-) -> Result<FlowSettings, CliError> {
+fn settings_of(node: DemoNode, options: &DemoOptions, listen: Ipv4Addr, domain: u16) -> Result<FlowSettings, CliError> {
     let peers: Vec<String> = options.peer.iter().map(|peer| format!("\"{peer}\"")).collect();
     let (layer, name, peers) = (node.layer(), node.name(), peers.join(", "));
     let own = [
@@ -203,14 +214,22 @@ fn settings_of(
         ("node", format!("{{ name: {name} }}")),
         ("brokers.node", "{ memory: {} }".to_owned()),
         ("brokers.layer", "{ memory: {} }".to_owned()),
-        ("brokers.inter", format!("{{ dds: {{ domain: {domain}, listen: \"{listen}\", peers: [{peers}] }} }}")),
+        (
+            "brokers.inter",
+            format!("{{ dds: {{ domain: {domain}, listen: \"{listen}\", peers: [{peers}] }} }}"),
+        ),
         ("admin.flow", "\"127.0.0.1:0\"".to_owned()),
     ];
     let sources = Sources {
         overrides: own
             .into_iter()
             .map(|(key, value)| (key.to_owned(), value))
-            .chain(options.set.iter().map(|setting| (setting.key.clone(), setting.value.clone())))
+            .chain(
+                options
+                    .set
+                    .iter()
+                    .map(|setting| (setting.key.clone(), setting.value.clone())),
+            )
             .collect(),
         file_may_be_absent: true,
         ..Sources::default()
@@ -219,7 +238,9 @@ fn settings_of(
         faults.into_iter().map(|fault| (fault.path, fault.detail)).collect()
     };
     let schema: Schema<NodeFile> = Arc::new(move |tree| {
-        NodeFile::read(tree).map(|(file, warnings)| (file, remarks(warnings))).map_err(remarks)
+        NodeFile::read(tree)
+            .map(|(file, warnings)| (file, remarks(warnings)))
+            .map_err(remarks)
     });
     let loaded = load_typed(&sources, &schema).map_err(|faults| {
         let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
@@ -231,10 +252,15 @@ fn settings_of(
 async fn wait_ready(nodes: &Nodes) -> Result<(), CliError> {
     for running in &nodes.running {
         let name = running.node.name();
-        tokio::time::timeout(READY_TIMEOUT, running.flow.ready()).await.map_err(|_| {
-            let waited = READY_TIMEOUT.as_secs();
-            CliError::Failed(format!("{name} was not ready within {waited} s; see http://{}/readyz", running.flow.admin()))
-        })?;
+        tokio::time::timeout(READY_TIMEOUT, running.flow.ready())
+            .await
+            .map_err(|_| {
+                let waited = READY_TIMEOUT.as_secs();
+                CliError::Failed(format!(
+                    "{name} was not ready within {waited} s; see http://{}/readyz",
+                    running.flow.admin()
+                ))
+            })?;
         eprintln!("ready node={name} admin={}", running.flow.admin());
     }
     Ok(())
@@ -290,10 +316,9 @@ impl System {
             return Ok(self);
         }
         for topic in self.topics.clone() {
-            let (publisher, lease) = self
-                .advertise(&topic)
-                .await
-                .map_err(|fault| CliError::Failed(format!("{} cannot publish {}: {fault}", topic.service, topic.name)))?;
+            let (publisher, lease) = self.advertise(&topic).await.map_err(|fault| {
+                CliError::Failed(format!("{} cannot publish {}: {fault}", topic.service, topic.name))
+            })?;
             self.publishers.push(publisher);
             self._advertised.push(lease);
         }
@@ -309,7 +334,10 @@ impl System {
             large: topic.large,
             ..PublishOptions::default()
         };
-        let publisher = service.broker().publisher(&topic.name, &publish).map_err(|error| error.to_string())?;
+        let publisher = service
+            .broker()
+            .publisher(&topic.name, &publish)
+            .map_err(|error| error.to_string())?;
         let advertise = Advertise {
             rate_hz: Some(topic.rate_hz),
             max_bytes: Some(topic.max_bytes as u64),
@@ -319,7 +347,11 @@ impl System {
             lifespan: topic.lifespan(),
             ..Advertise::new(topic.name.clone())
         };
-        let lease = service.flow().advertise(advertise).await.map_err(|error| error.to_string())?;
+        let lease = service
+            .flow()
+            .advertise(advertise)
+            .await
+            .map_err(|error| error.to_string())?;
         Ok((publisher, lease))
     }
 
@@ -328,7 +360,13 @@ impl System {
         drop(self.publishers);
         drop(self._advertised);
         let services = std::mem::take(&mut *self.services.lock().await);
-        join_all(services.into_values().filter_map(Arc::into_inner).map(ServiceManager::shutdown)).await;
+        join_all(
+            services
+                .into_values()
+                .filter_map(Arc::into_inner)
+                .map(ServiceManager::shutdown),
+        )
+        .await;
         join_all(self.nodes.running.into_iter().map(|running| running.flow.shutdown())).await;
     }
 }
@@ -347,10 +385,17 @@ impl Stage for EndableSystem {
 
     async fn listen(&self, consumer: &Consumer, id: ConsumerId) -> Result<(), String> {
         let system = &self.system;
-        let topic = system.topics.iter().find(|topic| topic.name == consumer.topic).ok_or("nobody plays it")?;
+        let topic = system
+            .topics
+            .iter()
+            .find(|topic| topic.name == consumer.topic)
+            .ok_or("nobody plays it")?;
         let service = system.service(consumer.service, consumer.node).await?;
         let board = Arc::clone(&system.board);
-        let options = SubscribeOptions { large: topic.large, ..SubscribeOptions::default() };
+        let options = SubscribeOptions {
+            large: topic.large,
+            ..SubscribeOptions::default()
+        };
         let subscription = service
             .broker()
             .subscribe(&topic.name, options, move |message| {
@@ -366,8 +411,16 @@ impl Stage for EndableSystem {
             lifespan: topic.lifespan(),
             ..Request::new(topic.name.clone())
         };
-        let lease = service.flow().request(request).await.map_err(|error| error.to_string())?;
-        system.listeners.lock().await.insert(id, Listener { subscription, lease });
+        let lease = service
+            .flow()
+            .request(request)
+            .await
+            .map_err(|error| error.to_string())?;
+        system
+            .listeners
+            .lock()
+            .await
+            .insert(id, Listener { subscription, lease });
         Ok(())
     }
 
@@ -376,7 +429,9 @@ impl Stage for EndableSystem {
             return Ok(());
         };
         let withdrawn = listener.lease.withdraw().await;
-        self.system.board.set_consumer_counts(id, counts_of(&listener.subscription));
+        self.system
+            .board
+            .set_consumer_counts(id, counts_of(&listener.subscription));
         listener.subscription.close().await;
         withdrawn.map_err(|error| error.to_string())
     }
@@ -395,7 +450,9 @@ impl Stage for EndableSystem {
 
     async fn look(&self) {
         for (id, listener) in self.system.listeners.lock().await.iter() {
-            self.system.board.set_consumer_counts(*id, counts_of(&listener.subscription));
+            self.system
+                .board
+                .set_consumer_counts(*id, counts_of(&listener.subscription));
         }
     }
 
@@ -406,11 +463,17 @@ impl Stage for EndableSystem {
 
 fn counts_of(subscription: &Subscription) -> ConsumerCounts {
     let stats = subscription.stats();
-    ConsumerCounts { queue_full: stats.queue_dropped, lifespan: stats.expired, duplicated: stats.duplicated }
+    ConsumerCounts {
+        queue_full: stats.queue_dropped,
+        lifespan: stats.expired,
+        duplicated: stats.duplicated,
+    }
 }
 
 fn unix_ns() -> u64 {
-    let since_epoch = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let since_epoch = SystemTime::now()
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .unwrap_or_default();
     u64::try_from(since_epoch.as_nanos()).unwrap_or(u64::MAX)
 }
 
