@@ -16,7 +16,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_domain::Priority;
-use blaze_flow::link::dds::{Chunking, DdsConfig, DdsTransport};
+use blaze_domain::node_file::Chunking;
+use blaze_flow::link::dds::{DdsConfig, DdsTransport};
 use blaze_flow::link::transport::{Endpoint, SendOutcome, Transport, TransportEvent};
 use bytes::Bytes;
 use parking_lot::Mutex;

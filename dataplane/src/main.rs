@@ -109,7 +109,11 @@ async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
 }
 
 async fn start(supervisor: &Supervisor, file: &NodeFile) -> anyhow::Result<(RunningFlow, LogHandle)> {
-    let format = if file.log.format.as_str() == "json" { LogFormat::Json } else { LogFormat::Text };
+    let format = if file.log.format.as_str() == "json" {
+        LogFormat::Json
+    } else {
+        LogFormat::Text
+    };
     let log = logs::init(file.log.level.as_str(), format)?;
     let directory = state::state_directory(file.state_dir.as_deref())?;
     if let Some(refused) = &directory.instead_of {
@@ -119,7 +123,9 @@ async fn start(supervisor: &Supervisor, file: &NodeFile) -> anyhow::Result<(Runn
     let node = match &file.brokers.node {
         None => None,
         Some(NodeBroker::Memory) => Some(MemoryHub::new(settings.me.to_string())),
-        Some(NodeBroker::Redis(_)) => anyhow::bail!("brokers.node.redis: this version has no Redis adapter; use memory: {{}}"),
+        Some(NodeBroker::Redis(_)) => {
+            anyhow::bail!("brokers.node.redis: this version has no Redis adapter; use memory: {{}}")
+        }
     };
     let layer = match &file.brokers.layer {
         None => None,
@@ -132,7 +138,10 @@ async fn start(supervisor: &Supervisor, file: &NodeFile) -> anyhow::Result<(Runn
         settings,
         node: node.map(|hub| Arc::new(hub.broker()) as Arc<dyn blaze_brokers::Broker>),
         // Only this process sees it, so nobody shares its identity.
-        layer: layer.map(|hub| LayerBroker { broker: Arc::new(hub.broker()), id: LayerScopeId::private() }),
+        layer: layer.map(|hub| LayerBroker {
+            broker: Arc::new(hub.broker()),
+            id: LayerScopeId::private(),
+        }),
         state_dir: Some(directory.path),
     };
     Ok((blaze_flow::flow::start(options, supervisor.clone()).await?, log))

@@ -38,6 +38,14 @@ pub struct FlowView {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct LayerScopeId(pub u64);
 
+impl LayerScopeId {
+    /// Identity of a broker that only this process sees.
+    #[must_use]
+    pub fn private() -> Self {
+        Self(rand::random::<u64>().max(1))
+    }
+}
+
 /// What a flow says of itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum FlowState {

@@ -51,7 +51,10 @@ impl Admin {
         let (_, text) = self.get("/metrics").ok()?;
         let line = text.lines().find(|line| {
             line.starts_with(name)
-                && line.as_bytes().get(name.len()).is_some_and(|b| matches!(b, b'{' | b' '))
+                && line
+                    .as_bytes()
+                    .get(name.len())
+                    .is_some_and(|b| matches!(b, b'{' | b' '))
                 && labels.iter().all(|label| line.contains(label))
         })?;
         line.rsplit(' ').next()?.parse().ok()
@@ -61,7 +64,11 @@ impl Admin {
         let timeout = Duration::from_secs(2);
         let mut stream = TcpStream::connect_timeout(&self.address, timeout)?;
         stream.set_read_timeout(Some(timeout))?;
-        write!(stream, "GET {path} HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n", self.address)?;
+        write!(
+            stream,
+            "GET {path} HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n",
+            self.address
+        )?;
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer)?;
         Ok(String::from_utf8_lossy(&answer).into_owned())
@@ -73,8 +80,9 @@ impl Admin {
             self.address.ip(),
             self.address.port()
         );
-        let output =
-            std::process::Command::new("ip").args(["netns", "exec", namespace, "bash", "-c", &script]).output()?;
+        let output = std::process::Command::new("ip")
+            .args(["netns", "exec", namespace, "bash", "-c", &script])
+            .output()?;
         Ok(String::from_utf8_lossy(&output.stdout).into_owned())
     }
 }

@@ -12,8 +12,15 @@ static NEXT: AtomicU32 = AtomicU32::new(0);
 /// # Errors
 /// When it fails; the message holds what it printed.
 pub fn run(command: &str) -> anyhow::Result<String> {
-    let output = Command::new("bash").args(["-c", command]).output().with_context(|| command.to_owned())?;
-    let text = format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    let output = Command::new("bash")
+        .args(["-c", command])
+        .output()
+        .with_context(|| command.to_owned())?;
+    let text = format!(
+        "{}{}",
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr)
+    );
     anyhow::ensure!(output.status.success(), "{command}: {text}");
     Ok(text)
 }
@@ -60,7 +67,9 @@ impl Pair {
             "ip netns exec {name} cat /sys/class/net/v0/statistics/tx_bytes /sys/class/net/v0/statistics/tx_packets"
         ))?;
         let numbers: Vec<u64> = text.split_whitespace().map(str::parse).collect::<Result<_, _>>()?;
-        let [bytes, packets] = numbers[..] else { anyhow::bail!("two numbers expected: {text}") };
+        let [bytes, packets] = numbers[..] else {
+            anyhow::bail!("two numbers expected: {text}")
+        };
         const ETHERNET_HEADER: u64 = 14;
         Ok((bytes.saturating_sub(packets * ETHERNET_HEADER), packets))
     }

@@ -20,9 +20,16 @@ const MAX_LINES: usize = 20_000;
 /// When it has not been built.
 pub fn binary(name: &str) -> anyhow::Result<PathBuf> {
     let test = std::env::current_exe()?;
-    let folder = test.parent().and_then(|deps| deps.parent()).context("the test lies in target/<profile>/deps")?;
+    let folder = test
+        .parent()
+        .and_then(|deps| deps.parent())
+        .context("the test lies in target/<profile>/deps")?;
     let path = folder.join(name);
-    anyhow::ensure!(path.exists(), "{} is not built: run `cargo build --workspace` first", path.display());
+    anyhow::ensure!(
+        path.exists(),
+        "{} is not built: run `cargo build --workspace` first",
+        path.display()
+    );
     Ok(path)
 }
 
@@ -51,11 +58,20 @@ impl Process {
                 command
             }
         };
-        command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command
+            .args(arguments)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped());
         let mut child = command.spawn().with_context(|| format!("starting {name}"))?;
         let stdout = collect(child.stdout.take());
         let stderr = collect(child.stderr.take());
-        Ok(Self { child, namespace: namespace.map(str::to_owned), stdout, stderr })
+        Ok(Self {
+            child,
+            namespace: namespace.map(str::to_owned),
+            stdout,
+            stderr,
+        })
     }
 
     /// Its process id. `ip netns exec` replaces itself, so it is that of the program also in a namespace.
@@ -88,8 +104,16 @@ impl Process {
             || self.stderr().into_iter().find(|line| line.starts_with(&start)),
             || self.tail(),
         )?;
-        let address = line.split("admin=").nth(1).context("no admin= in the ready line")?.trim().parse()?;
-        Ok(Admin { address, namespace: self.namespace.clone() })
+        let address = line
+            .split("admin=")
+            .nth(1)
+            .context("no admin= in the ready line")?
+            .trim()
+            .parse()?;
+        Ok(Admin {
+            address,
+            namespace: self.namespace.clone(),
+        })
     }
 
     /// Kills it at once, as a crash would, and waits for its end.
@@ -107,7 +131,9 @@ impl Process {
     /// # Errors
     /// When it does not end in time.
     pub fn terminate(&mut self, deadline: Duration) -> anyhow::Result<Option<i32>> {
-        Command::new("kill").args(["-TERM", &self.child.id().to_string()]).status()?;
+        Command::new("kill")
+            .args(["-TERM", &self.child.id().to_string()])
+            .status()?;
         self.exit(deadline)
     }
 

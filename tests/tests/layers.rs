@@ -1,5 +1,7 @@
 //! Which crate may know which: the table of ARCHITECTURE.md, checked against `cargo metadata`.
 
+#![allow(clippy::expect_used, reason = "the helpers of a test fail like the test")]
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use cargo_metadata::MetadataCommand;
@@ -10,10 +12,36 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("blaze-proto", &["blaze-domain"]),
     ("blaze-runtime", &[]),
     ("blaze-brokers", &["blaze-domain", "blaze-proto", "blaze-runtime"]),
-    ("blaze-flow", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"]),
-    ("blaze-sdk", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"]),
-    ("blaze", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers", "blaze-flow", "blaze-sdk"]),
-    ("blaze-tests", &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers", "blaze-flow", "blaze-sdk"]),
+    (
+        "blaze-flow",
+        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"],
+    ),
+    (
+        "blaze-sdk",
+        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"],
+    ),
+    (
+        "blaze",
+        &[
+            "blaze-domain",
+            "blaze-proto",
+            "blaze-runtime",
+            "blaze-brokers",
+            "blaze-flow",
+            "blaze-sdk",
+        ],
+    ),
+    (
+        "blaze-tests",
+        &[
+            "blaze-domain",
+            "blaze-proto",
+            "blaze-runtime",
+            "blaze-brokers",
+            "blaze-flow",
+            "blaze-sdk",
+        ],
+    ),
 ];
 
 /// Crates that may use an outside crate which would otherwise creep in everywhere.
@@ -21,7 +49,17 @@ const OUTSIDE: &[(&str, &[&str])] = &[
     ("rustdds", &["blaze-brokers"]),
     ("axum", &["blaze-runtime", "blaze-flow"]),
     ("anyhow", &["blaze-runtime", "blaze-flow", "blaze", "blaze-tests"]),
-    ("tokio", &["blaze-runtime", "blaze-brokers", "blaze-flow", "blaze-sdk", "blaze", "blaze-tests"]),
+    (
+        "tokio",
+        &[
+            "blaze-runtime",
+            "blaze-brokers",
+            "blaze-flow",
+            "blaze-sdk",
+            "blaze",
+            "blaze-tests",
+        ],
+    ),
 ];
 
 fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
@@ -30,7 +68,10 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
         .packages
         .iter()
         .map(|package| {
-            let normal = package.dependencies.iter().filter(|d| d.kind == cargo_metadata::DependencyKind::Normal);
+            let normal = package
+                .dependencies
+                .iter()
+                .filter(|d| d.kind == cargo_metadata::DependencyKind::Normal);
             (package.name.to_string(), normal.map(|d| d.name.clone()).collect())
         })
         .collect()
@@ -44,7 +85,10 @@ fn our_crates_know_only_whom_they_may() {
     assert_eq!(members, names, "every crate of the workspace is in the table");
     for (name, allowed) in ALLOWED {
         for dependency in found[*name].iter().filter(|d| names.contains(d.as_str())) {
-            assert!(allowed.contains(&dependency.as_str()), "{name} must not depend on {dependency}");
+            assert!(
+                allowed.contains(&dependency.as_str()),
+                "{name} must not depend on {dependency}"
+            );
         }
     }
 }
@@ -55,7 +99,10 @@ fn outside_crates_stay_where_they_belong() {
     for (outside, allowed) in OUTSIDE {
         for (name, dependencies) in &found {
             let uses = dependencies.contains(*outside);
-            assert!(!uses || allowed.contains(&name.as_str()), "{name} must not depend on {outside}");
+            assert!(
+                !uses || allowed.contains(&name.as_str()),
+                "{name} must not depend on {outside}"
+            );
         }
     }
 }

@@ -9,7 +9,6 @@
 //! ```
 
 use std::collections::{BTreeMap, HashMap};
-use std::hash::{BuildHasher as _, Hasher as _, RandomState};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -172,7 +171,7 @@ async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<N
     for (node, settings) in settings {
         let (layer_hub, id) = layers
             .entry(node.layer())
-            .or_insert_with(|| (MemoryHub::new(node.layer()), LayerScopeId(random_u64())))
+            .or_insert_with(|| (MemoryHub::new(node.layer()), LayerScopeId::private()))
             .clone();
         let node_hub = MemoryHub::new(node.name());
         let flow_options = FlowOptions {
@@ -198,11 +197,6 @@ async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<N
         running,
         _domain: reserved,
     })
-}
-
-/// Different in each process: layer hubs of two processes are not connected.
-fn random_u64() -> u64 {
-    RandomState::new().build_hasher().finish()
 }
 
 /// What a node of the demo has in its node file, with the user's `--set` on top.

@@ -53,7 +53,7 @@ pub enum Output {
         /// The flow.
         to: FlowId,
         /// The message.
-        body: Body,
+        body: Box<Body>,
     },
     /// Make the bridges of a topic equal to this plan.
     Plan {
@@ -236,7 +236,10 @@ impl ControlCore {
         }
         self.plan_due(now, wall_ms);
         for (to, body) in self.registry.poll(now) {
-            self.outputs.push_back(Output::Link { to, body });
+            self.outputs.push_back(Output::Link {
+                to,
+                body: Box::new(body),
+            });
         }
         let announced = self.registry.announced();
         if announced != self.announced {

@@ -16,7 +16,7 @@ use serde_json::{Map, Value, json};
 use super::Shared;
 use super::plane::wall_ns;
 use crate::lane::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
-use crate::link::PeerState;
+use crate::link::{Engine, PeerState};
 use crate::plan::Target;
 use crate::registry::{LeaseView, Terms};
 use crate::world::{Advertise, Request};
@@ -276,7 +276,7 @@ async fn peers(State(shared): App) -> Json<Value> {
     let now = Instant::now();
     let peers = shared
         .plane
-        .read(|state| state.engine.as_ref().map(|engine| engine.peers()).unwrap_or_default());
+        .read(|state| state.engine.as_ref().map(Engine::peers).unwrap_or_default());
     let control = shared.control.lock();
     let rows: Vec<Value> = peers
         .iter()

@@ -91,7 +91,7 @@ impl ControlTask {
                     transport.follow(&news);
                 }
                 if let News::Link(event) = news {
-                    control.link_event(now, event);
+                    control.link_event(now, *event);
                 }
             }
             control.tick(now, wall_ms());
@@ -109,7 +109,7 @@ impl ControlTask {
         match output {
             Output::Publish { scope, channel, body } => self.publish(scope, channel, &body),
             Output::Link { to, body } => {
-                plane.with(|state| state.engine.as_mut().map(|engine| engine.send_control(now, &to, body)));
+                plane.with(|state| state.engine.as_mut().map(|engine| engine.send_control(now, &to, *body)));
             }
             Output::Announce { version, digest } => {
                 plane.with(|state| {

@@ -75,18 +75,29 @@ impl InterTransport {
     /// Makes and drops writers as peers come and go. Of a peer that is down the control writer stays: it carries Hello
     /// until the peer is forgotten, says Goodbye or begins a new life.
     fn follow(&self, news: &News) {
-        let endpoint = |flow: &FlowId, epoch: u64| Endpoint { flow: flow.clone(), epoch };
-        match news {
-            News::Discovered(found) => self.dds.connect(found),
-            News::Link(LinkEvent::PeerUp { flow, epoch }) => self.dds.connect(&endpoint(flow, *epoch)),
-            News::Link(LinkEvent::PeerDown { flow, epoch, reason: DownReason::Silent }) => {
-                self.dds.disconnect(&endpoint(flow, *epoch), &[Priority::State, Priority::Bulk]);
+        let endpoint = |flow: &FlowId, epoch: u64| Endpoint {
+            flow: flow.clone(),
+            epoch,
+        };
+        let event = match news {
+            News::Discovered(found) => return self.dds.connect(found),
+            News::Link(event) => event.as_ref(),
+        };
+        match event {
+            LinkEvent::PeerUp { flow, epoch } => self.dds.connect(&endpoint(flow, *epoch)),
+            LinkEvent::PeerDown {
+                flow,
+                epoch,
+                reason: DownReason::Silent,
+            } => {
+                self.dds
+                    .disconnect(&endpoint(flow, *epoch), &[Priority::State, Priority::Bulk]);
             }
-            News::Link(LinkEvent::PeerDown { flow, epoch, .. } | LinkEvent::PeerForgotten { flow, epoch }) => {
+            LinkEvent::PeerDown { flow, epoch, .. } | LinkEvent::PeerForgotten { flow, epoch } => {
                 self.dds.disconnect(&endpoint(flow, *epoch), Priority::ALL);
             }
-            News::Link(LinkEvent::Addresses(addresses)) => self.dds.learn_addresses(addresses),
-            News::Link(_) => {}
+            LinkEvent::Addresses(addresses) => self.dds.learn_addresses(addresses),
+            _ => {}
         }
     }
 
@@ -288,32 +299,38 @@ impl RunningFlow {
         *self.shared.live.lock() = live;
     }
 
-    /// Drains: takes in nothing more, lets out what is queued, says good-bye, ends.
-    pub async fn shutdown(mut self) {
-        self.shared.readiness.stop();
+    /// Takes in nothing more, lets out what is queued and says good-bye. The admin port stays.
+    pub async fn drain(&self) {
+        let shared = &self.shared;
+        shared.readiness.stop();
         self.draining.cancel();
-        let until = Instant::now() + DRAIN;
         let still_draining = || {
-            self.shared.plane.with(|state| {
+            shared.plane.with(|state| {
                 state.run_timers(Instant::now());
                 state.core.is_draining()
             })
         };
+        let until = Instant::now() + DRAIN;
         while Instant::now() < until && still_draining() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
-        self.shared
+        shared
             .plane
             .with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
-        if self.shared.transport.is_some() {
+        if shared.transport.is_some() {
             tokio::time::sleep(GOODBYE).await;
         }
-        self.shared.routes.stop();
-        self.shared.egress.stop();
-        self.shared.plane.wake();
-        if let Some(pacer) = self.pacer.take() {
+        shared.routes.stop();
+        shared.egress.stop();
+        shared.plane.wake();
+        if let Some(pacer) = &self.pacer {
             pacer.finished().await;
         }
+    }
+
+    /// Drains and ends all tasks.
+    pub async fn shutdown(self) {
+        self.drain().await;
         self.supervisor.shutdown(Duration::from_secs(1)).await;
     }
 }

@@ -26,7 +26,7 @@ const MAX_NEWS: usize = 10_000;
 #[derive(Debug)]
 pub enum News {
     /// Something happened on the link.
-    Link(LinkEvent),
+    Link(Box<LinkEvent>),
     /// An endpoint was found: writers to it are to be made.
     Discovered(Endpoint),
 }
@@ -229,7 +229,7 @@ impl Plane {
                 self.news_dropped.fetch_add(1, Ordering::Relaxed);
                 continue;
             }
-            news.push_back(News::Link(event));
+            news.push_back(News::Link(Box::new(event)));
         }
         drop(news);
         self.news_waits.notify_one();

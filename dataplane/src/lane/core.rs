@@ -580,6 +580,11 @@ impl BridgeState {
                     arrived: now,
                     reliable: self.lane.reliable,
                     lifespan: (lifespan_ms > 0).then(|| Duration::from_millis(lifespan_ms.into())),
+                    keep_newest: if *class == Priority::Bulk && !self.lane.reliable {
+                        self.lane.depth.max(1) as usize
+                    } else {
+                        0
+                    },
                 };
                 if let Err(reason) = link.submit(now, submit) {
                     self.stats.dropped.add(reason, 1);

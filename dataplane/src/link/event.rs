@@ -42,6 +42,9 @@ pub struct Submit<'a> {
     pub reliable: bool,
     /// Age (that of the frame included) at which it is of no use; `None` = never.
     pub lifespan: Option<Duration>,
+    /// At most this many of its lane and stream wait unstarted, itself included: older ones give way, so that a link
+    /// that is too slow for a topic carries its newest messages and not its oldest. 0 = only bytes count.
+    pub keep_newest: usize,
 }
 
 /// A datagram to hand to the transport.

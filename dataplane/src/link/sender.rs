@@ -191,6 +191,9 @@ impl SendClass {
 
     /// Takes a message; the oldest that are not started give way.
     pub(crate) fn submit(&mut self, submit: Submit<'_>, ledger: &mut Ledger) {
+        if submit.keep_newest > 0 {
+            self.make_place(submit.lane, submit.stream, submit.keep_newest, ledger);
+        }
         let message = Outgoing::new(submit, self.part_bytes());
         let cost = Self::cost(&message);
         while self.waiting_bytes > 0 && self.queue_bytes() + cost > self.limits.queue_bytes {
@@ -204,6 +207,20 @@ impl SendClass {
         self.waiting_bytes += cost;
         let key = self.messages.insert(message);
         self.waiting.push_back(key);
+    }
+
+    /// Lets the oldest unstarted messages of a stream go, until there is place for one more among the newest `keep`.
+    fn make_place(&mut self, lane: LaneId, stream: StreamKey, keep: usize, ledger: &mut Ledger) {
+        let messages = &self.messages;
+        let same = |key: &&Key| {
+            messages
+                .get(**key)
+                .is_some_and(|m| m.lane == lane && m.stream == stream)
+        };
+        let waiting: SmallVec<[Key; 4]> = self.waiting.iter().filter(same).copied().collect();
+        for oldest in waiting.iter().take((waiting.len() + 1).saturating_sub(keep)) {
+            self.drop_message(*oldest, DropReason::QueueFull, ledger);
+        }
     }
 
     /// Takes a message away and counts it. A started one leaves its place in the order to the one before it.

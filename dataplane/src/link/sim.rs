@@ -411,6 +411,7 @@ impl Sim {
             arrived: self.now,
             reliable: post.reliable,
             lifespan: post.lifespan,
+            keep_newest: 0,
         };
         let node = &mut self.nodes[from];
         node.engine.submit(self.now, submit)?;

@@ -5,6 +5,8 @@
 //! requester must get each message of every matching publisher exactly once; and at no time may a (writer, sequence) be
 //! written twice into one scope.
 
+#![allow(clippy::unwrap_used, reason = "the helpers of a test fail like the test")]
+
 mod world;
 
 use world::{Chaos, Simulation};
@@ -18,6 +20,7 @@ fn seeds() -> u64 {
     }
 }
 
+#[allow(clippy::disallowed_methods, reason = "which seeds a test runs is no configuration")]
 fn run_seeds(name: &str, chaos: &Chaos) {
     let only: Option<u64> = std::env::var("BLAZE_SEED").ok().and_then(|text| text.parse().ok());
     let range = only.map_or(0..seeds(), |seed| seed..seed + 1);

@@ -35,6 +35,9 @@ pub(crate) struct Chaos {
     pub(crate) churn: bool,
 }
 
+/// A message in a scope.
+type Delivered = (TopicName, WriterId, u64);
+
 /// One scope's broker: survives its flow.
 #[derive(Default)]
 struct ScopeState {
@@ -511,7 +514,7 @@ impl<'a> Simulation<'a> {
             let Some(engine) = &mut flow.plane.engine else { continue };
             match output {
                 Output::Publish { .. } => {}
-                Output::Link { to, body } => drop(engine.send_control(now, &to, body)),
+                Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
                 Output::Announce { version, digest } => engine.set_registry(now, version, digest),
                 Output::State(state) => engine.set_state(now, hello_state(state)),
                 Output::Plan { topic, plan, info } => {
@@ -607,7 +610,7 @@ impl<'a> Simulation<'a> {
     }
 
     fn everybody_has(&self, sent: &[(usize, u64)], before: &HashMap<(usize, Scope), usize>) -> Result<usize, String> {
-        let mut expected: BTreeMap<(usize, Scope), BTreeSet<(TopicName, WriterId, u64)>> = BTreeMap::new();
+        let mut expected: BTreeMap<(usize, Scope), BTreeSet<Delivered>> = BTreeMap::new();
         let mut wanted: BTreeMap<(usize, Scope), BTreeSet<&TopicName>> = BTreeMap::new();
         for request in self
             .services
