@@ -35,7 +35,7 @@ use super::domain_id::{self, DEFAULT_DOMAIN, ReservedDomain};
 use super::options::{DemoNode, DemoOptions};
 use super::recording::{self, Recording};
 use super::report::{Report, Style};
-use super::roles::{Consumer, PUBLISHING_NODE, PlayedTopic, consumers, played_topics};
+use super::roles::{Consumer, PUBLISHING_NODE, PlayedTopic, consumers, played_topics, scope_of};
 use super::session::{self, Script, Stage};
 use crate::exit::{CliError, Exit};
 use crate::output::Format;
@@ -286,10 +286,10 @@ impl System {
         }
         let running = self.nodes.running.iter().find(|running| running.node == node);
         let running = running.ok_or_else(|| format!("{} does not run here", node.name()))?;
-        // On the edge a service talks to its node's broker, in fog and cloud to that of the layer.
-        let (hub, scope) = match node {
-            DemoNode::Robot1 | DemoNode::Edge2 => (&running.node_hub, Scope::Node),
-            DemoNode::Fog1 | DemoNode::Cloud1 => (&running.layer_hub, Scope::Layer),
+        let scope = scope_of(name, node);
+        let hub = match scope {
+            Scope::Node => &running.node_hub,
+            Scope::Layer | Scope::Inter => &running.layer_hub,
         };
         let id = running.flow.id();
         let service_name: ServiceName = name.parse().map_err(|error| format!("{name} {error}"))?;

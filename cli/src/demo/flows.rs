@@ -1,6 +1,6 @@
 //! What the flows of the demo say of themselves: by which bridges a topic travels, and what they dropped.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::net::SocketAddr;
 use std::time::Duration;
 
@@ -58,17 +58,18 @@ impl FlowView {
         view
     }
 
-    /// Bridges of a topic that carry, for people: `edge/robot-1 → cloud`.
+    /// Bridges of a topic that carry, for people: `robot-1 node→inter/cloud`.
     #[must_use]
-    pub fn links_of(&self, topic: &str) -> Vec<String> {
-        let carries = |(_, bridge): &&(DemoNode, Bridge)| {
-            bridge.topic == topic && bridge.to.scope == "inter" && bridge.state == "up"
+    pub fn bridges_of(&self, topic: &str) -> BTreeSet<String> {
+        let carries = |(_, bridge): &&(DemoNode, Bridge)| bridge.topic == topic && bridge.state == "up";
+        let describe = |(node, bridge): &(DemoNode, Bridge)| {
+            let to = match (bridge.to.scope.as_str(), &bridge.to.layer) {
+                ("inter", Some(layer)) => format!("inter/{layer}"),
+                (scope, _) => scope.to_owned(),
+            };
+            format!("{} {}→{to}", node.name(), bridge.from.scope)
         };
-        self.bridges
-            .iter()
-            .filter(carries)
-            .map(|(node, bridge)| format!("{} → {}", node.flow(), bridge.to.layer.as_deref().unwrap_or("?")))
-            .collect()
+        self.bridges.iter().filter(carries).map(describe).collect()
     }
 
     /// The shortest way of a topic; if its beginning is in another process, the part that is here.
@@ -214,8 +215,14 @@ mod tests {
         let edge = demo().path("imu/data", &robot, &Spot::Node(DemoNode::Edge2)).unwrap();
         assert_eq!(edge.route, ["node:memory", "layer:memory", "node:memory"]);
         assert_eq!(
-            demo().links_of("imu/data"),
-            ["edge/robot-1 → fog", "edge/robot-1 → cloud"]
+            demo().bridges_of("imu/data").into_iter().collect::<Vec<_>>(),
+            [
+                "cloud-1 inter→layer",
+                "edge-2 layer→node",
+                "robot-1 node→inter/cloud",
+                "robot-1 node→inter/fog",
+                "robot-1 node→layer",
+            ]
         );
     }
 

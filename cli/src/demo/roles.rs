@@ -8,7 +8,7 @@
 
 use std::time::Duration;
 
-use blaze_domain::{Reliability, TopicName};
+use blaze_domain::{Reliability, Scope, TopicName};
 
 use super::flows::Spot;
 use super::options::DemoNode;
@@ -104,13 +104,23 @@ pub struct Consumer {
 }
 
 impl Consumer {
-    /// Where it listens: on edge-2 its node scope, in fog and cloud the layer scope.
+    /// Where it listens.
     #[must_use]
     pub fn spot(&self) -> Spot {
-        match self.node {
-            DemoNode::Robot1 | DemoNode::Edge2 => Spot::Node(self.node),
-            DemoNode::Fog1 | DemoNode::Cloud1 => Spot::Layer(self.node.layer().to_owned()),
+        match scope_of(self.service, self.node) {
+            Scope::Node => Spot::Node(self.node),
+            Scope::Layer | Scope::Inter => Spot::Layer(self.node.layer().to_owned()),
         }
+    }
+}
+
+/// On the edge a service talks to its node's broker, in fog and cloud to that of the layer; the one that moves keeps to its
+/// node, so that its move is seen in the bridges although others in both layers listen to the same topic.
+#[must_use]
+pub fn scope_of(service: &str, node: DemoNode) -> Scope {
+    match node {
+        DemoNode::Fog1 | DemoNode::Cloud1 if service != MOVING_SERVICE => Scope::Layer,
+        _ => Scope::Node,
     }
 }
 

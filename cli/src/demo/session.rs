@@ -2,6 +2,7 @@
 //!
 //! What the flows and services are is the business of a [`Stage`]; this is the same for any.
 
+use std::collections::BTreeSet;
 use std::future::Future;
 use std::io::Write;
 use std::net::SocketAddr;
@@ -27,6 +28,8 @@ const MOVE_TIMEOUT: Duration = Duration::from_secs(5);
 const DRAIN_LIMIT: Duration = Duration::from_secs(3);
 /// No message for so long: nothing is on the way any more.
 const DRAIN_QUIET: Duration = Duration::from_millis(300);
+/// How long bridges may take to re-form after the move.
+const REFORM_LIMIT: Duration = Duration::from_secs(2);
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 
 /// The flows and services that a session runs on.
@@ -133,6 +136,8 @@ enum Moving {
         leaves: ConsumerId,
         joined: ConsumerId,
         topic: TopicName,
+        /// The topic's bridges before the move.
+        bridges: BTreeSet<String>,
         deadline: Instant,
     },
 }
@@ -254,17 +259,22 @@ impl<S: Stage> Session<'_, S> {
         let Some(later) = script.consumers.iter().find(|consumer| consumer.later) else {
             return Ok(());
         };
-        let links = self.links(&later.topic).await;
+        let bridges = self.bridges(&later.topic).await;
         let (from, to) = (MOVES_FROM.flow(), MOVES_TO.flow());
         report.event(
             self.start.elapsed(),
-            &format!("{MOVING_SERVICE} moves from {from} to {to}; {links}"),
+            &format!(
+                "{MOVING_SERVICE} moves from {from} to {to}; bridges of {}: {}",
+                later.topic,
+                list(&bridges)
+            ),
         )?;
         if let Some(joined) = self.listen(later).await {
             self.moving = Moving::Joining {
                 leaves,
                 joined,
                 topic: later.topic.clone(),
+                bridges,
                 deadline: Instant::now() + MOVE_TIMEOUT,
             };
         }
@@ -274,7 +284,11 @@ impl<S: Stage> Session<'_, S> {
     /// Leaves the old place, once it listens at the new one.
     async fn finish_move<Out: Write, Err: Write>(&mut self, report: &mut Report<Out, Err>) -> Result<(), CliError> {
         let Moving::Joining {
-            leaves, joined, topic, ..
+            leaves,
+            joined,
+            topic,
+            bridges,
+            ..
         } = std::mem::replace(&mut self.moving, Moving::No)
         else {
             return Ok(());
@@ -293,21 +307,40 @@ impl<S: Stage> Session<'_, S> {
             || "no message came to it there".to_owned(),
             |moved| format!("{:.0} ms without a message", moved.gap_ms),
         );
-        let links = self.links(&topic).await;
+        let now = self.bridges_after(&topic, &bridges).await;
+        let made: BTreeSet<String> = now.difference(&bridges).cloned().collect();
+        let ended: BTreeSet<String> = bridges.difference(&now).cloned().collect();
         report.event(
             self.start.elapsed(),
-            &format!("{MOVING_SERVICE} is on {to}: {gap}; {links}"),
+            &format!(
+                "{MOVING_SERVICE} is on {to}: {gap}; bridges made: {}; ended: {}",
+                list(&made),
+                list(&ended)
+            ),
         )
     }
 
-    /// Where a topic travels now, for people.
-    async fn links(&self, topic: &TopicName) -> String {
-        let links = FlowView::ask(&self.stage.admin_ports()).await.links_of(topic.as_str());
-        if links.is_empty() {
-            format!("no bridge carries {topic} to another layer")
-        } else {
-            format!("bridges of {topic}: {}", links.join(", "))
+    /// The bridges of a topic, for people.
+    async fn bridges(&self, topic: &TopicName) -> BTreeSet<String> {
+        FlowView::ask(&self.stage.admin_ports())
+            .await
+            .bridges_of(topic.as_str())
+    }
+
+    /// The bridges of a topic, once they differ from what they were and have settled, or after two seconds.
+    async fn bridges_after(&self, topic: &TopicName, before: &BTreeSet<String>) -> BTreeSet<String> {
+        let deadline = Instant::now() + REFORM_LIMIT;
+        let mut last = self.bridges(topic).await;
+        while Instant::now() < deadline {
+            sleep(LOOK_PERIOD).await;
+            let now = self.bridges(topic).await;
+            let lost_some = before.difference(&now).next().is_some();
+            if lost_some && now == last {
+                break;
+            }
+            last = now;
         }
+        last
     }
 
     /// Waits until nothing more arrives.
@@ -324,6 +357,13 @@ impl<S: Stage> Session<'_, S> {
             }
         }
     }
+}
+
+fn list(bridges: &BTreeSet<String>) -> String {
+    if bridges.is_empty() {
+        return "none".to_owned();
+    }
+    bridges.iter().map(String::as_str).collect::<Vec<_>>().join(", ")
 }
 
 fn pace_text(pace: &PlayerReport) -> String {
