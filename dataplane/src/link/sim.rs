@@ -250,6 +250,7 @@ pub(crate) struct Post {
     pub bytes: usize,
     pub reliable: bool,
     pub lifespan: Option<Duration>,
+    pub keep_newest: usize,
 }
 
 impl Post {
@@ -260,6 +261,7 @@ impl Post {
             bytes: 100,
             reliable: false,
             lifespan: None,
+            keep_newest: 0,
         }
     }
 
@@ -411,7 +413,7 @@ impl Sim {
             arrived: self.now,
             reliable: post.reliable,
             lifespan: post.lifespan,
-            keep_newest: 0,
+            keep_newest: post.keep_newest,
         };
         let node = &mut self.nodes[from];
         node.engine.submit(self.now, submit)?;

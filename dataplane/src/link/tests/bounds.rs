@@ -57,6 +57,46 @@ fn the_oldest_that_waits_gives_way() {
 }
 
 #[test]
+fn a_link_that_is_too_slow_carries_the_newest_pictures() {
+    let mut sim = Sim::new(3, Weather::delay(10), &["edge/a", "fog/b"]);
+    sim.run_ms(1_000);
+    // A picture of 100 kB each 33 ms is 3 MB/s; the link takes a third of that.
+    sim.nodes[0].rate = Some(1_000_000.0);
+    for _ in 0..90 {
+        sim.publish(
+            0,
+            1,
+            Post {
+                lifespan: Some(Duration::from_millis(500)),
+                keep_newest: 1,
+                ..Post::large(1, 100_000)
+            },
+        )
+        .unwrap();
+        assert!(
+            sim.nodes[0].engine.lane_queued(LaneId(1)).messages <= 4,
+            "one waits, the others are on the way"
+        );
+        sim.run_ms(33);
+    }
+    sim.run_ms(1_000);
+    let arrived = sim.sequences(1, 1);
+    assert!((25..=33).contains(&arrived.len()), "{arrived:?}");
+    assert!(
+        arrived.windows(2).all(|pair| pair[1] - pair[0] <= 5),
+        "a picture comes at any time: {arrived:?}"
+    );
+    let lane = &sim.nodes[0].lanes[&LaneId(1)];
+    assert_eq!(
+        lane.dropped.get(&DropReason::Lifespan),
+        None,
+        "none grows old in the queue"
+    );
+    assert_eq!(lane.dropped[&DropReason::QueueFull], 90 - arrived.len() as u64);
+    sim.check_accounts();
+}
+
+#[test]
 fn a_started_message_is_finished_when_the_queue_overflows() {
     let limits = Limits {
         queue_bytes: [30_000; 3],

@@ -289,6 +289,7 @@ fn whatever_happens_accounts_balance_and_nothing_comes_twice() {
                         bytes: [50, 900, 3_000, 40_000][stream as usize % 4],
                         reliable: stream.is_multiple_of(2),
                         lifespan: random.chance(0.3).then(|| Duration::from_millis(500)),
+                        keep_newest: 0,
                     };
                     for _ in 0..=random.below(6) {
                         let _ = sim.publish(from, to, post);
