@@ -112,6 +112,8 @@ pub struct ControlCore {
     started: Instant,
     reconciled: Instant,
     announced: (u64, u64),
+    /// Where other flows say that they are found.
+    addresses: BTreeMap<FlowId, String>,
     /// Control payloads or parts of them that were refused.
     pub refused: u64,
 }
@@ -140,6 +142,7 @@ impl ControlCore {
             started: now,
             reconciled: now,
             announced: (0, 0),
+            addresses: BTreeMap::new(),
             refused: 0,
         }
     }
@@ -154,6 +157,17 @@ impl ControlCore {
     #[must_use]
     pub fn world(&self) -> &World {
         self.registry.world()
+    }
+
+    /// Where another flow says that it is found.
+    #[must_use]
+    pub fn address_of(&self, flow: &FlowId) -> Option<&str> {
+        self.addresses.get(flow).map(String::as_str)
+    }
+
+    /// The flow has a new life on the link; leases and plans stay.
+    pub fn set_epoch(&mut self, epoch: u64) {
+        self.registry.set_epoch(epoch);
     }
 
     /// The plans in force, by topic.
@@ -206,14 +220,23 @@ impl ControlCore {
     /// Takes what the link says of other flows.
     pub fn link_event(&mut self, now: Instant, event: LinkEvent) {
         let changed = match event {
-            LinkEvent::Hello { from, hello } => self.registry.on_hello(now, &from, &hello),
+            LinkEvent::Hello { from, hello } => {
+                // The own address comes first.
+                if let Some(address) = hello.addresses.first() {
+                    self.addresses.insert(from.clone(), address.clone());
+                }
+                self.registry.on_hello(now, &from, &hello)
+            }
             LinkEvent::Control { from, body } => self.registry.on_control(now, &from, body),
             LinkEvent::PeerUp { flow, .. } | LinkEvent::PeerRecovered { flow } => {
                 self.registry.set_reach(now, &flow, Reach::Up)
             }
             LinkEvent::PeerSuspect { flow } => self.registry.set_reach(now, &flow, Reach::Suspect),
             LinkEvent::PeerDown { flow, .. } => self.registry.set_reach(now, &flow, Reach::Down),
-            LinkEvent::PeerForgotten { flow, .. } => self.registry.forget(&flow),
+            LinkEvent::PeerForgotten { flow, .. } => {
+                self.addresses.remove(&flow);
+                self.registry.forget(&flow)
+            }
             _ => BTreeSet::new(),
         };
         self.touch(now, changed);

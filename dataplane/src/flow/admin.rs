@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use axum::extract::{Query, State};
@@ -38,7 +39,7 @@ pub(super) fn router(shared: Arc<Shared>) -> Router {
 pub(super) fn answer(shared: &Shared, body: Value) -> Json<Value> {
     let mut whole = Map::new();
     whole.insert("flow".into(), json!(shared.me));
-    whole.insert("epoch".into(), json!(shared.epoch));
+    whole.insert("epoch".into(), json!(shared.epoch.load(Ordering::Relaxed)));
     whole.insert("time".into(), json!(rfc3339_millis(wall_ns() / 1_000_000)));
     if let Value::Object(members) = body {
         whole.extend(members);
@@ -288,7 +289,7 @@ async fn peers(State(shared): App) -> Json<Value> {
                 "rtt_ms": peer.rtt.map(|rtt| rounded(rtt.as_secs_f64() * 1e3)),
                 "clock_offset_ms": peer.clock_offset_ns.map(|ns| rounded(ns as f64 / 1e6)),
                 "clock_error_ms": peer.clock_error.map(|error| rounded(error.as_secs_f64() * 1e3)),
-                "loss": rounded(peer.loss), "address": null,
+                "loss": rounded(peer.loss), "address": control.address_of(&peer.flow),
                 "in_step": control.registry().is_in_step_with(&peer.flow),
                 "outstanding_bytes": peer.outstanding_bytes, "window_bytes": peer.window_bytes, "queue_bytes": peer.queue_bytes,
                 "receiving_bytes_per_s": peer.receiving_bytes_per_s.round(),

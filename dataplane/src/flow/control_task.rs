@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
@@ -90,8 +91,13 @@ impl ControlTask {
                 if let Some(transport) = &self.shared.transport {
                     transport.follow(&news);
                 }
-                if let News::Link(event) = news {
-                    control.link_event(now, *event);
+                match news {
+                    News::Link(event) => control.link_event(now, *event),
+                    News::Rebuilt(epoch) => {
+                        self.shared.epoch.store(epoch, Ordering::Relaxed);
+                        control.set_epoch(epoch);
+                    }
+                    News::Discovered(_) => {}
                 }
             }
             control.tick(now, wall_ms());

@@ -21,12 +21,13 @@ use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use blaze_brokers::{Broker, BrokerKind, Health};
 use blaze_domain::{FlowId, Priority};
-use blaze_proto::link::link_control::LayerScope;
+use blaze_proto::link::link_control::{Egress as SaidEgress, LayerScope};
 use blaze_runtime::admin::{AdminServer, CheckStatus, Gate, Readiness};
 use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
@@ -82,6 +83,7 @@ impl InterTransport {
         let event = match news {
             News::Discovered(found) => return self.dds.connect(found),
             News::Link(event) => event.as_ref(),
+            News::Rebuilt(_) => return,
         };
         match event {
             LinkEvent::PeerUp { flow, epoch } => self.dds.connect(&endpoint(flow, *epoch)),
@@ -109,7 +111,8 @@ impl InterTransport {
 /// What the parts of one flow share.
 pub(crate) struct Shared {
     pub(crate) me: FlowId,
-    pub(crate) epoch: u64,
+    /// Changes when the transport is rebuilt.
+    pub(crate) epoch: AtomicU64,
     pub(crate) plane: Arc<Plane>,
     pub(crate) control: Mutex<ControlCore>,
     pub(crate) routes: Routes,
@@ -118,6 +121,24 @@ pub(crate) struct Shared {
     pub(crate) egress: Arc<Egress>,
     pub(crate) live: Mutex<LiveSettings>,
     pub(crate) readiness: Readiness,
+}
+
+impl Shared {
+    /// Tells the link what its Hellos say of this flow's traffic, and the wall clock, which may have been set.
+    fn tell_link(&self) {
+        let now = Instant::now();
+        let limit = self.egress.budget() as u64;
+        self.plane.read(|state| {
+            let demand = state.core.link_demand(now) as u64;
+            if let Some(engine) = &mut state.engine {
+                engine.set_wall_clock(now, wall_ns());
+                engine.set_egress(SaidEgress {
+                    demand_bytes_per_s: demand,
+                    limit_bytes_per_s: limit,
+                });
+            }
+        });
+    }
 }
 
 /// A flow that runs.
@@ -208,7 +229,7 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
     let readiness = readiness(&brokers, transport.is_some());
     let shared = Arc::new(Shared {
         me: settings.me.clone(),
-        epoch,
+        epoch: AtomicU64::new(epoch),
         routes: Routes::new(Arc::clone(&plane), brokers.clone(), supervisor.clone()),
         plane,
         control: Mutex::new(control),
@@ -413,6 +434,7 @@ async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>) {
         if marked.elapsed() >= MARK {
             marked = Instant::now();
             shared.plane.read(|state| state.core.mark());
+            shared.tell_link();
         }
         for (check, broker) in [
             ("node_broker", &shared.brokers.node),

@@ -29,6 +29,8 @@ pub enum News {
     Link(Box<LinkEvent>),
     /// An endpoint was found: writers to it are to be made.
     Discovered(Endpoint),
+    /// The transport died and was rebuilt: the flow has this new epoch on the link.
+    Rebuilt(u64),
 }
 
 /// Nanoseconds since 1970.
@@ -160,8 +162,13 @@ impl Plane {
 
     /// Takes what the transport found.
     pub fn transport_event(&self, event: TransportEvent) {
-        if let TransportEvent::Discovered(endpoint) = &event {
-            self.news.lock().push_back(News::Discovered(endpoint.clone()));
+        let news = match &event {
+            TransportEvent::Discovered(endpoint) => Some(News::Discovered(endpoint.clone())),
+            TransportEvent::Rebuilt { epoch } => Some(News::Rebuilt(*epoch)),
+            TransportEvent::Lost(_) | TransportEvent::Received { .. } => None,
+        };
+        if let Some(news) = news {
+            self.news.lock().push_back(news);
             self.news_waits.notify_one();
         }
         self.with(|state| {

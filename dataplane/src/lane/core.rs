@@ -146,6 +146,19 @@ impl DataCore {
         bridges.any(|bridge| matches!(bridge.phase, Phase::Draining { .. }))
     }
 
+    /// Bytes of payload per second that local publishers have for other flows: one copy per lane.
+    pub fn link_demand(&mut self, now: Instant) -> f64 {
+        let mut demand = 0.0;
+        for path in &mut self.topics {
+            let is_lane = |b: &&BridgeState| matches!((&b.phase, &b.sink), (Phase::Up { .. }, Sink::Lane { .. }));
+            let lanes = path.bridges.iter().filter(is_lane).count();
+            if lanes > 0 {
+                demand += path.in_rate.rate(now).1 * lanes as f64;
+            }
+        }
+        demand
+    }
+
     /// Puts a mark into the counters of every bridge: what happened since the one before is "lately".
     pub fn mark(&mut self) {
         for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
