@@ -14,6 +14,7 @@
 mod announcement;
 #[cfg(feature = "fault-injection")]
 mod fault;
+mod filter;
 mod participant;
 mod pulse;
 mod reader;

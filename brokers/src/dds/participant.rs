@@ -13,11 +13,12 @@ use rustdds::{
     RTPSEntity, StatusEvented, Subscriber, Topic, TopicKind, no_key,
 };
 
+use super::filter::{self, Attached, FilterError, Shape};
 use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
 use super::watch::{ReaderWatch, RemoteReader};
-use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, MAX_DOMAIN, announcement_port};
+use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, MAX_DOMAIN, announcement_port, multicast_port};
 
 /// Identity of one participant on the wire; a rebuilt one has a new identity.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -47,10 +48,13 @@ pub struct ParticipantConfig {
     pub send_buffer_bytes: usize,
     /// Receive buffer of each socket in bytes; the system caps it (`net.core.rmem_max`).
     pub receive_buffer_bytes: usize,
+    /// Bytes of the largest sample that comes in fragments. RustDDS takes memory for a whole sample when the first
+    /// fragment comes, from any sender, so larger ones (than the next power of two) are dropped before it sees them.
+    pub largest_sample: u32,
 }
 
 impl ParticipantConfig {
-    /// A participant with RustDDS' receive buffer and a send buffer of 64 KiB.
+    /// A participant with RustDDS' receive buffer, a send buffer of 64 KiB and fragmented samples up to 64 KiB.
     #[must_use]
     pub fn new(domain: u16, address: Ipv4Addr) -> Self {
         Self {
@@ -58,6 +62,7 @@ impl ParticipantConfig {
             address,
             send_buffer_bytes: 64 * 1024,
             receive_buffer_bytes: DomainParticipantBuilder::DEFAULT_SOCKET_RECEIVE_BUFFER_SIZE,
+            largest_sample: 64 * 1024,
         }
     }
 
@@ -135,6 +140,7 @@ pub struct Participant {
     config: ParticipantConfig,
     prefix: GuidPrefix,
     port: u16,
+    filter: Result<Attached, FilterError>,
     failed: Arc<AtomicBool>,
 }
 
@@ -175,9 +181,14 @@ impl Participant {
                 "too many DDS participants on this host: others here do not see this one"
             );
         }
+        let port = announcement_port(config.domain, id);
+        let multicast = multicast_port(config.domain);
+        let filter = filter::attach(&[port, port + 1, multicast, multicast + 1], config.largest_sample);
+        warn_once(&filter);
         Ok(Self {
             prefix: prefix_of(dds.guid()),
-            port: announcement_port(config.domain, id),
+            port,
+            filter,
             dds,
             publisher,
             subscriber,
@@ -196,6 +207,18 @@ impl Participant {
     #[must_use]
     pub fn port(&self) -> u16 {
         self.port
+    }
+
+    /// Why hostile datagrams may reach RustDDS, or harmless ones may not; `None` when all is well.
+    #[must_use]
+    pub fn filter_weakness(&self) -> Option<String> {
+        weakness(&self.filter)
+    }
+
+    /// Datagrams that the kernel dropped at its sockets: hostile ones, and those for which no room was left.
+    #[must_use]
+    pub fn dropped_by_kernel(&self) -> u64 {
+        self.filter.as_ref().map_or(0, Attached::dropped)
     }
 
     /// Makes a writer of a topic.
@@ -290,6 +313,25 @@ impl Participant {
                 self.failed.store(true, Ordering::Relaxed);
             }
         })
+    }
+}
+
+fn weakness(filter: &Result<Attached, FilterError>) -> Option<String> {
+    match filter {
+        Ok(attached) if attached.shape == Shape::LARGE => None,
+        Ok(_) => Some("the packet filter is a small one, since net.core.optmem_max is below 128 KiB".into()),
+        Err(error) => Some(format!(
+            "no packet filter, so any sender can exhaust the memory: {error}"
+        )),
+    }
+}
+
+fn warn_once(filter: &Result<Attached, FilterError>) {
+    static WARNED: AtomicBool = AtomicBool::new(false);
+    if let Some(weakness) = weakness(filter)
+        && !WARNED.swap(true, Ordering::Relaxed)
+    {
+        tracing::warn!("{weakness}");
     }
 }
 

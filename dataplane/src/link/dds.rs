@@ -86,6 +86,9 @@ pub struct DdsStatus {
     pub not_sent: u64,
     /// Datagrams of readers that were not a sequence of octets.
     pub malformed: u64,
+    /// Datagrams that the kernel dropped at the receive sockets: hostile ones, and those for which no room was left.
+    /// Counted once a second.
+    pub dropped_by_kernel: u64,
     /// Endpoints of other flows that can be written to.
     pub endpoints: usize,
     /// Hosts to which announcements go or went.

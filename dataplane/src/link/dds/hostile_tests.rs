@@ -146,40 +146,72 @@ fn mutate(random: &mut Random, captured: &[Vec<u8>]) -> Vec<u8> {
     datagram
 }
 
-/// Whether a datagram makes RustDDS 0.15 allocate gigabytes, so that no test can survive many of them: the first part of
-/// a sample that claims to be huge, from whomever it comes, and a HEARTBEAT or GAP over billions of samples in the name
-/// of a known writer. Who may send to the ports must be limited outside, see docs/link-measurements.md.
-fn exhausts_memory(datagram: &[u8]) -> bool {
-    const LIMIT: u64 = 1 << 20;
-    let mut at = 20;
-    while let Some(head) = datagram.get(at..at + 4) {
-        let little = head[1] & 1 != 0;
-        let word = |offset: usize| {
-            let bytes = datagram
-                .get(at + offset..at + offset + 4)
-                .map_or([0; 4], |bytes| bytes.try_into().unwrap());
-            u64::from(if little {
-                u32::from_le_bytes(bytes)
-            } else {
-                u32::from_be_bytes(bytes)
-            })
-        };
-        let number = |offset: usize| word(offset) << 32 | word(offset + 4);
-        let huge = match head[0] {
-            0x16 => word(32) > LIMIT,
-            0x07 | 0x08 => number(12) > LIMIT || number(20) > LIMIT,
-            _ => false,
-        };
-        if huge {
-            return true;
+/// Datagrams that make an unprotected RustDDS 0.15 allocate up to gigabytes each, in the name of every writer and reader
+/// of discovery that a participant has.
+fn bombs(prefix: &[u8], random: &mut Random) -> Vec<Vec<u8>> {
+    let little = random.below(2) == 0;
+    let half = |value: u16| {
+        if little {
+            value.to_le_bytes()
+        } else {
+            value.to_be_bytes()
         }
-        let length = if little { [head[2], head[3]] } else { [head[3], head[2]] };
-        match u16::from_le_bytes(length) {
-            0 => return false,
-            length => at += 4 + usize::from(length),
+    };
+    let word = |value: u32| {
+        if little {
+            value.to_le_bytes()
+        } else {
+            value.to_be_bytes()
         }
+    };
+    let number = |value: u64| [word((value >> 32) as u32), word((value & 0xffff_ffff) as u32)].concat();
+    let count = (random.next() & 0x7fff_ffff) as u32;
+    let mut bombs = Vec::new();
+    let mut add = |kind: u8, fields: &[&[u8]]| {
+        let body = fields.concat();
+        let mut message = b"RTPS\x02\x04\x01\x12".to_vec();
+        message.extend_from_slice(prefix);
+        message.extend_from_slice(&[kind, u8::from(little)]);
+        message.extend_from_slice(&half(u16::try_from(body.len()).unwrap()));
+        message.extend_from_slice(&body);
+        bombs.push(message);
+    };
+    // Topics, publications, subscriptions, liveliness of participants: reader and writer.
+    for id in [b"\0\0\x02", b"\0\0\x03", b"\0\0\x04", b"\0\x02\0"] {
+        let ids = [&id[..], &[0xc7], &id[..], &[0xc2]].concat();
+        let sequence = number(1 + random.next() % 1000);
+        add(0x07, &[&ids, &number(1), &number(0x7fff_ffff), &word(count)]);
+        add(
+            0x07,
+            &[&ids, &number(1 << 40), &number((1 << 40) + (1 << 31)), &word(count)],
+        );
+        add(0x08, &[&ids, &number(1000), &number(0x7fff_0000), &word(0)]);
+        add(
+            0x12,
+            &[
+                &ids,
+                &sequence,
+                &word(0xffff_fff0),
+                &word(8),
+                &word(u32::MAX),
+                &word(count),
+            ],
+        );
+        let fragment = [&half(0)[..], &half(28), &ids, &sequence, &word(1), &half(1), &half(256)].concat();
+        add(0x16, &[&fragment, &word(0xffff_ff00), &[0; 256]]);
+        add(0x16, &[&fragment, &word(256 << 20), &[0; 256]]);
     }
-    false
+    bombs
+}
+
+/// Memory of this process in bytes: now, and the most that it ever had.
+fn resident() -> (u64, u64) {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let field = |name: &str| -> u64 {
+        let line = status.lines().find_map(|line| line.strip_prefix(name)).unwrap();
+        line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
+    };
+    (field("VmRSS:"), field("VmHWM:"))
 }
 
 #[test]
@@ -197,15 +229,21 @@ fn hostile_datagrams_do_not_end_a_flow() {
     let attacker = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
     let base = 7400 + 250 * domain;
     let targets: Vec<u16> = [base, base + 1].into_iter().chain(base + 10..base + 34).collect();
+    let (before, _) = resident();
+    let filtered = robot.transport.status().dropped_by_kernel;
     let begin = Instant::now();
     let mut sent = 0_u64;
     while begin.elapsed() < Duration::from_secs(3) {
-        let datagram = mutate(&mut random, &captured);
-        if exhausts_memory(&datagram) {
-            continue;
+        let mut datagrams = vec![mutate(&mut random, &captured)];
+        if random.below(20) == 0 {
+            let prefix = &known[random.below(known.len())];
+            datagrams.extend(bombs(prefix, &mut random));
         }
-        for port in &targets {
-            attacker.send_to(&datagram, (Ipv4Addr::LOCALHOST, *port)).ok();
+        for (datagram, port) in datagrams
+            .iter()
+            .flat_map(|it| targets.iter().map(move |port| (it, port)))
+        {
+            attacker.send_to(datagram, (Ipv4Addr::LOCALHOST, *port)).ok();
             sent += 1;
         }
         // Below what the receivers take, so that they look at every datagram.
@@ -213,6 +251,13 @@ fn hostile_datagrams_do_not_end_a_flow() {
             std::thread::sleep(Duration::from_millis(2));
         }
     }
+    let (after, most) = resident();
+    let grown = most.saturating_sub(before) >> 20;
+    assert!(
+        grown < 64,
+        "memory grew by {grown} MiB, {} MiB remain",
+        after.saturating_sub(before) >> 20
+    );
     // A newcomer finds the flow, whatever life it is in, and reaches it.
     let cloud = start(domain, "cloud/cloud-1", 1);
     let life = wait_for("the flow after the attack", Duration::from_secs(10), || {
@@ -225,8 +270,14 @@ fn hostile_datagrams_do_not_end_a_flow() {
         })
     });
     cloud.reach(&robot, &life);
+    let filtered = wait_for("a count of what was filtered", Duration::from_secs(3), || {
+        let status = robot.transport.status();
+        (status.dropped_by_kernel > filtered).then(|| status.dropped_by_kernel - filtered)
+    });
+    assert_eq!(robot.transport.status().detail, "");
     println!(
-        "{sent} datagrams from {} captured, seed {seed:#x}: {} rebuilds, robot now {life}",
+        "{sent} datagrams from {} captured, seed {seed:#x}: {} rebuilds, robot now {life}, {filtered} \
+         filtered, memory {grown} MiB more",
         captured.len(),
         robot.transport.status().rebuilds
     );

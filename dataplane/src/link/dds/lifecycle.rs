@@ -22,6 +22,7 @@ const TICK: Duration = Duration::from_millis(200);
 const LIVE: Duration = Duration::from_millis(1200);
 const GOOD_BYE: Duration = Duration::from_secs(1);
 const RETRY: Duration = Duration::from_secs(1);
+const COUNT: Duration = Duration::from_secs(1);
 
 pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
     thread::Builder::new()
@@ -50,6 +51,10 @@ struct Lifecycle {
     built: Instant,
     /// Whether a participant ran before, so that the next one is a new life.
     had_life: bool,
+    /// When the kernel's drops are counted next.
+    next_count: Instant,
+    /// What the kernel dropped at the sockets of earlier participants.
+    dropped_before: u64,
 }
 
 impl Lifecycle {
@@ -62,6 +67,8 @@ impl Lifecycle {
             next_attempt: now,
             built: now,
             had_life: false,
+            next_count: now,
+            dropped_before: 0,
         }
     }
 
@@ -90,6 +97,10 @@ impl Lifecycle {
         self.shared.discarded.lock().clear();
         self.make_writers();
         self.tell_relay(now);
+        if now >= self.next_count {
+            self.next_count = now + COUNT;
+            self.count_drops();
+        }
         #[cfg(test)]
         if let Some(fault) = self.shared.fault.lock().take()
             && let Some(generation) = &self.generation
@@ -101,6 +112,8 @@ impl Lifecycle {
     /// Puts a dead participant aside.
     fn bury(&mut self, reason: &str) {
         tracing::error!(flow = %self.local, reason, "DDS participant died, building a new one");
+        // What came since the last look is not counted.
+        self.dropped_before = self.shared.status.lock().dropped_by_kernel;
         self.lay_aside();
         self.shared.homes.lock().clear();
         self.shared.heard.lock().clear();
@@ -146,11 +159,12 @@ impl Lifecycle {
             Ok(generation) => {
                 self.shared.relay.set_participant(generation.participant.prefix());
                 tracing::info!(flow = %self.local, participant = ?generation.participant, "DDS participant started");
+                let filter_weakness = generation.participant.filter_weakness();
                 self.generation = Some(generation);
                 self.built = now;
                 let mut status = self.shared.status.lock();
                 status.ready = true;
-                status.detail.clear();
+                status.detail = filter_weakness.unwrap_or_default();
                 if self.had_life {
                     status.rebuilds += 1;
                 }
@@ -167,6 +181,13 @@ impl Lifecycle {
                 self.shared.status.lock().detail = error.to_string();
                 self.next_attempt = now + RETRY;
             }
+        }
+    }
+
+    fn count_drops(&self) {
+        if let Some(generation) = &self.generation {
+            let dropped = self.dropped_before + generation.participant.dropped_by_kernel();
+            self.shared.status.lock().dropped_by_kernel = dropped;
         }
     }
 
@@ -229,7 +250,10 @@ impl Lifecycle {
 
 impl Generation {
     fn start(shared: &Arc<Shared>, local: &Endpoint) -> Result<Self, DdsError> {
-        let participant = Participant::start(ParticipantConfig::new(shared.config.domain, shared.address))?;
+        let participant = Participant::start(ParticipantConfig {
+            largest_sample: shared.wire.largest_sample(),
+            ..ParticipantConfig::new(shared.config.domain, shared.address)
+        })?;
         let pulse = Pulse::start(&participant)?;
         let readers = Priority::ALL
             .iter()

@@ -29,6 +29,8 @@ const LOOPBACK_MTU: usize = 65_536;
 const LOOPBACK_DATAGRAM: usize = 32 * 1024;
 /// `whole`: RustDDS cuts it into fragments of 256 bytes, five to a packet.
 const WHOLE_DATAGRAM: usize = 60 * 1024;
+/// Fragmented samples of this many bytes are always taken.
+const SMALLEST_LIMIT: usize = 2048;
 
 /// The sizes of one transport.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -54,6 +56,13 @@ impl Wire {
 
     pub(super) fn max_datagram_bytes(self) -> usize {
         self.max_datagram
+    }
+
+    /// Bytes of the largest sample that may come in fragments: a datagram of this transport, or one packet of a flow
+    /// whose `mtu` is above that of its interface.
+    pub(super) fn largest_sample(self) -> u32 {
+        let sample = (PAYLOAD_HEADER + self.max_datagram).max(SMALLEST_LIMIT);
+        u32::try_from(sample).unwrap_or(u32::MAX)
     }
 
     /// Bytes of all IP packets of a datagram, headers included. Small ones that RustDDS happens to put into one packet

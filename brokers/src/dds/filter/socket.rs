@@ -1,0 +1,139 @@
+//! Attaching the filter to the sockets that RustDDS keeps to itself.
+//!
+//! The kernel lists the UDP sockets of the network namespace with their ports and inodes, and the files of this process
+//! with their inodes. A duplicate of such a file is the same socket, and so is its filter.
+
+use std::collections::{HashMap, HashSet};
+use std::fs;
+use std::os::fd::{OwnedFd, RawFd};
+
+use rustix::io::Errno;
+use rustix::process::{PidfdFlags, PidfdGetfdFlags, getpid, pidfd_getfd, pidfd_open};
+use socket2::{SockFilter, Socket};
+
+use super::assembler::Instruction;
+use super::program::{Shape, program};
+use super::{FilterError, system};
+
+/// The UDP sockets of the calling thread's network namespace, IPv4.
+const UDP_SOCKETS: &str = "/proc/thread-self/net/udp";
+const OWN_FILES: &str = "/proc/self/fd";
+
+/// Sockets that have the filter.
+#[derive(Debug)]
+pub(in super::super) struct Attached {
+    inodes: HashSet<u64>,
+    /// What fitted.
+    pub(in super::super) shape: Shape,
+}
+
+impl Attached {
+    /// Datagrams that the kernel dropped at these sockets until now, by the filter or because no room was left.
+    pub(in super::super) fn dropped(&self) -> u64 {
+        udp_sockets().map_or(0, |sockets| {
+            let ours = sockets.iter().filter(|socket| self.inodes.contains(&socket.inode));
+            ours.map(|socket| socket.dropped).sum()
+        })
+    }
+}
+
+/// One line of the kernel's list.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct UdpSocketLine {
+    pub(super) port: u16,
+    pub(super) inode: u64,
+    pub(super) dropped: u64,
+}
+
+impl UdpSocketLine {
+    /// `sl local_address rem_address st tx_queue:rx_queue tr:tm->when retrnsmt uid timeout inode ref pointer drops`
+    pub(super) fn parse(line: &str) -> Option<Self> {
+        let fields: Vec<&str> = line.split_ascii_whitespace().collect();
+        let (_, port) = fields.get(1)?.rsplit_once(':')?;
+        Some(Self {
+            port: u16::from_str_radix(port, 16).ok()?,
+            inode: fields.get(9)?.parse().ok()?,
+            dropped: fields.get(12)?.parse().ok()?,
+        })
+    }
+}
+
+fn udp_sockets() -> std::io::Result<Vec<UdpSocketLine>> {
+    let list = fs::read_to_string(UDP_SOCKETS)?;
+    Ok(list.lines().filter_map(UdpSocketLine::parse).collect())
+}
+
+/// The sockets among the open files of this process: inode and descriptor.
+fn own_sockets() -> std::io::Result<HashMap<u64, RawFd>> {
+    let mut sockets = HashMap::new();
+    for entry in fs::read_dir(OWN_FILES)?.flatten() {
+        // Files may be closed meanwhile.
+        let Ok(target) = fs::read_link(entry.path()) else {
+            continue;
+        };
+        let inode = target.to_str().and_then(|name| {
+            let inode = name.strip_prefix("socket:[")?.strip_suffix(']')?;
+            inode.parse().ok()
+        });
+        let descriptor = entry.file_name().to_str().and_then(|name| name.parse().ok());
+        if let (Some(inode), Some(descriptor)) = (inode, descriptor) {
+            sockets.insert(inode, descriptor);
+        }
+    }
+    Ok(sockets)
+}
+
+/// Attaches the filter to all UDP sockets of this process that are bound to one of the ports.
+pub(in super::super) fn attach(ports: &[u16], largest_sample: u32) -> Result<Attached, FilterError> {
+    let own = own_sockets().map_err(system("the own sockets are not known"))?;
+    let all = udp_sockets().map_err(system("the UDP sockets are not known"))?;
+    let this = pidfd_open(getpid(), PidfdFlags::empty()).map_err(errno("pidfd_open"))?;
+    let mut attached = Attached {
+        inodes: HashSet::new(),
+        shape: Shape::LARGE,
+    };
+    for found in all.iter().filter(|socket| ports.contains(&socket.port)) {
+        let Some(descriptor) = own.get(&found.inode) else {
+            continue;
+        };
+        let duplicate = pidfd_getfd(&this, *descriptor, PidfdGetfdFlags::empty()).map_err(errno("pidfd_getfd"))?;
+        if let Some(socket) = still_bound(duplicate, found.port) {
+            attach_one(&socket, largest_sample, &mut attached.shape)?;
+            attached.inodes.insert(found.inode);
+        }
+    }
+    if attached.inodes.is_empty() {
+        return Err(FilterError::NoSocket(ports.to_vec()));
+    }
+    Ok(attached)
+}
+
+/// The socket, unless the descriptor has been closed and used anew since it was listed.
+fn still_bound(duplicate: OwnedFd, port: u16) -> Option<Socket> {
+    let socket = Socket::from(duplicate);
+    let address = socket.local_addr().ok()?.as_socket_ipv4()?;
+    (address.port() == port && socket.r#type().ok()? == socket2::Type::DGRAM).then_some(socket)
+}
+
+/// Attaches the largest filter for which the system has room.
+fn attach_one(socket: &Socket, largest_sample: u32, shape: &mut Shape) -> Result<(), FilterError> {
+    if *shape == Shape::LARGE {
+        match socket.attach_filter(&filters(&program(Shape::LARGE, largest_sample)?)) {
+            Ok(()) => return Ok(()),
+            Err(error) if Errno::from_io_error(&error) == Some(Errno::NOMEM) => *shape = Shape::SMALL,
+            Err(error) => return Err(system("the filter was refused")(error)),
+        }
+    }
+    socket
+        .attach_filter(&filters(&program(*shape, largest_sample)?))
+        .map_err(system("the filter was refused"))
+}
+
+fn filters(program: &[Instruction]) -> Vec<SockFilter> {
+    let convert = |it: &Instruction| SockFilter::new(it.code, it.if_true, it.if_false, it.k);
+    program.iter().map(convert).collect()
+}
+
+fn errno(what: &'static str) -> impl FnOnce(Errno) -> FilterError {
+    move |error| system(what)(error.into())
+}

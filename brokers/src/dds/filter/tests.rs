@@ -1,0 +1,444 @@
+//! The program against an interpreter of its own, and against the kernel.
+
+use std::net::{Ipv4Addr, UdpSocket};
+use std::time::Duration;
+
+use super::assembler::{AssembleError, Assembler, Instruction, JUMP, Op, Test};
+use super::program::{Shape, program};
+use super::socket::{UdpSocketLine, attach};
+
+/// Runs a program over a packet; the result is what `Return` says, 0 for a load beyond the packet.
+fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
+    let (mut a, mut x, mut memory, mut at) = (0_u32, 0_u32, [None::<u32>; 16], 0_usize);
+    let load = |from: u32, count: usize| {
+        let from = usize::try_from(from).ok()?;
+        let bytes = packet.get(from..from.checked_add(count)?)?;
+        Some(bytes.iter().fold(0, |value, byte| value << 8 | u32::from(*byte)))
+    };
+    loop {
+        let it = program[at];
+        at += 1;
+        let code = it.code;
+        let slot = it.k as usize % 16;
+        let is = |op: Op| op as u16 == code;
+        let test = [Test::Equal, Test::AnyBit, Test::EqualsIndex, Test::AboveIndex]
+            .into_iter()
+            .find(|test| *test as u16 == code);
+        if let Some(test) = test {
+            let holds = match test {
+                Test::Equal => a == it.k,
+                Test::AnyBit => a & it.k != 0,
+                Test::EqualsIndex => a == x,
+                Test::AboveIndex => a > x,
+            };
+            at += usize::from(if holds { it.if_true } else { it.if_false });
+        } else if code == JUMP {
+            at += it.k as usize;
+        } else if is(Op::Return) {
+            return it.k;
+        } else if is(Op::LoadWordAt) || is(Op::LoadWord) || is(Op::LoadHalf) {
+            let from = if is(Op::LoadWordAt) {
+                Some(it.k)
+            } else {
+                x.checked_add(it.k)
+            };
+            let Some(value) = from.and_then(|from| load(from, if is(Op::LoadHalf) { 2 } else { 4 })) else {
+                return 0;
+            };
+            a = value;
+        } else {
+            match () {
+                () if is(Op::LoadConstant) => a = it.k,
+                () if is(Op::LoadLength) => a = u32::try_from(packet.len()).unwrap(),
+                () if is(Op::Recall) => a = memory[slot].expect("memory was written before"),
+                () if is(Op::RecallIndex) => x = memory[slot].expect("memory was written before"),
+                () if is(Op::IndexConstant) => x = it.k,
+                () if is(Op::Store) => memory[slot] = Some(a),
+                () if is(Op::StoreIndex) => memory[slot] = Some(x),
+                () if is(Op::Add) => a = a.wrapping_add(it.k),
+                () if is(Op::AddIndex) => a = a.wrapping_add(x),
+                () if is(Op::SubtractIndex) => a = a.wrapping_sub(x),
+                () if is(Op::Multiply) => a = a.wrapping_mul(it.k),
+                () if is(Op::And) => a &= it.k,
+                () if is(Op::ShiftRight) => a >>= it.k,
+                () if is(Op::ToIndex) => x = a,
+                () if is(Op::FromIndex) => a = x,
+                () => panic!("unknown instruction {it:?}"),
+            }
+        }
+    }
+}
+
+const LARGEST: u32 = 60 * 1024 + 8;
+
+fn passes_shape(shape: Shape, datagram: &[u8]) -> bool {
+    let mut packet = vec![0; 8];
+    packet.extend_from_slice(datagram);
+    interpret(&program(shape, LARGEST).unwrap(), &packet) != 0
+}
+
+/// Whether a datagram passes; both shapes must agree.
+fn passes(datagram: &[u8]) -> bool {
+    let large = passes_shape(Shape::LARGE, datagram);
+    assert_eq!(passes_shape(Shape::SMALL, datagram), large, "{datagram:02x?}");
+    large
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Endian {
+    Little,
+    Big,
+}
+
+const BOTH: [Endian; 2] = [Endian::Little, Endian::Big];
+
+impl Endian {
+    fn half(self, value: u16) -> Vec<u8> {
+        match self {
+            Self::Little => value.to_le_bytes().into(),
+            Self::Big => value.to_be_bytes().into(),
+        }
+    }
+
+    fn word(self, value: u32) -> Vec<u8> {
+        match self {
+            Self::Little => value.to_le_bytes().into(),
+            Self::Big => value.to_be_bytes().into(),
+        }
+    }
+
+    fn number(self, value: i64) -> Vec<u8> {
+        let bits = value.cast_unsigned();
+        let words = [(bits >> 32) as u32, (bits & 0xffff_ffff) as u32];
+        words.map(|word| self.word(word)).concat()
+    }
+
+    fn submessage(self, kind: u8, body: &[u8]) -> Vec<u8> {
+        self.submessage_of(kind, u16::try_from(body.len()).unwrap(), body)
+    }
+
+    fn submessage_of(self, kind: u8, length: u16, body: &[u8]) -> Vec<u8> {
+        let flags = u8::from(self == Self::Little);
+        [&[kind, flags][..], &self.half(length), body].concat()
+    }
+
+    fn data(self, bytes: usize) -> Vec<u8> {
+        self.submessage(0x15, &vec![0xff; 20 + bytes])
+    }
+
+    fn data_frag(self, start: u32, count: u16, size: u16, sample: u32) -> Vec<u8> {
+        let body = [
+            self.half(0),
+            self.half(28),
+            vec![1; 8],
+            self.number(7),
+            self.word(start),
+            self.half(count),
+            self.half(size),
+            self.word(sample),
+            vec![9; 256],
+        ];
+        self.submessage(0x16, &body.concat())
+    }
+
+    fn heartbeat(self, first: i64, last: i64) -> Vec<u8> {
+        self.submessage(
+            0x07,
+            &[vec![1; 8], self.number(first), self.number(last), self.word(3)].concat(),
+        )
+    }
+
+    fn gap(self, start: i64, base: i64) -> Vec<u8> {
+        self.submessage(
+            0x08,
+            &[vec![1; 8], self.number(start), self.number(base), self.word(0)].concat(),
+        )
+    }
+
+    fn acknack(self, base: i64, bits: u32) -> Vec<u8> {
+        self.submessage(
+            0x06,
+            &[vec![1; 8], self.number(base), self.word(bits), vec![0; 36]].concat(),
+        )
+    }
+
+    fn nack_frag(self, number: i64, fragment: u32, bits: u32) -> Vec<u8> {
+        let body = [
+            vec![1; 8],
+            self.number(number),
+            self.word(fragment),
+            self.word(bits),
+            vec![0; 36],
+        ];
+        self.submessage(0x12, &body.concat())
+    }
+
+    fn heartbeat_frag(self, number: i64, last: u32) -> Vec<u8> {
+        self.submessage(
+            0x13,
+            &[vec![1; 8], self.number(number), self.word(last), self.word(1)].concat(),
+        )
+    }
+
+    fn info_ts(self) -> Vec<u8> {
+        self.submessage(0x09, &[0xff; 8])
+    }
+
+    fn info_dst(self) -> Vec<u8> {
+        self.submessage(0x0e, &[0xff; 12])
+    }
+}
+
+fn message<T: AsRef<[u8]>>(submessages: &[T]) -> Vec<u8> {
+    let mut message = b"RTPS\x02\x04\x01\x12impersonator".to_vec();
+    submessages.iter().for_each(|it| message.extend_from_slice(it.as_ref()));
+    message
+}
+
+#[test]
+fn what_rustdds_sends_passes() {
+    for e in BOTH {
+        let good = [
+            vec![e.data(60_000)],
+            vec![e.data(32 * 1024 + 8)],
+            vec![e.data_frag(1, 1, 256, LARGEST)],
+            vec![e.data_frag(236, 5, 256, LARGEST), e.data_frag(241, 1, 256, LARGEST)],
+            vec![e.info_ts(), e.data(400), e.heartbeat(1, 1)],
+            vec![e.heartbeat(1, 0)],
+            vec![e.heartbeat(1, (1 << 20) - 1)],
+            vec![e.heartbeat(0x7ff0_0001, 0x7fff_ffff)],
+            vec![e.info_dst(), e.acknack(1, 256), e.nack_frag(2, 1, 256)],
+            vec![e.info_dst(), e.gap(0x1_0000, 0x1_ffff), e.heartbeat(0x1_ffff, 0x2_0001)],
+            vec![e.gap(1, 0x7fff_fff0)],
+            vec![e.heartbeat_frag(1, 240)],
+            vec![e.submessage(0x80, &[1, 2, 3]), e.submessage(0x0f, &[0; 4])],
+            vec![],
+        ];
+        for submessages in good {
+            let datagram = message(&submessages);
+            assert!(passes(&datagram), "{e:?} {:02x?}", &datagram[..datagram.len().min(80)]);
+        }
+    }
+}
+
+#[test]
+fn what_exhausts_rustdds_is_dropped_wherever_it_stands() {
+    for e in BOTH {
+        let bad = [
+            e.data_frag(1, 1, 256, 0x1_0000),
+            e.data_frag(1, 1, 256, u32::MAX),
+            e.data_frag(1, 1, 0, 1024),
+            e.data_frag(1, 1, 1, 0xffff),
+            e.data_frag(0, 1, 256, 1024),
+            e.data_frag(1, 0, 256, 1024),
+            e.heartbeat(1, 0x7fff_ffff),
+            e.heartbeat(1, 1 << 21),
+            e.heartbeat(1, 0x8000_0000),
+            e.heartbeat(0x8000_0000, 1),
+            e.heartbeat(-5, 1),
+            e.heartbeat(1, i64::MAX),
+            e.heartbeat(1 << 32, (1 << 32) + 1),
+            e.gap(2, 0x7fff_ffff),
+            e.gap(2, 0x2_0000),
+            e.gap(i64::MIN, 1),
+            e.gap(1, 1 << 40),
+            e.gap(0x0100_0000, 0x7000_0000),
+            e.acknack(1, u32::MAX),
+            e.acknack(-1, 1),
+            e.nack_frag(1, 0, 1),
+            e.nack_frag(1, u32::MAX, 1),
+            e.nack_frag(1, 1024, 1),
+            e.nack_frag(1, 1, 1 << 20),
+            e.heartbeat_frag(1, u32::MAX),
+        ];
+        for bad in bad {
+            for other in BOTH {
+                let alone = message(std::slice::from_ref(&bad));
+                assert!(!passes(&alone), "{e:?} {bad:02x?}");
+                let after = message(&[other.info_ts(), other.data(100), other.info_dst(), bad.clone()]);
+                assert!(!passes(&after), "after {other:?}: {bad:02x?}");
+                let before = message(&[bad.clone(), other.data(100)]);
+                assert!(!passes(&before), "before {other:?}: {bad:02x?}");
+                // Behind submessages without length that are not the last.
+                let pad = message(&[other.submessage(0x01, &[]), other.submessage(0x09, &[]), bad.clone()]);
+                assert!(!passes(&pad), "behind {other:?} padding: {bad:02x?}");
+                for run in 0..24 {
+                    let mut many = vec![other.data(8); run];
+                    many.push(bad.clone());
+                    assert!(!passes_shape(Shape::LARGE, &message(&many)), "behind {run}: {bad:02x?}");
+                    assert!(!passes_shape(Shape::SMALL, &message(&many)), "behind {run}: {bad:02x?}");
+                }
+            }
+        }
+        // Without length it is the last and extends to the end.
+        let mut body = e.heartbeat(1, 0x7fff_ffff);
+        body[2..4].fill(0);
+        assert!(!passes(&message(&[body])));
+        let tail = [e.submessage_of(0x0e, 0, &[]), e.heartbeat(1, 0x7fff_ffff)];
+        assert!(passes(&message(&tail)), "it belongs to the one before");
+    }
+}
+
+#[test]
+fn malformed_datagrams_are_dropped() {
+    let whole = message(&[Endian::Little.data(100), Endian::Big.data_frag(1, 1, 256, 1024)]);
+    assert!(passes(&whole));
+    for length in 0..whole.len() {
+        let cut = &whole[..length];
+        // Between two submessages it is a smaller message.
+        let complete = length == 20 || length == 20 + 124;
+        assert_eq!(passes(cut), complete, "{length} bytes");
+    }
+    assert!(!passes(b"RTPX\x02\x04\x01\x12impersonator"));
+    assert!(!passes(b"GET / HTTP/1.1\r\n\r\n-----------"));
+}
+
+#[test]
+fn long_runs_of_data_pass_up_to_the_number_of_steps() {
+    let run = |count: usize| {
+        let mut submessages = vec![Endian::Little.data(40); count];
+        submessages.push(Endian::Little.heartbeat(1, 100));
+        message(&submessages)
+    };
+    let steps = |shape: Shape| 2 * shape.full + shape.quick;
+    for shape in [Shape::LARGE, Shape::SMALL] {
+        // The heartbeat is the last step.
+        assert!(passes_shape(shape, &run(steps(shape) - 1)));
+        assert!(!passes_shape(shape, &run(steps(shape))));
+        let mut hidden = vec![Endian::Little.data(40); steps(shape) - 1];
+        hidden.push(Endian::Little.heartbeat(1, 0x7fff_ffff));
+        assert!(!passes_shape(shape, &message(&hidden)));
+    }
+    // What a packet of 1500 bytes takes, with a time for each.
+    let packet = vec![[Endian::Little.info_ts(), Endian::Little.data(64)].concat(); 11];
+    assert!(passes(&message(&packet)));
+}
+
+/// Whatever passes, RustDDS reads nothing in it that it must not.
+#[test]
+fn random_messages_agree_with_a_plain_walk() {
+    let mut state = 0x2545_f491_4f6c_dd1d_u64;
+    let mut random = |limit: u64| {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state % limit
+    };
+    let edges: [i64; 10] = [
+        0,
+        1,
+        2,
+        0xff,
+        0x100,
+        0xffff,
+        0x1_0000,
+        0x10_0000,
+        0x7fff_ffff,
+        0x8000_0000,
+    ];
+    let (mut passed, mut dropped) = (0, 0);
+    for _ in 0..20_000 {
+        let mut submessages = Vec::new();
+        let mut good = true;
+        for _ in 0..random(6) {
+            let e = BOTH[random(2) as usize];
+            let mut number = || edges[random(edges.len() as u64) as usize];
+            let (first, second) = (number(), number());
+            let fine = |number: i64| number < 1 << 31;
+            let width = (second >> 16) - (first >> 16);
+            match random(5) {
+                0 => submessages.push(e.data(random(90) as usize)),
+                1 => submessages.push(e.info_ts()),
+                2 => {
+                    submessages.push(e.heartbeat(first, second));
+                    good &= fine(first) && fine(second) && width <= 15;
+                }
+                3 => {
+                    submessages.push(e.gap(first, second));
+                    good &= fine(first) && fine(second) && (width <= 1 || first == 1);
+                }
+                _ => {
+                    submessages.push(e.data_frag(1, 1, 256, u32::try_from(first).unwrap()));
+                    good &= first < 0x1_0000;
+                }
+            }
+        }
+        let datagram = message(&submessages);
+        assert_eq!(passes(&datagram), good, "{datagram:02x?}");
+        *(if good { &mut passed } else { &mut dropped }) += 1;
+    }
+    assert!(passed > 1000 && dropped > 1000, "{passed} passed, {dropped} dropped");
+}
+
+#[test]
+fn jumps_that_are_too_far_or_lead_nowhere_are_refused() {
+    let mut asm = Assembler::default();
+    let far = asm.label();
+    asm.when(Test::Equal, 0, far);
+    (0..256).for_each(|_| asm.op(Op::Add, 1));
+    asm.place(far);
+    asm.op(Op::Return, 0);
+    assert_eq!(asm.finish(), Err(AssembleError::Distance(0)));
+
+    let mut asm = Assembler::default();
+    let nowhere = asm.label();
+    asm.jump(nowhere);
+    assert_eq!(asm.finish(), Err(AssembleError::Unbound));
+
+    let mut asm = Assembler::default();
+    (0..4097).for_each(|_| asm.op(Op::Add, 1));
+    assert_eq!(asm.finish(), Err(AssembleError::Length(4097)));
+}
+
+#[test]
+fn the_kernels_list_is_read() {
+    let line = "  512: 0100007F:306B 00000000:0000 07 00000000:00000000 00:00000000 00000000     0        0 4711 2 \
+                0000000000000000 23";
+    let expected = UdpSocketLine {
+        port: 12_395,
+        inode: 4711,
+        dropped: 23,
+    };
+    assert_eq!(UdpSocketLine::parse(line), Some(expected));
+    assert_eq!(
+        UdpSocketLine::parse("  sl  local_address rem_address   st tx_queue"),
+        None
+    );
+    assert_eq!(UdpSocketLine::parse(""), None);
+}
+
+/// The same datagrams as above through a socket that has the filter.
+#[test]
+fn the_kernel_takes_the_filter_and_drops_what_it_must() {
+    let receiver = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    receiver.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+    let port = receiver.local_addr().unwrap().port();
+    let attached = attach(&[port], LARGEST).unwrap();
+    let sender = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let mut buffer = vec![0; 65_536];
+    for e in BOTH {
+        let before = attached.dropped();
+        let bad = [
+            e.heartbeat(1, 0x7fff_ffff),
+            e.gap(2, 1 << 30),
+            e.data_frag(1, 1, 256, 1 << 24),
+            e.nack_frag(1, u32::MAX, 1),
+        ];
+        for bad in &bad {
+            sender.send_to(&message(&[bad]), (Ipv4Addr::LOCALHOST, port)).unwrap();
+        }
+        let run = vec![e.data(40); 150];
+        let last = [e.info_ts(), e.data_frag(1, 1, 256, LARGEST), e.heartbeat(1, 9)];
+        for good in [vec![e.data(60_000)], last.to_vec(), run] {
+            let good = message(&good);
+            // Big-endian DATA takes full steps, which are few.
+            if good.len() < 6000 || e == Endian::Little || good.len() > 60_000 {
+                sender.send_to(&good, (Ipv4Addr::LOCALHOST, port)).unwrap();
+                let length = receiver.recv(&mut buffer).unwrap();
+                assert_eq!(buffer[..length], good);
+            }
+        }
+        assert_eq!(attached.dropped() - before, bad.len() as u64);
+    }
+    assert!(attach(&[1], LARGEST).is_err(), "no socket of this process has port 1");
+}
