@@ -99,3 +99,101 @@ impl Drop for Pair {
         }
     }
 }
+
+/// Refuses with a sentence for people where namespaces cannot be made.
+///
+/// # Errors
+/// When this is not root, or iproute2 or nftables is missing.
+pub fn check_rights() -> anyhow::Result<()> {
+    let user = run("id -u")?;
+    anyhow::ensure!(
+        user.trim() == "0",
+        "this test makes network namespaces and must be run by root: `sudo -E env PATH=\"$PATH\" cargo test -p blaze-tests --test e2e`"
+    );
+    for tool in ["ip", "nft"] {
+        anyhow::ensure!(
+            run(&format!("command -v {tool}")).is_ok(),
+            "`{tool}` is missing: run `apt-get install -y iproute2 nftables`"
+        );
+    }
+    Ok(())
+}
+
+/// What an interface had sent at some time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sample {
+    /// Seconds since 1970.
+    pub at_s: f64,
+    /// Ethernet payload bytes.
+    pub bytes: u64,
+    /// Packets.
+    pub packets: u64,
+}
+
+/// Reads a host's counter again and again, from a process in its namespace so that no start of a process stands between
+/// the clock and the counter. It ends when dropped.
+pub struct Meter {
+    child: std::process::Child,
+    samples: std::sync::Arc<std::sync::Mutex<Vec<Sample>>>,
+}
+
+impl Meter {
+    /// Starts to read the counter of `v0` every `period_ms`.
+    ///
+    /// # Errors
+    /// When the namespace has gone.
+    pub fn start(namespace: &str, period_ms: u32) -> anyhow::Result<Self> {
+        let script = format!(
+            "cd /sys/class/net/v0/statistics; exec 3<> <(:); \
+             while :; do read -r p < tx_packets; read -r b < tx_bytes; echo $EPOCHREALTIME $b $p; \
+             read -r -t {}.{:03} -u 3; done",
+            period_ms / 1000,
+            period_ms % 1000
+        );
+        let mut child = Command::new("ip")
+            .args(["netns", "exec", namespace, "bash", "-c", &script])
+            .stdin(std::process::Stdio::null())
+            .stdout(std::process::Stdio::piped())
+            .spawn()?;
+        let samples = std::sync::Arc::<std::sync::Mutex<Vec<Sample>>>::default();
+        let kept = std::sync::Arc::clone(&samples);
+        let out = child.stdout.take().context("no output")?;
+        std::thread::spawn(move || {
+            use std::io::BufRead as _;
+            for line in std::io::BufReader::new(out).lines().map_while(Result::ok) {
+                let mut kept = kept.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+                kept.extend(parse_sample(&line));
+            }
+        });
+        Ok(Self { child, samples })
+    }
+
+    /// What was read so far.
+    #[must_use]
+    pub fn samples(&self) -> Vec<Sample> {
+        self.samples
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
+            .clone()
+    }
+}
+
+impl Drop for Meter {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn parse_sample(line: &str) -> Option<Sample> {
+    const ETHERNET_HEADER: u64 = 14;
+    let mut words = line.split_whitespace();
+    let at_s = words.next()?.parse().ok()?;
+    let bytes: u64 = words.next()?.parse().ok()?;
+    let packets: u64 = words.next()?.parse().ok()?;
+    Some(Sample {
+        at_s,
+        bytes: bytes.saturating_sub(packets * ETHERNET_HEADER),
+        packets,
+    })
+}

@@ -1,0 +1,12 @@
+//! End-to-end tests: real `blaze demo --only …` processes over loopback and between network namespaces.
+//!
+//! They measure time and rates on a machine of two cores, so they run one after another. Each has DDS domains of its
+//! own. `BLAZE_LONG` selects the full counts.
+
+#![allow(clippy::expect_used, reason = "the helpers of a test fail like the test")]
+
+mod lossy_link;
+mod meeting;
+mod pace;
+mod restarts;
+mod support;
