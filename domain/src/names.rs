@@ -8,6 +8,8 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
+use crate::control::REPLY_PREFIX;
+
 /// Longest layer, node, service or instance name, in bytes.
 pub const MAX_NAME_BYTES: usize = 63;
 /// Longest topic name, in bytes.
@@ -229,6 +231,18 @@ impl ChannelName {
         Self(Arc::from(format!("blaze/bare/{topic}")))
     }
 
+    /// Where one life of a service gets its answers, on brokers that make channels as they are named.
+    #[must_use]
+    pub fn reply(service: &ServiceName, instance: &InstanceName, life: u64) -> Self {
+        Self(Arc::from(format!("{REPLY_PREFIX}{service}-{instance}-{life:016x}")))
+    }
+
+    /// Where all services get their answers, on brokers whose channels are set up beforehand.
+    #[must_use]
+    pub fn shared_reply() -> Self {
+        Self(Arc::from(REPLY_PREFIX.trim_end_matches('/')))
+    }
+
     /// Whether the channel is one of BlazeAIoT's own: its payloads are never framed and never bridged.
     #[must_use]
     pub fn is_reserved(&self) -> bool {
@@ -286,6 +300,11 @@ mod tests {
         assert_eq!(control, ChannelName::control());
         assert!(control.is_reserved());
         let longest: TopicName = "t".repeat(200).parse().unwrap();
+        let name = "a".repeat(63);
+        let own = ChannelName::reply(&name.parse().unwrap(), &name.parse().unwrap(), u64::MAX);
+        for reply in [own, ChannelName::shared_reply()] {
+            assert_eq!(reply.as_str().parse::<ChannelName>().unwrap(), reply);
+        }
         let bare = ChannelName::bare(&longest);
         assert_eq!(bare.as_str().parse::<ChannelName>().unwrap(), bare);
     }

@@ -24,6 +24,8 @@ mod watch;
 
 use std::net::IpAddr;
 
+use blaze_domain::node_file::MAX_DDS_DOMAIN;
+
 #[cfg(feature = "fault-injection")]
 pub use fault::Fault;
 pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile, Writer};
@@ -34,9 +36,6 @@ pub use watch::{ReaderWatch, RemoteReader};
 
 /// The type of all samples, IDL `sequence<octet>`.
 pub const FRAME_TYPE: &str = "blaze::v1::Frame";
-
-/// Largest DDS domain whose ports lie below 65,536.
-pub const MAX_DOMAIN: u16 = 231;
 
 /// RustDDS announces itself to this many participant slots of its own host.
 const LOCAL_SLOTS: u16 = 12;
@@ -54,8 +53,8 @@ fn announcement_port(domain: u16, slot: u16) -> u16 {
 /// Why DDS refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DdsError {
-    /// Ports of that domain would lie above 65,535.
-    #[error("DDS domain {0} is above {MAX_DOMAIN}")]
+    /// Ports of that domain would lie in the range that systems give out by themselves, or above all.
+    #[error("DDS domain {0} is above {MAX_DDS_DOMAIN}")]
     Domain(u16),
     /// RustDDS speaks IPv4 alone.
     #[error("{0} is not an IPv4 address of one interface")]

@@ -6,6 +6,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use blaze_domain::node_file::MAX_DDS_DOMAIN;
 use bytes::Bytes;
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{
@@ -18,7 +19,7 @@ use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
 use super::watch::{ReaderWatch, RemoteReader};
-use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, MAX_DOMAIN, announcement_port, multicast_port};
+use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, announcement_port, multicast_port};
 
 /// Identity of one participant on the wire; a rebuilt one has a new identity.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -40,7 +41,7 @@ impl fmt::Debug for GuidPrefix {
 /// Where a participant lives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ParticipantConfig {
-    /// DDS domain, 0 to [`MAX_DOMAIN`].
+    /// DDS domain, 0 to [`MAX_DDS_DOMAIN`].
     pub domain: u16,
     /// Address of the one interface that it announces. Never unspecified.
     pub address: Ipv4Addr,
@@ -67,7 +68,7 @@ impl ParticipantConfig {
     }
 
     fn check(&self) -> Result<(), DdsError> {
-        if self.domain > MAX_DOMAIN {
+        if self.domain > MAX_DDS_DOMAIN {
             return Err(DdsError::Domain(self.domain));
         }
         let address = IpAddr::V4(self.address);

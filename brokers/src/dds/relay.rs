@@ -13,11 +13,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use blaze_domain::node_file::MAX_DDS_DOMAIN;
 use parking_lot::Mutex;
 
 use super::announcement::Announcement;
 use super::reader::StoppableThread;
-use super::{DdsError, GuidPrefix, LOCAL_SLOTS, MAX_DOMAIN, announcement_port, multicast_port};
+use super::{DdsError, GuidPrefix, LOCAL_SLOTS, announcement_port, multicast_port};
 
 /// Most addresses that are announced to.
 const MAX_ADDRESSES: usize = 256;
@@ -89,7 +90,7 @@ impl Relay {
     /// [`DdsError`] when the domain is out of range or there is no thread for it. Ports that are taken are no error:
     /// they are tried again each second.
     pub fn start(config: RelayConfig) -> Result<Self, DdsError> {
-        if config.domain > MAX_DOMAIN {
+        if config.domain > MAX_DDS_DOMAIN {
             return Err(DdsError::Domain(config.domain));
         }
         let state = Arc::<Mutex<State>>::default();

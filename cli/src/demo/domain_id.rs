@@ -2,10 +2,10 @@
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
 
+use blaze_domain::node_file::MAX_DDS_DOMAIN;
+
 /// The demo's domain where several processes must agree on one.
 pub const DEFAULT_DOMAIN: u16 = 20;
-/// Largest domain of the contract.
-const LAST_DOMAIN: u16 = 100;
 
 /// A domain that is ours until this is dropped.
 #[derive(Debug)]
@@ -29,7 +29,7 @@ fn claim_port(domain: u16) -> u16 {
 /// Finds a domain that nobody on this host uses at `address`, beginning with [`DEFAULT_DOMAIN`]. `None`: all are taken.
 #[must_use]
 pub fn reserve(address: Ipv4Addr) -> Option<ReservedDomain> {
-    (DEFAULT_DOMAIN..=LAST_DOMAIN).find_map(|domain| {
+    (DEFAULT_DOMAIN..=MAX_DDS_DOMAIN).find_map(|domain| {
         let claim = bind(Ipv4Addr::LOCALHOST, claim_port(domain))?;
         // SPDP and user traffic of the first participant, whoever started it.
         let free = [10, 11]
@@ -52,7 +52,7 @@ mod tests {
         let first = reserve(Ipv4Addr::LOCALHOST).unwrap();
         let second = reserve(Ipv4Addr::LOCALHOST).unwrap();
         assert_ne!(first.domain, second.domain);
-        assert!((DEFAULT_DOMAIN..=LAST_DOMAIN).contains(&second.domain));
+        assert!((DEFAULT_DOMAIN..=MAX_DDS_DOMAIN).contains(&second.domain));
     }
 
     #[test]
@@ -66,7 +66,7 @@ mod tests {
 
     #[test]
     fn ports_stay_within_the_range() {
-        assert_eq!(claim_port(LAST_DOMAIN), 32_649);
+        assert_eq!(claim_port(MAX_DDS_DOMAIN), 32_649);
         assert_eq!(claim_port(DEFAULT_DOMAIN) + 1, base_port(DEFAULT_DOMAIN + 1));
     }
 }

@@ -8,14 +8,13 @@
 
 use std::time::Duration;
 
+use blaze_domain::node_file::LARGE_BYTES;
 use blaze_domain::{Reliability, Scope, TopicName};
 
 use super::flows::Spot;
 use super::options::DemoNode;
 use super::recording::{RecordedTopic, Recording};
 
-/// From this size on a topic is large: best effort, with a lifespan (as `flow.bandwidth.large_bytes`).
-pub const LARGE_BYTES: usize = 65_536;
 /// How long a picture is of use.
 pub const PICTURE_LIFESPAN: Duration = Duration::from_millis(500);
 /// The service that moves at half time.
@@ -42,13 +41,13 @@ pub struct PlayedTopic {
     pub rate_hz: f64,
     /// Largest payload.
     pub max_bytes: usize,
-    /// Whether it counts as large: pictures and the like.
+    /// Whether it is larger than [`LARGE_BYTES`], as pictures are: best effort, with a lifespan.
     pub large: bool,
 }
 
 impl PlayedTopic {
     fn new(topic: &RecordedTopic) -> Self {
-        let large = topic.max_bytes >= LARGE_BYTES;
+        let large = topic.max_bytes > LARGE_BYTES as usize;
         let service = match topic.type_name.as_str() {
             "sensor_msgs/msg/Imu" => "imu-driver",
             "nav_msgs/msg/Odometry" => "odometry",

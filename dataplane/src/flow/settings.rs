@@ -6,7 +6,7 @@ use blaze_domain::node_file::{Chunking, FlowSection, NodeFile};
 use blaze_domain::{FlowId, LayerKind};
 
 use crate::limit::budget_bytes_per_s;
-use crate::plan::{PlanRules, TopicRule};
+use crate::plan::PlanRules;
 
 /// The inter scope of a flow.
 #[derive(Debug, Clone, PartialEq)]
@@ -46,17 +46,11 @@ impl LiveSettings {
 
 impl From<&FlowSection> for LiveSettings {
     fn from(flow: &FlowSection) -> Self {
-        let rules = flow.topics.iter().map(|rule| TopicRule {
-            pattern: rule.pattern.to_string(),
-            priority: rule.priority,
-            max_rate_hz: rule.max_rate_hz,
-            lifespan_ms: rule.lifespan_ms.unwrap_or(0),
-        });
         Self {
             limit_mbps: flow.bandwidth.limit_mbps,
             large_bytes: u64::from(flow.bandwidth.large_bytes),
             rules: PlanRules {
-                topics: rules.collect(),
+                topics: flow.topics.clone(),
             },
         }
     }

@@ -2,19 +2,21 @@
 
 use std::collections::BTreeSet;
 
+use blaze_domain::node_file::TopicValues;
 use blaze_domain::{Durability, Priority, Reliability, WhyCode};
 
-use super::{LaneSpec, Publisher, Requester, TopicRule};
+use super::{LaneSpec, Publisher, Requester};
 use crate::world::{Advertise, OriginFilter, Request};
 
 /// Makes the lanes of one topic.
-pub(super) struct LaneBuilder<'a> {
-    rule: Option<&'a TopicRule>,
+pub(super) struct LaneBuilder {
+    /// The operator's word.
+    rules: TopicValues,
 }
 
-impl<'a> LaneBuilder<'a> {
-    pub(super) fn new(rule: Option<&'a TopicRule>) -> Self {
-        Self { rule }
+impl LaneBuilder {
+    pub(super) fn new(rules: TopicValues) -> Self {
+        Self { rules }
     }
 
     /// The lane for the given pairs of publisher and requester, each of which matches; `None` without a pair.
@@ -56,13 +58,12 @@ impl<'a> LaneBuilder<'a> {
 
     /// The operator's word: it bounds rate and lifespan, and replaces the class.
     fn cap(&self, lane: &mut LaneSpec) {
-        let Some(rule) = self.rule else { return };
-        lane.max_rate_hz = match (lane.max_rate_hz, rule.max_rate_hz) {
+        lane.max_rate_hz = match (lane.max_rate_hz, self.rules.max_rate_hz) {
             (Some(asked), Some(cap)) => Some(asked.min(cap)),
             (asked, cap) => asked.or(cap),
         };
-        lane.lifespan_ms = shorter(lane.lifespan_ms, rule.lifespan_ms);
-        lane.priority = rule.priority.or(lane.priority);
+        lane.lifespan_ms = shorter(lane.lifespan_ms, self.rules.lifespan_ms.unwrap_or(0));
+        lane.priority = self.rules.priority.or(lane.priority);
     }
 }
 

@@ -24,7 +24,7 @@ use std::collections::BTreeMap;
 use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WhyCode};
 
 pub(crate) use lane::asks_too_much;
-pub use rules::{PlanRules, TopicRule};
+pub use rules::PlanRules;
 pub(crate) use view::{Group, Pairing, Publisher, Requester, TopicView, meets_directly, type_detail};
 
 use crate::world::{FlowState, OriginFilter, World};
@@ -185,7 +185,7 @@ pub fn owner(world: &World, topic: &TopicName) -> Option<FlowId> {
     TopicView::new(world, topic)?.owner().cloned()
 }
 
-fn deliver(view: &TopicView<'_>, lanes: &LaneBuilder<'_>) -> Delivery {
+fn deliver(view: &TopicView<'_>, lanes: &LaneBuilder) -> Delivery {
     let outside: Vec<_> = view.publishers_outside().collect();
     let node = view.own_node_requester();
     let node_lane = node.and_then(|own| lanes.lane(view.pairs(outside.iter().copied(), std::iter::once(own))));
@@ -199,7 +199,7 @@ fn deliver(view: &TopicView<'_>, lanes: &LaneBuilder<'_>) -> Delivery {
 /// Collects the bridges of one topic.
 struct Planner<'a, 'w> {
     view: &'a TopicView<'w>,
-    lanes: &'a LaneBuilder<'a>,
+    lanes: &'a LaneBuilder,
     bridges: BTreeMap<(Scope, Target), LaneSpec>,
 }
 

@@ -12,6 +12,7 @@ const MAX_DETAIL_CHARS: usize = 200;
 
 /// What is wrong with a control message, and where.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
+#[serde(from = "ReadError")]
 #[error("{code} at {pointer:?}: {detail}")]
 pub struct ControlError {
     /// The fault.
@@ -37,6 +38,52 @@ impl ControlError {
             detail,
         }
     }
+
+    /// The pointer without the place of the object in an array: a sender joins objects as it likes, so that place says
+    /// nothing to whoever made the object.
+    #[must_use]
+    pub fn pointer_in_object(&self) -> &str {
+        let Some(rest) = self.pointer.strip_prefix('/') else {
+            return &self.pointer;
+        };
+        let (first, after) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+        let is_place = !first.is_empty() && first.bytes().all(|byte| byte.is_ascii_digit());
+        if is_place { after } else { &self.pointer }
+    }
+}
+
+/// An error as another version may write it.
+#[derive(Deserialize, Default)]
+#[serde(default)]
+struct ReadError {
+    code: String,
+    pointer: String,
+    detail: String,
+}
+
+impl From<ReadError> for ControlError {
+    /// A refusal is one whatever its code: a word of a newer version becomes `invalid_value` and goes before the detail.
+    fn from(read: ReadError) -> Self {
+        match read.code.parse() {
+            Ok(code) => Self::new(code, read.pointer, read.detail),
+            Err(_) => Self::new(
+                ErrorCode::InvalidValue,
+                read.pointer,
+                format!("{}: {}", read.code, read.detail),
+            ),
+        }
+    }
+}
+
+/// The objects of a payload, which is one or an array of them. What is not understood is left out, the others stay.
+fn read_each<T: for<'de> Deserialize<'de>>(payload: &[u8]) -> Vec<T> {
+    let values = match serde_json::from_slice(payload) {
+        Ok(Value::Array(values)) => values,
+        Ok(value) => vec![value],
+        Err(_) => return Vec::new(),
+    };
+    let read = values.into_iter().map(T::deserialize);
+    read.filter_map(Result::ok).collect()
 }
 
 /// The answer to one control message that named a `reply_to`.
@@ -83,6 +130,12 @@ impl Answer {
         }
     }
 
+    /// The answers of a payload: one object or an array. What is no answer is left out.
+    #[must_use]
+    pub fn read_all(payload: &[u8]) -> Vec<Self> {
+        read_each(payload)
+    }
+
     /// The answer as a JSON object.
     #[must_use]
     pub fn to_json(&self) -> Value {
@@ -94,7 +147,8 @@ impl Answer {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Event {
     /// What happened.
-    pub event: EventKind,
+    #[serde(rename = "event")]
+    pub kind: EventKind,
     /// The flow that says so, `layer/node`.
     pub flow: String,
     /// The topic; empty where none is meant.
@@ -110,14 +164,20 @@ pub struct Event {
 impl Event {
     /// An event at a wall-clock time in milliseconds since 1970.
     #[must_use]
-    pub fn new(event: EventKind, flow: &FlowId, topic: Option<&TopicName>, code: &str, unix_ms: u64) -> Self {
+    pub fn new(kind: EventKind, flow: &FlowId, topic: Option<&TopicName>, code: &str, unix_ms: u64) -> Self {
         Self {
-            event,
+            kind,
             flow: flow.to_string(),
             topic: topic.map(ToString::to_string).unwrap_or_default(),
             code: code.to_owned(),
             time: rfc3339_millis(unix_ms),
         }
+    }
+
+    /// The events of a payload: one object or an array. What is no event, or of a kind of a newer version, is left out.
+    #[must_use]
+    pub fn read_all(payload: &[u8]) -> Vec<Self> {
+        read_each(payload)
     }
 
     /// The event as a JSON object.
@@ -187,6 +247,46 @@ mod tests {
         let text = r#"{"event":"lease_expired","flow":"edge/robot-1","topic":"imu/data","code":"lease_expired","time":"2023-11-14T22:13:20.123Z"}"#;
         assert_eq!(event.to_json().to_string(), text);
         assert_eq!(serde_json::from_str::<Event>(text).unwrap(), event);
+    }
+
+    #[test]
+    fn answers_and_events_of_other_versions_are_read() {
+        let answers = Answer::read_all(br#"[{"id":"7","ok":true,"lease_s":15,"new":1}, 3, {"x":1}]"#);
+        assert_eq!(answers.len(), 1);
+        assert_eq!((answers[0].id.as_deref(), answers[0].lease_s), (Some("7"), Some(15)));
+        assert!(Answer::read_all(b"no json").is_empty());
+        for (error, expected) in [
+            (
+                r#"{"code":"tired","detail":"no"}"#,
+                (ErrorCode::InvalidValue, "", "tired: no"),
+            ),
+            (
+                r#"{"code":"stale_epoch","pointer":"/epoch"}"#,
+                (ErrorCode::StaleEpoch, "/epoch", ""),
+            ),
+        ] {
+            let answer = format!(r#"{{"id":"7","ok":false,"error":{error}}}"#);
+            let read = Answer::read_all(answer.as_bytes()).remove(0).error.unwrap();
+            assert_eq!((read.code, read.pointer.as_str(), read.detail.as_str()), expected);
+        }
+        let events = br#"[{"event":"flow_started","flow":"edge/r","time":"t"},{"event":"flow_sings","flow":"edge/r","time":"t"}]"#;
+        let read = Event::read_all(events);
+        assert_eq!(read.len(), 1);
+        assert_eq!((read[0].kind, read[0].topic.as_str()), (EventKind::FlowStarted, ""));
+    }
+
+    #[test]
+    fn pointers_lose_the_place_in_the_array() {
+        for (pointer, expected) in [
+            ("/topic", "/topic"),
+            ("/3/topic", "/topic"),
+            ("/3", ""),
+            ("", ""),
+            ("/from/layer", "/from/layer"),
+        ] {
+            let error = ControlError::new(ErrorCode::InvalidValue, pointer, "");
+            assert_eq!(error.pointer_in_object(), expected, "{pointer}");
+        }
     }
 
     #[test]

@@ -15,7 +15,10 @@ use super::{SecretText, TopicPattern, url};
 use crate::qos::{UnknownWord, word_enum};
 
 /// Highest DDS domain whose ports stay below the range that systems give out by themselves.
-const MAX_DDS_DOMAIN: u16 = 100;
+pub const MAX_DDS_DOMAIN: u16 = 100;
+/// Smallest MTU of the way between flows, in bytes, as IPv6 demands it of every link: a datagram of the link of 1,024 bytes
+/// fits one packet together with all headers.
+pub const MIN_MTU: u16 = 1280;
 
 /// The brokers of the three scopes; each may be missing.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -198,7 +201,7 @@ pub struct InterDds {
     pub peers: Vec<Ipv4Addr>,
     /// DDS participants that are probed per peer.
     pub peer_slots: u16,
-    /// Largest IP packet of the way, in bytes.
+    /// Largest IP packet of the way, in bytes, at least [`MIN_MTU`].
     pub mtu: u16,
     /// How large messages are cut.
     pub chunking: Chunking,
@@ -210,7 +213,7 @@ impl InterDds {
         let listen = s.need("listen", address);
         let peers = s.list("peers", address);
         let peer_slots = s.or("peer_slots", whole(1, 119), 4);
-        let mtu = s.or("mtu", whole(576, u16::MAX), 1500);
+        let mtu = s.or("mtu", whole(MIN_MTU, u16::MAX), 1500);
         let chunking = s.or("chunking", parsed, Chunking::Auto);
         Some(Self {
             domain: domain?,

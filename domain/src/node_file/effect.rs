@@ -33,6 +33,7 @@ const KEYS: &[(&str, &[&str])] = &[
             "share",
             "wire_overhead",
             "adaptive",
+            "links",
         ],
     ),
     ("flow", &["pool_threads", "gateway"]),

@@ -15,8 +15,8 @@ use crate::qos::{Priority, UnknownWord, word_enum};
 
 /// What one Mbit/s of the file is, in bytes per second: 1024² bit.
 const BYTES_PER_MBIT: f64 = 1024.0 * 1024.0 / 8.0;
-/// 64 KiB: above it a topic is large, and a payload worth compressing.
-const LARGE_BYTES: u32 = 65_536;
+/// 64 KiB: unless the file says otherwise, a topic with payloads above it is large, and a payload worth compressing.
+pub const LARGE_BYTES: u32 = 65_536;
 /// Longest lifespan: a day.
 const MAX_LIFESPAN_MS: u32 = 86_400_000;
 const MAX_MBPS: f64 = 1_000_000.0;
@@ -57,19 +57,13 @@ impl FlowSection {
     /// What the rules say of one topic: each value is that of the first matching rule that gives it.
     #[must_use]
     pub fn topic(&self, topic: &TopicName) -> TopicSettings {
-        let mut out = TopicSettings {
-            compression: self.compression,
-            ..TopicSettings::default()
-        };
-        let mut change = CompressionOverride::default();
-        for rule in self.topics.iter().filter(|rule| rule.pattern.matches(topic)) {
-            out.priority = out.priority.or(rule.priority);
-            out.max_rate_hz = out.max_rate_hz.or(rule.max_rate_hz);
-            out.lifespan_ms = out.lifespan_ms.or(rule.lifespan_ms);
-            change = change.or(rule.compression);
+        let values = TopicValues::of(&self.topics, topic);
+        TopicSettings {
+            priority: values.priority,
+            max_rate_hz: values.max_rate_hz,
+            lifespan_ms: values.lifespan_ms,
+            compression: self.compression.with(values.compression),
         }
-        out.compression = out.compression.with(change);
-        out
     }
 }
 
@@ -254,6 +248,13 @@ impl CompressionOverride {
 pub struct TopicRule {
     /// `match`: which topics.
     pub pattern: TopicPattern,
+    /// What it says.
+    pub values: TopicValues,
+}
+
+/// The values that rules may give; what is absent is left to the next rule that matches, in the end to the defaults.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct TopicValues {
     /// Class on the inter scope.
     pub priority: Option<Priority>,
     /// Rate on the inter scope, at most, in Hz.
@@ -264,19 +265,38 @@ pub struct TopicRule {
     pub compression: CompressionOverride,
 }
 
+impl TopicValues {
+    /// What rules say of a topic: each value is that of the first matching rule that gives it.
+    #[must_use]
+    pub fn of(rules: &[TopicRule], topic: &TopicName) -> Self {
+        rules
+            .iter()
+            .filter(|rule| rule.pattern.matches(topic))
+            .fold(Self::default(), |given, rule| given.or(rule.values))
+    }
+
+    fn or(self, other: Self) -> Self {
+        Self {
+            priority: self.priority.or(other.priority),
+            max_rate_hz: self.max_rate_hz.or(other.max_rate_hz),
+            lifespan_ms: self.lifespan_ms.or(other.lifespan_ms),
+            compression: self.compression.or(other.compression),
+        }
+    }
+}
+
 impl TopicRule {
     fn section(s: &mut Section<'_>) -> Option<Self> {
         let pattern = s.need("match", parsed);
-        let priority = s.opt("priority", parsed);
-        let max_rate_hz = s.opt("max_rate_hz", number(0.001, 1_000_000.0));
-        let lifespan_ms = s.opt("lifespan_ms", whole(0, MAX_LIFESPAN_MS));
-        let compression = s.sub_or_empty("compression", CompressionOverride::section);
+        let values = TopicValues {
+            priority: s.opt("priority", parsed),
+            max_rate_hz: s.opt("max_rate_hz", number(0.001, 1_000_000.0)),
+            lifespan_ms: s.opt("lifespan_ms", whole(0, MAX_LIFESPAN_MS)),
+            compression: s.sub_or_empty("compression", CompressionOverride::section),
+        };
         Some(Self {
             pattern: pattern?,
-            priority,
-            max_rate_hz,
-            lifespan_ms,
-            compression,
+            values,
         })
     }
 }

@@ -25,16 +25,16 @@ use std::path::PathBuf;
 use serde_json::Value;
 
 pub use brokers::{
-    Brokers, Chunking, DdsLayerBroker, InterDds, KafkaBroker, LayerBroker, NodeBroker, RedisBroker, RedisTls,
-    Ros2Distro, Ros2Plugin,
+    Brokers, Chunking, DdsLayerBroker, InterDds, KafkaBroker, LayerBroker, MAX_DDS_DOMAIN, MIN_MTU, NodeBroker,
+    RedisBroker, RedisTls, Ros2Distro, Ros2Plugin,
 };
 pub use control_plane::{
     AuthSection, ControlPlaneSection, EncryptionKey, EncryptionSection, GrpcSection, HistorySection, JwksSource,
     JwtAlgorithm, JwtKey, LimitsSection, ListenSection, StoreSection, TlsSection,
 };
 pub use flow::{
-    BandwidthSection, Codec, Compression, CompressionOverride, FlowSection, LinkLimit, SharePolicy, TopicRule,
-    TopicSettings, WireOverhead,
+    BandwidthSection, Codec, Compression, CompressionOverride, FlowSection, LARGE_BYTES, LinkLimit, SharePolicy,
+    TopicRule, TopicSettings, TopicValues, WireOverhead,
 };
 pub use pattern::{PatternError, TopicPattern};
 pub use services::{

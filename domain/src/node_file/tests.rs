@@ -98,6 +98,10 @@ fn the_example_is_read_whole() {
         ]
     );
     assert_eq!(warnings[8].detail, "worker, monitor: not in effect in this version");
+    assert_eq!(
+        warnings[9].detail,
+        "per_message_share, overhead, min_rate_hz, share, wire_overhead, adaptive, links: not in effect in this version"
+    );
 }
 
 #[test]
@@ -108,7 +112,7 @@ fn what_is_in_effect_gives_no_warning() {
         "brokers": { "node": { "memory": {} }, "layer": { "memory": null },
                      "inter": { "dds": { "domain": 20, "listen": "127.0.0.1" } } },
         "admin": { "flow": "127.0.0.1:0" },
-        "flow": { "bandwidth": { "limit_mbps": 40.5, "large_bytes": 1000, "links": {} },
+        "flow": { "bandwidth": { "limit_mbps": 40.5, "large_bytes": 1000 },
                   "topics": [ { "match": "**", "priority": "state" } ] },
         "log": { "level": "info,blaze_flow=debug" },
         "state_dir": "./state",
@@ -171,7 +175,7 @@ fn all_faults_come_at_once() {
         "brokers": {
             "node": { "redis": { "prefix": "a b" }, "memory": {} },
             "layer": {},
-            "inter": { "dds": { "domain": 101, "listen": "here", "peers": ["10.0.0.1", 7], "mtu": 100 } },
+            "inter": { "dds": { "domain": 101, "listen": "here", "peers": ["10.0.0.1", 7], "mtu": 1279 } },
         },
         "flow": { "bandwidth": { "limit_mbps": "fast", "limit_mbs": 3, "links": { "Cloud": { "limit_mbps": 0 } } },
                   "topics": [ { "match": "a*/b" }, { "priority": "urgent" }, 5 ],
@@ -191,7 +195,7 @@ fn all_faults_come_at_once() {
             "brokers.inter.dds.domain: 101 is not a whole number from 0 to 100",
             "brokers.inter.dds.listen: \"here\" is not an IPv4 address",
             "brokers.inter.dds.peers[1]: expected text, found the number 7; put it in quotes",
-            "brokers.inter.dds.mtu: 100 is not a whole number from 576 to 65535",
+            "brokers.inter.dds.mtu: 1279 is not a whole number from 1280 to 65535",
             "flow.bandwidth.limit_mbps: expected a number from 0.001 to 1000000, found text",
             "flow.bandwidth.links.Cloud: the name of a layer holds 'C'; allowed are a-z, 0-9 and -",
             "flow.bandwidth.links.Cloud.limit_mbps: 0 is not between 0.001 and 1000000",
@@ -250,6 +254,13 @@ fn the_first_rule_that_gives_a_value_wins() {
     assert_eq!((near.max_rate_hz, near.priority), (Some(15.0), Some(Priority::Bulk)));
     assert_eq!((near.compression.level, near.compression.codec), (9, Codec::None));
     assert_eq!(settings("camera/left/raw").max_rate_hz, Some(5.0));
+    let unbound = json!({ "flow": { "topics": [
+        { "match": "cmd", "lifespan_ms": 0 },
+        { "match": "**", "lifespan_ms": 500, "max_rate_hz": 15 },
+    ] } });
+    let (unbound, _) = NodeFile::read(&unbound).unwrap();
+    let cmd = TopicValues::of(&unbound.flow.topics, &"cmd".parse().unwrap());
+    assert_eq!((cmd.lifespan_ms, cmd.max_rate_hz), (Some(0), Some(15.0)));
     let other = settings("imu");
     assert_eq!(
         (other.max_rate_hz, other.priority, other.compression.level),

@@ -207,8 +207,9 @@ impl Supervisor {
     pub async fn failed(&self) -> String {
         let mut failure = self.shared.failure.subscribe();
         // The sender lives in `self`, so the wait cannot end without a value.
-        match failure.wait_for(Option::is_some).await {
-            Ok(reason) => reason.clone().unwrap_or_default(),
+        let reason = failure.wait_for(Option::is_some).await.map(|reason| reason.clone());
+        match reason {
+            Ok(reason) => reason.unwrap_or_default(),
             Err(_) => std::future::pending().await,
         }
     }

@@ -1,6 +1,9 @@
 //! Sizes: what a datagram becomes on the wire, and how large one may be.
 
+use blaze_domain::node_file::MIN_MTU;
+
 use super::Chunking;
+use crate::link::MIN_DATAGRAM_BYTES;
 
 /// IPv4 and UDP headers.
 const IP_UDP: usize = 20 + 8;
@@ -20,8 +23,9 @@ const DATA_RESERVE: usize = 48;
 const MTU_OVERHEAD: usize = 132;
 /// Largest sample of one packet, however large the MTU is: a peer behind a router has 1500.
 const LARGEST_SAMPLE: usize = 1300;
-/// The smallest MTU that IPv4 hosts must take.
-const SMALLEST_MTU: usize = 576;
+/// The smallest MTU that a node file may name: the smallest datagram of the link fits into it.
+const SMALLEST_MTU: usize = MIN_MTU as usize;
+const _: () = assert!(SMALLEST_MTU >= MIN_DATAGRAM_BYTES + PAYLOAD_HEADER - 4 + MTU_OVERHEAD);
 /// The MTU of Linux' loopback interface.
 const LOOPBACK_MTU: usize = 65_536;
 /// Datagrams between flows of one host: one packet of the loopback interface, and several fit in a default socket
@@ -86,11 +90,12 @@ mod tests {
 
     #[test]
     fn a_datagram_of_the_largest_size_is_one_packet() {
-        for mtu in [576, 1280, 1420, 1500, 9000] {
+        for mtu in [1280, 1420, 1500, 9000] {
             let wire = Wire::new(mtu, Chunking::Mtu, false);
             let largest = wire.max_datagram_bytes();
             assert!(wire.bytes(largest) <= mtu, "{mtu}: {}", wire.bytes(largest));
             assert_eq!(wire.bytes(largest), largest + 80);
+            assert!(largest >= MIN_DATAGRAM_BYTES);
         }
         assert_eq!(Wire::new(1500, Chunking::Auto, false).max_datagram_bytes(), 1296);
         assert_eq!(Wire::new(1420, Chunking::Auto, false).max_datagram_bytes(), 1284);

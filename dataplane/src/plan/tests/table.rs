@@ -1,9 +1,10 @@
 //! One row per rule.
 
+use blaze_domain::node_file::{TopicRule, TopicValues};
 use blaze_domain::{Durability, Priority, Reliability, Scope, WhyCode};
 
 use super::worlds::{ask, entry, filter, id, offer, topic, world};
-use crate::plan::{Delivery, Destination, PlanRules, Target, TopicPlan, TopicRule, delivery, owner, plan_topic};
+use crate::plan::{Delivery, Destination, PlanRules, Target, TopicPlan, delivery, owner, plan_topic};
 use crate::world::{Reach, Source, World};
 
 fn plan(world: &World) -> TopicPlan {
@@ -429,18 +430,31 @@ fn a_request_lowers_the_class_and_never_raises_it() {
 #[test]
 fn the_operator_bounds_rate_and_lifespan_and_sets_the_class() {
     let mut world = world(&["e/a node+", "c/b node-"]);
+    let rule = |pattern: &str, values: TopicValues| TopicRule {
+        pattern: pattern.parse().unwrap(),
+        values,
+    };
+    let fast = TopicValues {
+        priority: Some(Priority::State),
+        max_rate_hz: Some(100.0),
+        ..TopicValues::default()
+    };
+    let imu = TopicValues {
+        priority: Some(Priority::Control),
+        max_rate_hz: Some(15.0),
+        ..TopicValues::default()
+    };
+    let short = TopicValues {
+        lifespan_ms: Some(500),
+        ..TopicValues::default()
+    };
+    // What one rule leaves open, a later one that matches too may say.
     let rules = PlanRules {
         topics: vec![
-            TopicRule {
-                pattern: "camera/**".to_owned(),
-                ..TopicRule::default()
-            },
-            TopicRule {
-                pattern: "imu/*".to_owned(),
-                priority: Some(Priority::Control),
-                max_rate_hz: Some(15.0),
-                lifespan_ms: 500,
-            },
+            rule("camera/**", fast),
+            rule("imu/*", imu),
+            rule("**", short),
+            rule("imu/**", fast),
         ],
     };
     for (rate, lifespan, expected) in [

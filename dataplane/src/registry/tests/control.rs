@@ -64,7 +64,7 @@ fn a_lease_is_granted_renewed_and_lapses() {
     assert_eq!(changes.events.len(), 1);
     let event = changes.events[0].stamp(&registry.world().me, 0);
     assert_eq!(
-        (event.event, event.topic.as_str(), event.code.as_str()),
+        (event.kind, event.topic.as_str(), event.code.as_str()),
         (EventKind::LeaseExpired, "imu", "lease_expired")
     );
     assert_eq!(registry.lease_count(), 0);
