@@ -320,7 +320,7 @@ impl Participant {
 fn weakness(filter: &Result<Attached, FilterError>) -> Option<String> {
     match filter {
         Ok(attached) if attached.shape == Shape::LARGE => None,
-        Ok(_) => Some("the packet filter is a small one, since net.core.optmem_max is below 128 KiB".into()),
+        Ok(_) => Some("the packet filter is a small one, since net.core.optmem_max is below 61440".into()),
         Err(error) => Some(format!(
             "no packet filter, so any sender can exhaust the memory: {error}"
         )),

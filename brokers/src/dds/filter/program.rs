@@ -61,12 +61,12 @@ pub(in super::super) struct Shape {
 }
 
 impl Shape {
-    /// As many as there is room for: enough for all that RustDDS packs into 9000 bytes, and on loopback (65,536) for
-    /// the 128 samples that may wait in a writer of 32 KiB samples.
+    /// 3,824 of 4,096 possible instructions: enough for all that RustDDS packs into 9000 bytes, and on loopback (65,536)
+    /// for the 128 samples that may wait in a writer of 32 KiB samples.
     pub(in super::super) const LARGE: Self = Self { full: 4, quick: 160 };
-    /// What fits where the system gives 20 KiB for the options of a socket (`net.core.optmem_max` before Linux 6.8).
-    /// A packet of 1500 bytes holds at most 15 of the link's datagrams.
-    pub(in super::super) const SMALL: Self = Self { full: 3, quick: 16 };
+    /// What fits into the 20 KiB that a socket has for its options where `net.core.optmem_max` has the value from before
+    /// Linux 6.8; the large one needs 60 KiB. A packet of 1500 bytes holds at most 15 of the link's datagrams.
+    pub(in super::super) const SMALL: Self = Self { full: 2, quick: 24 };
 }
 
 /// Makes the filter. DATA_FRAG passes up to the next power of two above `largest_sample` bytes.
