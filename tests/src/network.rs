@@ -100,6 +100,56 @@ impl Drop for Pair {
     }
 }
 
+/// Several hosts on one switch, without multicast, as where they are joined by routers.
+pub struct Lan {
+    switch: String,
+    /// Names of the namespaces.
+    pub names: Vec<String>,
+    /// Their addresses.
+    pub addresses: Vec<String>,
+}
+
+impl Lan {
+    /// Makes namespaces with one interface `v0` each.
+    ///
+    /// # Errors
+    /// As [`Pair::new`]; nftables is needed, too.
+    pub fn new(hosts: usize) -> anyhow::Result<Self> {
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        let id = std::process::id();
+        let net = 16 + (id + number) % 200;
+        let lan = Self {
+            switch: format!("blaze-{id}-{number}s"),
+            names: (0..hosts).map(|host| format!("blaze-{id}-{number}h{host}")).collect(),
+            addresses: (1..=hosts).map(|host| format!("10.199.{net}.{host}")).collect(),
+        };
+        let switch = &lan.switch;
+        run(&format!(
+            "ip netns add {switch} && ip -n {switch} link add b0 type bridge && ip -n {switch} link set b0 up"
+        ))?;
+        for (host, (name, address)) in lan.names.iter().zip(&lan.addresses).enumerate() {
+            run(&format!(
+                "ip netns add {name} && ip -n {name} link add v0 type veth peer name p{host} netns {switch} && \
+                 ip -n {switch} link set p{host} master b0 && ip -n {switch} link set p{host} up && \
+                 ip -n {name} addr add {address}/24 dev v0 && ip -n {name} link set v0 up && \
+                 ip -n {name} link set lo up && \
+                 ip netns exec {name} nft 'add table ip routed; \
+                 add chain ip routed output {{ type filter hook output priority 0 ; }}; \
+                 add rule ip routed output ip daddr 224.0.0.0/4 oifname v0 drop'"
+            ))?;
+        }
+        Ok(lan)
+    }
+}
+
+impl Drop for Lan {
+    fn drop(&mut self) {
+        for name in self.names.iter().chain([&self.switch]) {
+            let _ = run(&format!("ip netns del {name}"));
+        }
+    }
+}
+
 /// Refuses with a sentence for people where namespaces cannot be made.
 ///
 /// # Errors
@@ -122,12 +172,17 @@ pub fn check_rights() -> anyhow::Result<()> {
 /// What an interface had sent at some time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
-    /// Seconds since 1970.
+    /// When the counter was read: seconds since 1970, right within [`Sample::MAX_ERROR_S`].
     pub at_s: f64,
     /// Ethernet payload bytes.
     pub bytes: u64,
     /// Packets.
     pub packets: u64,
+}
+
+impl Sample {
+    /// Samples whose time is less certain, because their reader had to wait for the processor, are left out.
+    pub const MAX_ERROR_S: f64 = 0.000_5;
 }
 
 /// Reads a host's counter again and again, from a process in its namespace so that no start of a process stands between
@@ -145,7 +200,7 @@ impl Meter {
     pub fn start(namespace: &str, period_ms: u32) -> anyhow::Result<Self> {
         let script = format!(
             "cd /sys/class/net/v0/statistics; exec 3<> <(:); \
-             while :; do read -r p < tx_packets; read -r b < tx_bytes; echo $EPOCHREALTIME $b $p; \
+             while :; do read -r p < tx_packets; s=$EPOCHREALTIME; read -r b < tx_bytes; echo $s $EPOCHREALTIME $b $p; \
              read -r -t {}.{:03} -u 3; done",
             period_ms / 1000,
             period_ms % 1000
@@ -188,11 +243,15 @@ impl Drop for Meter {
 fn parse_sample(line: &str) -> Option<Sample> {
     const ETHERNET_HEADER: u64 = 14;
     let mut words = line.split_whitespace();
-    let at_s = words.next()?.parse().ok()?;
+    let before: f64 = words.next()?.parse().ok()?;
+    let after: f64 = words.next()?.parse().ok()?;
     let bytes: u64 = words.next()?.parse().ok()?;
     let packets: u64 = words.next()?.parse().ok()?;
+    if after - before > 2.0 * Sample::MAX_ERROR_S {
+        return None;
+    }
     Some(Sample {
-        at_s,
+        at_s: (before + after) / 2.0,
         bytes: bytes.saturating_sub(packets * ETHERNET_HEADER),
         packets,
     })

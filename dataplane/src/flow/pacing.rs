@@ -98,8 +98,8 @@ impl Egress {
         while !self.stop.load(Ordering::Relaxed) {
             let now = Instant::now();
             let budget = self.budget();
-            if (budget - pacer.rate()).abs() > f64::EPSILON {
-                pacer.set_rate(budget, now);
+            if (budget - pacer.limit()).abs() > f64::EPSILON {
+                pacer.set_limit(budget, now);
             }
             let wait = pacer.wait(now);
             if !wait.is_zero() {

@@ -2,12 +2,22 @@
 //!
 //! The pacer spends a budget that refills with time and saves at most two datagrams, so that no burst fills a queue behind
 //! it. LinkControl is never held back: it may put the pacer into debt, which user data then waits off.
+//!
+//! The limit holds for the wire, and the pacer stands before it. [`RESERVE`] of the limit is kept for what happens
+//! between them.
 
 use std::time::{Duration, Instant};
+
+/// Share of the limit that is not spent. RustDDS sends from a thread of its own: where that had to wait for the processor,
+/// what it held back leaves within the next second, on top of that second's own (25 ms = 2.5 %; 16 ms were seen on two
+/// cores with a load of ten). Its discovery, which the pacer does not see, is far less: some 100 bytes a second.
+pub const RESERVE: f64 = 0.03;
 
 /// A budget of wire bytes per second. It is exact over any second: what was spent is never forgotten.
 #[derive(Debug, Clone)]
 pub struct Pacer {
+    limit_bytes_per_s: f64,
+    /// Without the reserve.
     bytes_per_s: f64,
     /// Bytes that may leave now; negative = debt.
     credit: f64,
@@ -16,27 +26,29 @@ pub struct Pacer {
 }
 
 impl Pacer {
-    /// A pacer for a budget; `burst_bytes` is the most that leaves at once after a pause.
+    /// A pacer for a limit; `burst_bytes` is the most that leaves at once after a pause.
     #[must_use]
-    pub fn new(bytes_per_s: f64, burst_bytes: usize, now: Instant) -> Self {
+    pub fn new(limit_bytes_per_s: f64, burst_bytes: usize, now: Instant) -> Self {
         Self {
-            bytes_per_s: bytes_per_s.max(1.0),
+            limit_bytes_per_s,
+            bytes_per_s: paced(limit_bytes_per_s),
             credit: 0.0,
             burst_bytes: burst_bytes as f64,
             filled: now,
         }
     }
 
-    /// Changes the budget from now on.
-    pub fn set_rate(&mut self, bytes_per_s: f64, now: Instant) {
+    /// Changes the limit from now on.
+    pub fn set_limit(&mut self, limit_bytes_per_s: f64, now: Instant) {
         self.fill(now);
-        self.bytes_per_s = bytes_per_s.max(1.0);
+        self.limit_bytes_per_s = limit_bytes_per_s;
+        self.bytes_per_s = paced(limit_bytes_per_s);
     }
 
-    /// Bytes per second.
+    /// The limit in bytes per second, the reserve included.
     #[must_use]
-    pub fn rate(&self) -> f64 {
-        self.bytes_per_s
+    pub fn limit(&self) -> f64 {
+        self.limit_bytes_per_s
     }
 
     /// Takes what has left.
@@ -61,39 +73,65 @@ impl Pacer {
     }
 }
 
+fn paced(limit_bytes_per_s: f64) -> f64 {
+    (limit_bytes_per_s * (1.0 - RESERVE)).max(1.0)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn no_second_exceeds_the_budget_by_more_than_the_burst() {
-        let start = Instant::now();
+    const LIMIT: f64 = 1_000_000.0;
+
+    /// When datagrams of 1400 bytes leave the pacer during five seconds without a pause.
+    fn departures(start: Instant) -> Vec<Instant> {
         let mut now = start;
-        let mut pacer = Pacer::new(1_000_000.0, 2800, start);
-        let mut sent: Vec<(Instant, usize)> = Vec::new();
+        let mut pacer = Pacer::new(LIMIT, 2800, start);
+        let mut sent = Vec::new();
         while now < start + Duration::from_secs(5) {
             let wait = pacer.wait(now);
             if wait.is_zero() {
                 pacer.spend(1400, now);
-                sent.push((now, 1400));
+                sent.push(now);
             }
             now += wait.max(Duration::from_micros(50));
         }
-        for (first, _) in &sent {
-            let within = |t: &Instant| *t >= *first && *t < *first + Duration::from_secs(1);
-            let bytes: usize = sent.iter().filter(|(at, _)| within(at)).map(|(_, bytes)| bytes).sum();
-            assert!(bytes <= 1_000_000 + 2 * 2800, "{bytes} bytes in a second");
-        }
-        let total: usize = sent.iter().map(|(_, bytes)| bytes).sum();
-        assert!(total > 4_900_000, "{total} bytes in 5 s");
+        sent
+    }
+
+    fn most_bytes_in_a_second(sent: &[Instant]) -> usize {
+        let within = |first: Instant| {
+            sent.iter()
+                .filter(move |at| **at >= first && **at < first + Duration::from_secs(1))
+        };
+        sent.iter().map(|first| 1400 * within(*first).count()).max().unwrap()
+    }
+
+    #[test]
+    fn no_second_exceeds_the_limit_and_it_is_nearly_used_up() {
+        let sent = departures(Instant::now());
+        let most = most_bytes_in_a_second(&sent);
+        assert!(most <= 1_000_000, "{most} bytes in a second");
+        let total = 1400 * sent.len();
+        assert!(total > 4_800_000, "{total} bytes in 5 s");
+    }
+
+    #[test]
+    fn nor_when_the_transport_stands_still_for_25_ms() {
+        let start = Instant::now();
+        let (from, until) = (start + Duration::from_secs(2), start + Duration::from_millis(2025));
+        let held_back = |at: Instant| if (from..until).contains(&at) { until } else { at };
+        let sent: Vec<Instant> = departures(start).into_iter().map(held_back).collect();
+        let most = most_bytes_in_a_second(&sent);
+        assert!(most <= 1_000_000, "{most} bytes in a second");
     }
 
     #[test]
     fn control_goes_into_debt_that_data_waits_off() {
         let start = Instant::now();
         let mut pacer = Pacer::new(1000.0, 100, start);
-        pacer.spend(600, start);
-        assert_eq!(pacer.wait(start), Duration::from_millis(600));
+        pacer.spend(582, start);
+        assert_eq!(pacer.wait(start).as_millis(), 600);
         assert!(pacer.wait(start + Duration::from_millis(601)).is_zero());
     }
 }

@@ -24,7 +24,10 @@ const RELIABLE: &str = "imu/reliable";
 const PICTURES: &str = "probe/pictures";
 /// What a reliable message may take that has to be sent again, on a link with a round trip below 1 ms. Its loss is known
 /// with the next Feedback (50 ms or 64 samples), the repair may be lost again.
-const REPAIRED_MS: f64 = 300.0;
+const REPAIRED_MS: f64 = 200.0;
+/// What a message may take that is never repaired itself: below the 50 ms that others' repairs take, above the pauses of a
+/// busy machine.
+const UNTOUCHED_MS: f64 = 30.0;
 
 struct Wire {
     pair: Pair,
@@ -186,7 +189,7 @@ fn demo_latency(rows: &[Value]) -> (f64, f64) {
 
 /// Prints a phase; gives the 99 % latencies of the reliable and the best-effort topic of the probe.
 fn report(wire: &Wire, phase: &Phase, what: &str) -> (f64, f64) {
-    let mut of = |topic: &str| {
+    let of = |topic: &str| {
         let mut probed = wire.probe(topic, phase);
         let (p50, p99, max) = probed.p50_p99_max();
         println!(
@@ -214,7 +217,7 @@ fn repaired_link() -> anyhow::Result<()> {
     let mut wire = Wire::start()?;
     let seconds = if long() { 60 } else { 10 };
     let clean = wire.watch(seconds)?;
-    report(&wire, &clean, "no loss");
+    let (_, clean_p99) = report(&wire, &clean, "no loss");
     let clean_pictures = sum(&clean.demo[1], "received");
 
     wire.pair.lose(0, LOSS_PER_MILLE)?;
@@ -234,36 +237,38 @@ fn repaired_link() -> anyhow::Result<()> {
     let imu = end.topic("imu/data", "recorder")?;
     println!("whole run: imu {imu}");
 
-    anyhow::ensure!(best_effort.lost > 0, "best effort: no loss was counted");
-    let share = best_effort.lost as f64 / (best_effort.lost + best_effort.received) as f64;
-    anyhow::ensure!(share < 0.05, "best effort: {share:.3} lost at 1 %");
-    anyhow::ensure!(
-        best_effort.duplicated + reliable.duplicated + pictures.duplicated == 0,
-        "duplicates"
-    );
-    anyhow::ensure!(
-        reliable.lost == 0 && reliable.received >= 95 * seconds as u64,
-        "reliable: {}",
-        wire.tails()
-    );
-    for fault in ["lost", "duplicated", "reordered"] {
-        anyhow::ensure!(count(imu, fault) == 0, "IMU: {fault}: {imu}");
-    }
-    anyhow::ensure!(
-        lossy_pictures as f64 > 0.7 * clean_pictures as f64,
-        "pictures are not repaired"
-    );
-    anyhow::ensure!(
-        pictures.received >= 3 * seconds as u64,
-        "the probe's pictures are not repaired"
-    );
-    anyhow::ensure!(reliable_p99 < REPAIRED_MS, "reliable p99 {reliable_p99} ms");
-    // What is never repaired itself must not notice the repairs of others.
-    anyhow::ensure!(
-        best_effort_p99 < REPAIRED_MS / 3.0,
-        "best effort p99 {best_effort_p99} ms"
-    );
-    Ok(())
+    let judge = || {
+        anyhow::ensure!(best_effort.lost > 0, "best effort: no loss was counted");
+        let share = best_effort.lost as f64 / (best_effort.lost + best_effort.received) as f64;
+        anyhow::ensure!(share < 0.05, "best effort: {share:.3} lost at 1 %");
+        anyhow::ensure!(
+            best_effort.duplicated + reliable.duplicated + pictures.duplicated == 0,
+            "duplicates"
+        );
+        anyhow::ensure!(
+            reliable.lost == 0 && reliable.received >= 95 * seconds as u64,
+            "reliable: received {}, lost {}",
+            reliable.received,
+            reliable.lost
+        );
+        for fault in ["lost", "duplicated", "reordered"] {
+            anyhow::ensure!(count(imu, fault) == 0, "IMU: {fault}: {imu}");
+        }
+        anyhow::ensure!(
+            lossy_pictures as f64 > 0.7 * clean_pictures as f64,
+            "pictures are not repaired"
+        );
+        anyhow::ensure!(
+            pictures.received >= 3 * seconds as u64,
+            "the probe's pictures are not repaired"
+        );
+        anyhow::ensure!(reliable_p99 < REPAIRED_MS, "reliable p99 {reliable_p99} ms");
+        // What is never repaired itself must not notice the repairs of others.
+        let untouched = UNTOUCHED_MS.max(3.0 * clean_p99);
+        anyhow::ensure!(best_effort_p99 < untouched, "best effort p99 {best_effort_p99} ms");
+        Ok(())
+    };
+    judge().map_err(|error: anyhow::Error| error.context(wire.tails()))
 }
 
 #[test]

@@ -15,17 +15,31 @@ fn limit_bytes() -> f64 {
     LIMIT_MBPS * 1024.0 * 1024.0 / 8.0
 }
 
-/// The largest number of bytes in any second that begins at a sample: the counter at its end lies between two samples,
-/// and the later one counts in full.
-fn busiest_second(samples: &[Sample]) -> (f64, f64) {
+/// Begin (seconds after the first sample), length (a second and at most one period of the samples more) and bytes of the
+/// busiest second that begins at a sample.
+struct Second {
+    begin_s: f64,
+    length_s: f64,
+    bytes: f64,
+}
+
+impl Second {
+    fn rate(&self) -> f64 {
+        self.bytes / self.length_s
+    }
+}
+
+fn busiest_second(samples: &[Sample]) -> Option<Second> {
+    let start = samples.first()?.at_s;
     let windows = samples.iter().enumerate().filter_map(|(index, first)| {
         let last = samples[index..].iter().find(|last| last.at_s - first.at_s >= 1.0)?;
-        Some((last.at_s - first.at_s, (last.bytes - first.bytes) as f64))
+        Some(Second {
+            begin_s: first.at_s - start,
+            length_s: last.at_s - first.at_s,
+            bytes: (last.bytes - first.bytes) as f64,
+        })
     });
-    // A window is longer than a second by at most one period of the samples; it is judged by its own length.
-    windows
-        .max_by(|a, b| (a.1 / a.0).total_cmp(&(b.1 / b.0)))
-        .unwrap_or_default()
+    windows.max_by(|a, b| a.rate().total_cmp(&b.rate()))
 }
 
 fn tails(nodes: [&Node; 2]) -> String {
@@ -64,14 +78,16 @@ fn camera_within_the_budget() -> anyhow::Result<()> {
 
     let samples = meter.samples();
     drop(meter);
-    let (window, busiest) = busiest_second(&samples);
+    let busiest = busiest_second(&samples).ok_or_else(|| anyhow::anyhow!("too few samples"))?;
     let span = samples.last().map_or(0.0, |s| s.at_s) - samples.first().map_or(0.0, |s| s.at_s);
     let limit = limit_bytes();
     println!(
-        "pace: {} samples in {span:.1} s; busiest second {:.0} B/s ({window:.3} s), limit {limit:.0} B/s ({:.2} %)",
+        "pace: {} samples in {span:.1} s; busiest second {:.0} B/s ({:.3} s from {:.1} s on), limit {limit:.0} B/s: {:.2} %",
         samples.len(),
-        busiest / window,
-        100.0 * busiest / window / limit
+        busiest.rate(),
+        busiest.length_s,
+        busiest.begin_s,
+        100.0 * busiest.rate() / limit
     );
     let ratio = computed as f64 / counted as f64;
     println!("pace: over {seconds} s the interface counted {counted} B, the flow computed {computed} B ({ratio:.4})");
@@ -87,25 +103,32 @@ fn camera_within_the_budget() -> anyhow::Result<()> {
         robot_end.sent(CAMERA)
     );
 
-    anyhow::ensure!(samples.len() > 300, "only {} samples", samples.len());
-    anyhow::ensure!(
-        counted as f64 > 0.8 * limit * seconds as f64,
-        "the camera does not fill the budget"
-    );
-    anyhow::ensure!(busiest / window <= limit, "a second exceeds the limit");
-    anyhow::ensure!(
-        (0.97..=1.03).contains(&ratio),
-        "computed and counted bytes differ: {ratio:.4}"
-    );
-    anyhow::ensure!(count(imu, "received") > 500, "too few IMU messages");
-    for fault in ["lost", "duplicated", "reordered"] {
-        anyhow::ensure!(count(imu, fault) == 0, "IMU: {fault}: {imu}");
-    }
-    anyhow::ensure!(
-        count(camera, "received") > 0 && count(camera, "duplicated") == 0,
-        "{camera}"
-    );
-    Ok(())
+    let judge = || {
+        anyhow::ensure!(
+            samples.len() > 300 && span > 10.0,
+            "{} samples in {span:.1} s",
+            samples.len()
+        );
+        anyhow::ensure!(
+            counted as f64 > 0.6 * limit * seconds as f64,
+            "the camera does not fill the budget"
+        );
+        anyhow::ensure!(busiest.rate() <= limit, "a second exceeds the limit");
+        anyhow::ensure!(
+            (0.97..=1.03).contains(&ratio),
+            "computed and counted bytes differ: {ratio:.4}"
+        );
+        anyhow::ensure!(count(imu, "received") > 500, "too few IMU messages");
+        for fault in ["lost", "duplicated", "reordered"] {
+            anyhow::ensure!(count(imu, fault) == 0, "IMU: {fault}: {imu}");
+        }
+        anyhow::ensure!(
+            count(camera, "received") > 0 && count(camera, "duplicated") == 0,
+            "{camera}"
+        );
+        Ok(())
+    };
+    judge().map_err(|error| error.context(tails([&robot, &cloud])))
 }
 
 #[test]

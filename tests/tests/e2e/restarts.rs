@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use blaze_tests::{long, wait};
 
-use super::support::{Launch, Node, count, text, turn};
+use super::support::{Launch, Node, count, free_domain, text, turn};
 
 /// From `/readyz` of the new process to the next message.
 const FLOWING: Duration = Duration::from_secs(2);
@@ -39,15 +39,18 @@ fn plan() -> Plan {
 }
 
 struct Trio {
+    domain: u16,
     robot: Node,
     fog: Node,
     cloud: Node,
 }
 
 impl Trio {
-    fn start(domain: u16) -> anyhow::Result<Self> {
+    fn start() -> anyhow::Result<Self> {
+        let domain = free_domain()?;
         let start = |node| Launch::local(node, domain).start();
         let mut trio = Self {
+            domain,
             robot: start("robot-1")?,
             fog: start("fog-1")?,
             cloud: start("cloud-1")?,
@@ -144,12 +147,12 @@ fn no_duplicates(what: &str, node: &mut Node, service: &str) -> anyhow::Result<(
 fn kill_the_publisher() -> anyhow::Result<()> {
     let what = "publisher killed";
     let plan = plan();
-    let mut trio = Trio::start(63)?;
+    let mut trio = Trio::start()?;
     let (at_fog, at_cloud) = (trio.fog.bridges(), trio.cloud.bridges());
     let mut first = Vec::new();
     for round in 1..=plan.restarts {
         trio.robot.process.kill()?;
-        trio.robot = Launch::local("robot-1", 63).start()?;
+        trio.robot = Launch::local("robot-1", trio.domain).start()?;
         // Messages of the old life may still come: only what comes after the new one is ready counts.
         trio.robot.ready()?;
         let ready = Instant::now();
@@ -173,13 +176,13 @@ fn kill_the_publisher() -> anyhow::Result<()> {
 fn kill_a_consumer() -> anyhow::Result<()> {
     let what = "consumer killed";
     let plan = plan();
-    let mut trio = Trio::start(64)?;
+    let mut trio = Trio::start()?;
     let (at_robot, at_fog, at_cloud) = (trio.robot.bridges(), trio.fog.bridges(), trio.cloud.bridges());
     let mut first = Vec::new();
     for round in 1..=plan.restarts {
         let fog_before = trio.fog.bridged(TO_FOG);
         trio.cloud.process.kill()?;
-        trio.cloud = Launch::local("cloud-1", 64).start()?;
+        trio.cloud = Launch::local("cloud-1", trio.domain).start()?;
         trio.cloud.ready()?;
         let ready = Instant::now();
         let took = flowing_again(&trio, ready, || trio.cloud.bridged(TO_CLOUD) > 0)?;
