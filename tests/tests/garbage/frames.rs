@@ -86,7 +86,12 @@ async fn garbage_on_a_topic_is_counted_and_the_topic_goes_on() {
         "all garbage counted",
         DEADLINE,
         || inside.dropped(LIVE_TOPIC, "decode_error") == expected,
-        || format!("{expected} sent, {} counted", inside.dropped(LIVE_TOPIC, "decode_error")),
+        || {
+            format!(
+                "{expected} sent, {} counted",
+                inside.dropped(LIVE_TOPIC, "decode_error")
+            )
+        },
     )
     .unwrap();
     assert_eq!(traffic.strangers(), 0, "nothing of it arrived");
@@ -103,17 +108,36 @@ async fn payloads_above_16_mib_are_counted_and_the_topic_goes_on() {
     // A memory broker refuses it at the publisher ...
     assert_eq!(inside.publish(LIVE_TOPIC, too_long.clone()), PublishOutcome::TooLarge);
     // ... a server in another process may hold it: without a header, and with one.
-    assert_eq!(inside.node_broker.inject(LIVE_TOPIC, &too_long), 1, "the flow reads the topic");
+    assert_eq!(
+        inside.node_broker.inject(LIVE_TOPIC, &too_long),
+        1,
+        "the flow reads the topic"
+    );
     let mut framed = BytesMut::from(&frame_bytes(&header(LIVE_TOPIC, 9, 1), b"")[..]);
     framed.put_slice(&too_long);
     inside.node_broker.inject(LIVE_TOPIC, &framed.freeze());
     let counted = || inside.dropped(LIVE_TOPIC, "too_large") + inside.dropped(LIVE_TOPIC, "decode_error");
-    wait::until("both counted", DEADLINE, || counted() == 2, || format!("{} counted", counted())).unwrap();
-    assert!(inside.dropped(LIVE_TOPIC, "too_large") >= 1, "the bare one is too_large");
+    wait::until(
+        "both counted",
+        DEADLINE,
+        || counted() == 2,
+        || format!("{} counted", counted()),
+    )
+    .unwrap();
+    assert!(
+        inside.dropped(LIVE_TOPIC, "too_large") >= 1,
+        "the bare one is too_large"
+    );
 
     // Exactly 16 MiB is a message like any other.
     inside.node_broker.inject(LIVE_TOPIC, &too_long.slice(1..));
-    wait::until("16 MiB arrive", DEADLINE, || traffic.strangers() == 1, || "they did not".into()).unwrap();
+    wait::until(
+        "16 MiB arrive",
+        DEADLINE,
+        || traffic.strangers() == 1,
+        || "they did not".into(),
+    )
+    .unwrap();
     traffic.end().await;
     inside.end().await;
 }

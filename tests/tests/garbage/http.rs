@@ -58,7 +58,10 @@ fn no_requests() -> Vec<Vec<u8>> {
     let header = format!("GET /livez HTTP/1.1\r\nX-Long: {}\r\n\r\n", "x".repeat(1 << 20));
     let many = format!("GET /livez HTTP/1.1\r\n{}\r\n", "X: y\r\n".repeat(100_000));
     let path = format!("GET /{} HTTP/1.1\r\nHost: x\r\n\r\n", "x".repeat(1 << 20));
-    let question = format!("GET /v1/why?topic={} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n", "x".repeat(8000));
+    let question = format!(
+        "GET /v1/why?topic={} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n",
+        "x".repeat(8000)
+    );
     all.extend([header, many, path, question].map(String::into_bytes));
     for _ in 0..100 {
         let count = 1 + random.below(3000);
@@ -81,11 +84,19 @@ fn what_is_no_http_is_counted_and_the_port_goes_on() {
     for garbage in no_requests() {
         let answer = throw(admin.address, &garbage);
         // Whatever it was, the answer is HTTP or nothing.
-        assert!(answer.is_empty() || answer.starts_with(b"HTTP/1."), "{}", String::from_utf8_lossy(&answer));
+        assert!(
+            answer.is_empty() || answer.starts_with(b"HTTP/1."),
+            "{}",
+            String::from_utf8_lossy(&answer)
+        );
     }
     assert!(process.runs(), "{}", process.tail());
     assert!(admin.ready());
-    assert!(connections(&admin, "malformed") >= 50.0, "{} malformed", connections(&admin, "malformed"));
+    assert!(
+        connections(&admin, "malformed") >= 50.0,
+        "{} malformed",
+        connections(&admin, "malformed")
+    );
     assert_eq!(connections(&admin, "panicked"), 0.0);
     let after = process.resident_bytes().unwrap();
     assert!(after < before + MAX_GROWTH, "{before} bytes before, {after} after");
@@ -123,12 +134,23 @@ fn a_thousand_connections_and_slow_clients_end_by_themselves() {
     .unwrap();
     // Heads have five seconds.
     assert!(begin.elapsed() < Duration::from_secs(9), "{:?}", begin.elapsed());
-    assert!(connections(&admin, "refused") >= 500.0, "{} refused", connections(&admin, "refused"));
+    assert!(
+        connections(&admin, "refused") >= 500.0,
+        "{} refused",
+        connections(&admin, "refused")
+    );
     let timed_out = || connections(&admin, "timed_out") >= 200.0;
-    wait::until("slow ones are counted", DEADLINE, timed_out, || format!("{}", connections(&admin, "timed_out"))).unwrap();
+    wait::until("slow ones are counted", DEADLINE, timed_out, || {
+        format!("{}", connections(&admin, "timed_out"))
+    })
+    .unwrap();
     let after = process.resident_bytes().unwrap();
     assert!(after < before + MAX_GROWTH, "{before} bytes before, {after} after");
-    eprintln!("answered again after {:?}; {} KiB more", begin.elapsed(), after.saturating_sub(before) / 1024);
+    eprintln!(
+        "answered again after {:?}; {} KiB more",
+        begin.elapsed(),
+        after.saturating_sub(before) / 1024
+    );
     drop(open);
     assert_eq!(process.terminate(DEADLINE).unwrap(), Some(0));
 }

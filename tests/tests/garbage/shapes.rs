@@ -44,16 +44,41 @@ fn rows<'a>(value: &'a Value, key: &str) -> &'a Vec<Value> {
 }
 
 fn topics(admin: &Admin) {
-    let identity = ["layer:s", "node:s", "service:s", "instance:s", "scope:s", "broker:s?", "local:b"];
+    let identity = [
+        "layer:s",
+        "node:s",
+        "service:s",
+        "instance:s",
+        "scope:s",
+        "broker:s?",
+        "local:b",
+    ];
     let answer = ask(admin, "/v1/topics");
     for row in rows(&answer, "topics") {
-        check(row, &["topic:s", "state:s", "rate_hz:n", "bytes_per_s:n", "advertised:a", "requested:a"]);
+        check(
+            row,
+            &[
+                "topic:s",
+                "state:s",
+                "rate_hz:n",
+                "bytes_per_s:n",
+                "advertised:a",
+                "requested:a",
+            ],
+        );
         assert!(["flowing", "no_request", "no_advertise", "blocked"].contains(&row["state"].as_str().unwrap()));
         for advertised in rows(row, "advertised") {
             check(advertised, &identity);
             check(
                 advertised,
-                &["rate_hz:n?", "max_bytes:n?", "priority:s?", "reliability:s", "durability:s", "expires_in_s:n?"],
+                &[
+                    "rate_hz:n?",
+                    "max_bytes:n?",
+                    "priority:s?",
+                    "reliability:s",
+                    "durability:s",
+                    "expires_in_s:n?",
+                ],
             );
         }
         for requested in rows(row, "requested") {
@@ -68,18 +93,41 @@ fn bridges(admin: &Admin) {
     for row in rows(&answer, "bridges") {
         check(
             row,
-            &["id:s", "topic:s", "from:o", "to:o", "state:s", "since_s:n", "in:o", "out:o", "queued:n", "dropped:o"],
+            &[
+                "id:s",
+                "topic:s",
+                "from:o",
+                "to:o",
+                "state:s",
+                "since_s:n",
+                "in:o",
+                "out:o",
+                "queued:n",
+                "dropped:o",
+            ],
         );
         check(&row["from"], &["scope:s", "broker:s"]);
         check(&row["to"], &["scope:s", "broker:s", "layer:s", "flow:s"]);
         check(&row["in"], &["messages:n", "bytes:n"]);
         check(&row["out"], &["messages:n", "bytes:n"]);
         check(&row["latency_ms"], &["p50:n?", "p99:n?"]);
-        let dropped: u64 = row["dropped"].as_object().unwrap().values().map(|count| count.as_u64().unwrap()).sum();
+        let dropped: u64 = row["dropped"]
+            .as_object()
+            .unwrap()
+            .values()
+            .map(|count| count.as_u64().unwrap())
+            .sum();
         let number = |key: &str| row[key]["messages"].as_u64().unwrap();
-        assert_eq!(number("in"), number("out") + dropped + row["queued"].as_u64().unwrap(), "{row}");
+        assert_eq!(
+            number("in"),
+            number("out") + dropped + row["queued"].as_u64().unwrap(),
+            "{row}"
+        );
         let id = row["id"].as_str().unwrap();
-        let (from, to) = (row["from"]["scope"].as_str().unwrap(), row["to"]["scope"].as_str().unwrap());
+        let (from, to) = (
+            row["from"]["scope"].as_str().unwrap(),
+            row["to"]["scope"].as_str().unwrap(),
+        );
         let layer = row["to"]["layer"].as_str().unwrap();
         assert_eq!(id, format!("{}|{from}>{to}|{layer}", row["topic"].as_str().unwrap()));
     }
@@ -112,10 +160,19 @@ fn allocation(admin: &Admin) {
     let answer = ask(admin, "/v1/allocation");
     check(
         &answer,
-        &["limit_mbps:n", "budget_bytes_per_s:n", "measured_bytes_per_s:n?", "wire_factor:n?", "feasible:b?"],
+        &[
+            "limit_mbps:n",
+            "budget_bytes_per_s:n",
+            "measured_bytes_per_s:n?",
+            "wire_factor:n?",
+            "feasible:b?",
+        ],
     );
     for row in rows(&answer, "topics") {
-        check(row, &["topic:s", "class:s", "size_bytes:n", "advertised_hz:n", "lanes:a"]);
+        check(
+            row,
+            &["topic:s", "class:s", "size_bytes:n", "advertised_hz:n", "lanes:a"],
+        );
         assert!(["standard", "large"].contains(&row["class"].as_str().unwrap()));
         for lane in rows(row, "lanes") {
             check(lane, &["layer:s", "allocated_hz:n?", "actual_hz:n", "skipped:n"]);
@@ -135,30 +192,71 @@ fn why(admin: &Admin) {
         ("imu/data&to=moon", "not_flowing", "no_request"),
     ] {
         let answer = ask(admin, &format!("/v1/why?topic={question}"));
-        check(&answer, &["topic:s", "to:s?", "verdict:s", "code:s", "remedy:s?", "steps:a"]);
-        assert_eq!((&answer["verdict"], &answer["code"]), (&verdict.into(), &code.into()), "{question}: {answer}");
+        check(
+            &answer,
+            &["topic:s", "to:s?", "verdict:s", "code:s", "remedy:s?", "steps:a"],
+        );
+        assert_eq!(
+            (&answer["verdict"], &answer["code"]),
+            (&verdict.into(), &code.into()),
+            "{question}: {answer}"
+        );
         for step in rows(&answer, "steps") {
             check(step, &["flow:s", "step:s", "ok:b", "code:s", "detail:s"]);
             let step = step["step"].as_str().unwrap();
-            assert!(["advertise", "request", "plan", "bridge", "admit", "link", "deliver"].contains(&step), "{step}");
+            assert!(
+                ["advertise", "request", "plan", "bridge", "admit", "link", "deliver"].contains(&step),
+                "{step}"
+            );
         }
     }
-    for question in ["", "?to=fog", "?topic", "?topic=", "?topic=a//b", "?topic=imu/data&to=/", "?topic=%ff%00"] {
+    for question in [
+        "",
+        "?to=fog",
+        "?topic",
+        "?topic=",
+        "?topic=a//b",
+        "?topic=imu/data&to=/",
+        "?topic=%ff%00",
+    ] {
         let (status, body) = admin.get(&format!("/v1/why{question}")).unwrap();
         assert_eq!(status, 400, "{question}: {body}");
-        check(&serde_json::from_str::<Value>(&body).unwrap()["error"], &["code:s", "detail:s"]);
+        check(
+            &serde_json::from_str::<Value>(&body).unwrap()["error"],
+            &["code:s", "detail:s"],
+        );
     }
-    for path in ["/", "/v1", "/v1/", "/v1/nothing", "/v2/topics", "/metrics/", "/%00", "/..%2f..%2fetc/passwd"] {
+    for path in [
+        "/",
+        "/v1",
+        "/v1/",
+        "/v1/nothing",
+        "/v2/topics",
+        "/metrics/",
+        "/%00",
+        "/..%2f..%2fetc/passwd",
+    ] {
         let (status, body) = admin.get(path).unwrap();
         assert_eq!(status, 404, "{path}: {body}");
-        check(&serde_json::from_str::<Value>(&body).unwrap()["error"], &["code:s", "detail:s"]);
+        check(
+            &serde_json::from_str::<Value>(&body).unwrap()["error"],
+            &["code:s", "detail:s"],
+        );
     }
 }
 
 #[test]
 fn every_answer_has_the_keys_of_the_contract() {
     let domain = format!("brokers.inter.dds.domain={}", free_domain());
-    let arguments = ["demo", "--only", "robot-1,fog-1", "--duration", "120s", "--set", &domain];
+    let arguments = [
+        "demo",
+        "--only",
+        "robot-1,fog-1",
+        "--duration",
+        "120s",
+        "--set",
+        &domain,
+    ];
     let mut demo = Process::start("blaze", &arguments, None).unwrap();
     let robot = demo.node_ready("robot-1", DEADLINE).unwrap();
     let flows = || {
@@ -167,7 +265,11 @@ fn every_answer_has_the_keys_of_the_contract() {
         small["verdict"] == "flowing" && answer["verdict"] != "not_flowing" && !answer.is_null()
     };
     wait::until("messages flow", DEADLINE, flows, || demo.tail()).unwrap();
-    let rated = || robot.json("/v1/allocation").is_ok_and(|answer| answer["wire_factor"].is_number());
+    let rated = || {
+        robot
+            .json("/v1/allocation")
+            .is_ok_and(|answer| answer["wire_factor"].is_number())
+    };
     wait::until("rates are measured", DEADLINE, rated, || demo.tail()).unwrap();
     topics(&robot);
     bridges(&robot);

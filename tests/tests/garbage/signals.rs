@@ -10,7 +10,10 @@ use super::node_file::{DEADLINE, small_file, started};
 
 /// Sends a signal to a process of this test.
 pub(crate) fn send(process: &Process, signal: &str) {
-    let status = Command::new("kill").args([&format!("-{signal}"), &process.id().to_string()]).status().unwrap();
+    let status = Command::new("kill")
+        .args([&format!("-{signal}"), &process.id().to_string()])
+        .status()
+        .unwrap();
     assert!(status.success());
 }
 
@@ -19,7 +22,9 @@ fn file_with_inter(state: &std::path::Path) -> String {
     let domain = 101 - 1 - std::process::id() % 20;
     small_file(state, "40").replace(
         "brokers: { node: { memory: {} } }",
-        &format!("brokers: {{ node: {{ memory: {{}} }}, inter: {{ dds: {{ domain: {domain}, listen: 127.0.0.1 }} }} }}"),
+        &format!(
+            "brokers: {{ node: {{ memory: {{}} }}, inter: {{ dds: {{ domain: {domain}, listen: 127.0.0.1 }} }} }}"
+        ),
     )
 }
 
@@ -36,7 +41,11 @@ fn sigterm_and_sigint_drain_and_exit_with_0_at_once() {
         assert_eq!(process.exit(DEADLINE).unwrap(), Some(0), "{}", process.tail());
         let took = begin.elapsed();
         // Nothing is queued, so only the good-bye takes time; the deadline of a shutdown is 5 s.
-        assert!(took < Duration::from_secs(3), "SIG{signal}: {took:?}\n{}", process.tail());
+        assert!(
+            took < Duration::from_secs(3),
+            "SIG{signal}: {took:?}\n{}",
+            process.tail()
+        );
         assert_eq!(process.stdout().len(), 1, "{:?}", process.stdout());
         let deadline = |line: &String| line.contains("reached its deadline");
         assert!(!process.stderr().iter().any(deadline), "{}", process.tail());
@@ -68,9 +77,19 @@ fn a_port_that_is_taken_is_one_line_and_exit_code_1() {
     let file = folder.path().join("blaze.yaml");
     std::fs::write(&file, small_file(folder.path(), "40")).unwrap();
     let set = format!("admin.flow={port}");
-    let mut process =
-        Process::start("blaze-flow", &["--config", &file.display().to_string(), "--set", &set], None).unwrap();
+    let mut process = Process::start(
+        "blaze-flow",
+        &["--config", &file.display().to_string(), "--set", &set],
+        None,
+    )
+    .unwrap();
     assert_eq!(process.exit(DEADLINE).unwrap(), Some(1));
     let why = |line: &String| line.starts_with("blaze-flow failed: ") && line.contains(&port.to_string());
-    wait::until("the reason", DEADLINE, || process.stderr().iter().any(why), || process.tail()).unwrap();
+    wait::until(
+        "the reason",
+        DEADLINE,
+        || process.stderr().iter().any(why),
+        || process.tail(),
+    )
+    .unwrap();
 }

@@ -36,13 +36,22 @@ fn udp_ports(process: &Process) -> BTreeSet<u16> {
     let inodes: BTreeSet<String> = std::fs::read_dir(folder)
         .unwrap()
         .filter_map(|entry| std::fs::read_link(entry.ok()?.path()).ok())
-        .filter_map(|link| Some(link.to_str()?.strip_prefix("socket:[")?.trim_end_matches(']').to_owned()))
+        .filter_map(|link| {
+            Some(
+                link.to_str()?
+                    .strip_prefix("socket:[")?
+                    .trim_end_matches(']')
+                    .to_owned(),
+            )
+        })
         .collect();
     let table = std::fs::read_to_string("/proc/net/udp").unwrap();
     let port = |line: &str| {
         let fields: Vec<&str> = line.split_whitespace().collect();
         let local = fields.get(1)?.rsplit(':').next()?;
-        inodes.contains(*fields.get(9)?).then(|| u16::from_str_radix(local, 16).ok())?
+        inodes
+            .contains(*fields.get(9)?)
+            .then(|| u16::from_str_radix(local, 16).ok())?
     };
     table.lines().skip(1).filter_map(port).collect()
 }
@@ -195,10 +204,22 @@ fn a_storm_of_datagrams_leaves_the_processes_alive_and_messages_flow() {
         let label = ["event=\"participant_rebuilt\""];
         let rebuilt = admin.metric("blaze_flow_link_events_total", &label);
         eprintln!("{name}: {} MiB, rebuilt {rebuilt:?}", bytes >> 20);
-        let deaths = process.stderr().iter().filter(|line| line.contains("participant died")).count();
-        assert_eq!(rebuilt, Some(deaths as f64), "each death is counted\n{}", process.tail());
+        let deaths = process
+            .stderr()
+            .iter()
+            .filter(|line| line.contains("participant died"))
+            .count();
+        assert_eq!(
+            rebuilt,
+            Some(deaths as f64),
+            "each death is counted\n{}",
+            process.tail()
+        );
     }
-    eprintln!("{sent} datagrams to {} ports in {storm:?}; messages flowed again after {recovered:?}", ports.len());
+    eprintln!(
+        "{sent} datagrams to {} ports in {storm:?}; messages flowed again after {recovered:?}",
+        ports.len()
+    );
     for process in [&mut robot, &mut fog] {
         process.terminate(DEADLINE).unwrap();
     }
