@@ -146,6 +146,11 @@ async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<N
         Some(IpAddr::V4(address)) => address,
         Some(IpAddr::V6(_)) | None => Ipv4Addr::LOCALHOST,
     };
+    if !domain_id::is_local(listen) {
+        return Err(CliError::Usage(format!(
+            "--listen {listen}: no interface of this host has this address."
+        )));
+    }
     let reserved = if options.is_complete() {
         domain_id::reserve(listen)
     } else {

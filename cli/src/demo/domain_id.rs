@@ -39,6 +39,12 @@ pub fn reserve(address: Ipv4Addr) -> Option<ReservedDomain> {
     })
 }
 
+/// Whether an interface of this host has the address.
+#[must_use]
+pub fn is_local(address: Ipv4Addr) -> bool {
+    bind(address, 0).is_some()
+}
+
 fn bind(address: Ipv4Addr, port: u16) -> Option<UdpSocket> {
     UdpSocket::bind(SocketAddr::new(IpAddr::V4(address), port)).ok()
 }

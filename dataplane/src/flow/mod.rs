@@ -263,7 +263,7 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
     supervisor.spawn(
         "health",
         TaskPolicy::Essential,
-        watch_health(Arc::clone(&shared), ready),
+        watch_health(Arc::clone(&shared), ready, supervisor.shutdown_token()),
     );
     let pacer = if shared.transport.is_some() {
         let shared = Arc::clone(&shared);
@@ -426,8 +426,8 @@ fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {
     readiness
 }
 
-/// Keeps the checks of `/readyz` true to brokers and link.
-async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>) {
+/// Keeps the checks of `/readyz` true to brokers and link, until the process ends.
+async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: CancellationToken) {
     let mut listened = false;
     let mut marked = Instant::now();
     loop {
@@ -459,6 +459,7 @@ async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>) {
             shared.readiness.set("inter", state, detail);
         }
         tokio::select! {
+            () = stop.cancelled() => return,
             () = tokio::time::sleep(HEALTH) => {}
             () = ready.notified() => listened = true,
         }

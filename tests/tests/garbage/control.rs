@@ -29,7 +29,10 @@ impl<'a> Client<'a> {
             ..SubscribeOptions::default()
         };
         let replies = broker.subscribe(&REPLY.parse().unwrap(), many).await.unwrap();
-        let events = broker.subscribe(&"blaze/flow/events".parse().unwrap(), many).await.unwrap();
+        let events = broker
+            .subscribe(&"blaze/flow/events".parse().unwrap(), many)
+            .await
+            .unwrap();
         Self {
             inside,
             broker,
@@ -39,7 +42,10 @@ impl<'a> Client<'a> {
     }
 
     fn say(&self, payload: impl Into<bytes::Bytes>) {
-        assert_eq!(self.inside.publish(CONTROL, payload), blaze_brokers::PublishOutcome::Taken);
+        assert_eq!(
+            self.inside.publish(CONTROL, payload),
+            blaze_brokers::PublishOutcome::Taken
+        );
     }
 
     /// Answers, until there are that many.
@@ -73,7 +79,11 @@ async fn heard(subscription: &mut Subscription, count: usize) -> Vec<Value> {
     let mut batch = Vec::new();
     while found.len() < count {
         let more = tokio::time::timeout(DEADLINE, subscription.receive(&mut batch, count - found.len())).await;
-        assert!(more.is_ok_and(|more| more > 0), "{} of {count} came: {found:?}", found.len());
+        assert!(
+            more.is_ok_and(|more| more > 0),
+            "{} of {count} came: {found:?}",
+            found.len()
+        );
         for received in batch.drain(..) {
             let Content::Bare { payload, .. } = received.content else {
                 panic!("reserved channels carry JSON as it is")
@@ -110,7 +120,11 @@ fn faulty() -> Vec<(Value, &'static str, &'static str)> {
         (advertise(json!({"topic": long.as_str()})), "invalid_topic", "/topic"),
         (advertise(json!({"topic": "a/*"})), "invalid_topic", "/topic"),
         (advertise(json!({"topic": "ä"})), "invalid_topic", "/topic"),
-        (advertise(json!({"topic": "blaze/flow/control"})), "reserved_topic", "/topic"),
+        (
+            advertise(json!({"topic": "blaze/flow/control"})),
+            "reserved_topic",
+            "/topic",
+        ),
         (advertise(json!({"topic": "blaze/x"})), "reserved_topic", "/topic"),
         (advertise(json!({"topic": 3})), "invalid_value", "/topic"),
         (advertise(json!({"service": null})), "invalid_value", "/service"),
@@ -126,24 +140,48 @@ fn faulty() -> Vec<(Value, &'static str, &'static str)> {
         (advertise(json!({"rate_hz": -5})), "invalid_value", "/rate_hz"),
         (advertise(json!({"rate_hz": "fast"})), "invalid_value", "/rate_hz"),
         (advertise(json!({"max_bytes": -1})), "invalid_value", "/max_bytes"),
-        (advertise(json!({"encoding": long.as_str()})), "invalid_value", "/encoding"),
+        (
+            advertise(json!({"encoding": long.as_str()})),
+            "invalid_value",
+            "/encoding",
+        ),
         (advertise(json!({"encoding": "a\nb"})), "invalid_value", "/encoding"),
         (advertise(json!({"type": long.as_str()})), "invalid_value", "/type"),
         (advertise(json!({"type_hash": 7})), "invalid_value", "/type_hash"),
-        (advertise(json!({"reliability": "maybe"})), "invalid_value", "/reliability"),
-        (advertise(json!({"durability": "persistent"})), "invalid_value", "/durability"),
+        (
+            advertise(json!({"reliability": "maybe"})),
+            "invalid_value",
+            "/reliability",
+        ),
+        (
+            advertise(json!({"durability": "persistent"})),
+            "invalid_value",
+            "/durability",
+        ),
         (advertise(json!({"depth": 0})), "invalid_value", "/depth"),
         (advertise(json!({"depth": 65_536})), "invalid_value", "/depth"),
         (advertise(json!({"priority": "urgent"})), "invalid_value", "/priority"),
         (advertise(json!({"lifespan_ms": -1})), "invalid_value", "/lifespan_ms"),
-        (advertise(json!({"lifespan_ms": 4_294_967_296_u64})), "invalid_value", "/lifespan_ms"),
+        (
+            advertise(json!({"lifespan_ms": 4_294_967_296_u64})),
+            "invalid_value",
+            "/lifespan_ms",
+        ),
         (advertise(json!({"layer": "fog"})), "source_mismatch", "/layer"),
         (advertise(json!({"node": "robot-2"})), "source_mismatch", "/node"),
         (request(json!({"max_rate_hz": 0})), "invalid_value", "/max_rate_hz"),
         (request(json!({"bare": "yes"})), "invalid_value", "/bare"),
         (request(json!({"from": "edge"})), "invalid_value", "/from"),
-        (request(json!({"from": {"layer": "Edge"}})), "invalid_value", "/from/layer"),
-        (request(json!({"from": {"service": 1}})), "invalid_value", "/from/service"),
+        (
+            request(json!({"from": {"layer": "Edge"}})),
+            "invalid_value",
+            "/from/layer",
+        ),
+        (
+            request(json!({"from": {"service": 1}})),
+            "invalid_value",
+            "/from/service",
+        ),
         (message("withdraw", &json!({"kind": "both"})), "invalid_value", "/kind"),
     ];
     all.push((advertise(json!({"id": "x".repeat(257)})), "invalid_value", "/id"));
@@ -160,35 +198,67 @@ async fn faulty_control_messages_are_answered_with_code_and_pointer() {
     for (message, code, pointer) in faulty() {
         let answer = client.ask(&message).await;
         assert_eq!(answer["ok"], false, "{message}: {answer}");
-        assert_eq!((&answer["error"]["code"], &answer["error"]["pointer"]), (&json!(code), &json!(pointer)), "{message}: {answer}");
-        assert!(answer["error"]["detail"].as_str().is_some_and(|detail| !detail.is_empty()), "{answer}");
+        assert_eq!(
+            (&answer["error"]["code"], &answer["error"]["pointer"]),
+            (&json!(code), &json!(pointer)),
+            "{message}: {answer}"
+        );
+        assert!(
+            answer["error"]["detail"]
+                .as_str()
+                .is_some_and(|detail| !detail.is_empty()),
+            "{answer}"
+        );
         if pointer != "/id" {
             assert_eq!(answer["id"], "7", "{message}: {answer}");
         }
         let event = client.refusal().await;
-        assert_eq!((&event["code"], &event["flow"]), (&json!(code), &json!("edge/robot-1")), "{event}");
+        assert_eq!(
+            (&event["code"], &event["flow"]),
+            (&json!(code), &json!("edge/robot-1")),
+            "{event}"
+        );
         refused += 1;
         assert_eq!(client.refused(), refused, "{message} is counted once");
     }
 
     // A newer life holds the lease; after its withdrawal the older one may have it.
     let lease = |epoch: u64| message("advertise", &json!({"epoch": epoch}));
-    assert_eq!(client.ask(&lease(5)).await, json!({"id": "7", "ok": true, "flow": "edge/robot-1", "lease_s": 15}));
+    assert_eq!(
+        client.ask(&lease(5)).await,
+        json!({"id": "7", "ok": true, "flow": "edge/robot-1", "lease_s": 15})
+    );
     let stale = client.ask(&lease(4)).await;
-    assert_eq!((&stale["error"]["code"], &stale["error"]["pointer"]), (&json!("stale_epoch"), &json!("/epoch")));
+    assert_eq!(
+        (&stale["error"]["code"], &stale["error"]["pointer"]),
+        (&json!("stale_epoch"), &json!("/epoch"))
+    );
     assert_eq!(client.ask(&message("withdraw", &json!({"epoch": 5}))).await["ok"], true);
     assert_eq!(client.ask(&lease(4)).await["ok"], true);
-    assert_eq!(client.ask(&message("request", &json!({"ttl_s": 0}))).await["lease_s"], 0);
+    assert_eq!(
+        client.ask(&message("request", &json!({"ttl_s": 0}))).await["lease_s"],
+        0
+    );
 
     // Of an array each object has an answer of its own, and faults do not spread.
-    let array = json!([lease(9), message("advertise", &json!({"topic": "a//b"})), 17, lease(9), message("x", &json!({}))]);
+    let array = json!([
+        lease(9),
+        message("advertise", &json!({"topic": "a//b"})),
+        17,
+        lease(9),
+        message("x", &json!({}))
+    ]);
     client.say(array.to_string());
     let answers = client.answers(4).await;
     let told: Vec<(bool, &str)> = answers
         .iter()
         .map(|answer| (answer["ok"] == true, answer["error"]["pointer"].as_str().unwrap_or("")))
         .collect();
-    assert_eq!(told, [(true, ""), (false, "/1/topic"), (true, ""), (false, "/4/op")], "{answers:?}");
+    assert_eq!(
+        told,
+        [(true, ""), (false, "/1/topic"), (true, ""), (false, "/4/op")],
+        "{answers:?}"
+    );
 
     traffic.end().await;
     inside.end().await;
@@ -222,11 +292,34 @@ fn unanswerable() -> Vec<(Vec<u8>, &'static str)> {
         (long.into_bytes(), "invalid_value"),
         (serde_json::to_vec(&many).unwrap(), "invalid_value"),
         // In order, but the answer would go to a place that is not for answers.
-        (message("advertise", &json!({"reply_to": LIVE_TOPIC})).to_string().into_bytes(), "invalid_value"),
-        (message("advertise", &json!({"reply_to": CONTROL})).to_string().into_bytes(), "invalid_value"),
-        (message("advertise", &json!({"reply_to": "blaze/reply/"})).to_string().into_bytes(), "invalid_value"),
-        (message("advertise", &json!({"reply_to": "blaze/reply/../x y"})).to_string().into_bytes(), "invalid_value"),
-        (message("advertise", &json!({"reply_to": 7})).to_string().into_bytes(), "invalid_value"),
+        (
+            message("advertise", &json!({"reply_to": LIVE_TOPIC}))
+                .to_string()
+                .into_bytes(),
+            "invalid_value",
+        ),
+        (
+            message("advertise", &json!({"reply_to": CONTROL}))
+                .to_string()
+                .into_bytes(),
+            "invalid_value",
+        ),
+        (
+            message("advertise", &json!({"reply_to": "blaze/reply/"}))
+                .to_string()
+                .into_bytes(),
+            "invalid_value",
+        ),
+        (
+            message("advertise", &json!({"reply_to": "blaze/reply/../x y"}))
+                .to_string()
+                .into_bytes(),
+            "invalid_value",
+        ),
+        (
+            message("advertise", &json!({"reply_to": 7})).to_string().into_bytes(),
+            "invalid_value",
+        ),
     ]
 }
 
@@ -246,7 +339,9 @@ async fn payloads_that_cannot_be_answered_show_as_event_and_count() {
     }
     // Noise, as fast as it goes. Nothing of it is a lease.
     let mut random = Random::new(11);
-    let good = message("advertise", &json!({"topic": "noise"})).to_string().into_bytes();
+    let good = message("advertise", &json!({"topic": "noise"}))
+        .to_string()
+        .into_bytes();
     for _ in 0..2000 {
         let mut noise = good.clone();
         let at = random.below(noise.len());
@@ -264,7 +359,10 @@ async fn payloads_that_cannot_be_answered_show_as_event_and_count() {
     // A frame where only JSON may be.
     let frame = super::inside::frame_bytes(&super::inside::header(LIVE_TOPIC, 1, 1), b"x");
     client.say(frame);
-    assert_eq!(client.refusal_count_after(before + payloads.len() as u64 + 2001), Ok(()));
+    assert_eq!(
+        client.refusal_count_after(before + payloads.len() as u64 + 2001),
+        Ok(())
+    );
     drop(client.broker);
     traffic.end().await;
     inside.end().await;
@@ -272,9 +370,14 @@ async fn payloads_that_cannot_be_answered_show_as_event_and_count() {
 
 impl Client<'_> {
     fn refusal_count_after(&self, expected: u64) -> Result<(), String> {
-        wait::until("the count", DEADLINE, || self.refused() == expected, || format!("{}", self.refused()))
-            .map(|_| ())
-            .map_err(|error| error.to_string())
+        wait::until(
+            "the count",
+            DEADLINE,
+            || self.refused() == expected,
+            || format!("{}", self.refused()),
+        )
+        .map(|_| ())
+        .map_err(|error| error.to_string())
     }
 }
 
@@ -285,7 +388,12 @@ async fn the_10_001st_lease_is_refused_and_the_others_stay() {
     let mut client = Client::start(&inside).await;
     // The traffic holds two.
     let leases = |range: std::ops::Range<usize>| -> Value {
-        let one = |number: usize| message("advertise", &json!({"topic": format!("flood/t{number}"), "id": number.to_string()}));
+        let one = |number: usize| {
+            message(
+                "advertise",
+                &json!({"topic": format!("flood/t{number}"), "id": number.to_string()}),
+            )
+        };
         range.map(one).collect()
     };
     let begin = Instant::now();
@@ -297,7 +405,11 @@ async fn the_10_001st_lease_is_refused_and_the_others_stay() {
     assert!(answers.iter().all(|answer| answer["ok"] == true), "room for 10,000");
     let taken = begin.elapsed();
     let answer = client.ask(&leases(9998..9999)[0]).await;
-    assert_eq!((&answer["id"], &answer["error"]["code"]), (&json!("9998"), &json!("too_many_leases")), "{answer}");
+    assert_eq!(
+        (&answer["id"], &answer["error"]["code"]),
+        (&json!("9998"), &json!("too_many_leases")),
+        "{answer}"
+    );
     client.say(leases(9998..10_000).to_string());
     let answers = client.answers(2).await;
     assert_eq!(answers[1]["error"]["pointer"], "/1", "{answers:?}");
@@ -309,7 +421,10 @@ async fn the_10_001st_lease_is_refused_and_the_others_stay() {
     assert!(taken < Duration::from_secs(10), "9,998 leases took {taken:?}");
 
     // Room again once one is withdrawn.
-    assert_eq!(client.ask(&message("withdraw", &json!({"topic": "flood/t17"}))).await["ok"], true);
+    assert_eq!(
+        client.ask(&message("withdraw", &json!({"topic": "flood/t17"}))).await["ok"],
+        true
+    );
     assert_eq!(client.ask(&leases(9998..9999)[0]).await["ok"], true);
     eprintln!("9,998 leases in {taken:?}");
     traffic.end().await;

@@ -18,7 +18,9 @@ use blaze_flow::plan::PlanRules;
 use blaze_flow::world::LayerScopeId;
 use blaze_proto::{Frame, Header};
 use blaze_runtime::Supervisor;
-use blaze_sdk::{Advertise, Lease, PublishOptions, Request, ServiceManager, ServiceOptions, SubscribeOptions as Listen};
+use blaze_sdk::{
+    Advertise, Lease, PublishOptions, Request, ServiceManager, ServiceOptions, SubscribeOptions as Listen,
+};
 use blaze_tests::admin::Admin;
 use blaze_tests::wait;
 use bytes::Bytes;
@@ -51,7 +53,10 @@ mod parking {
 
         pub(super) fn of(&self, channel: &ChannelName) -> Vec<SubscriptionSender> {
             let ends = self.0.lock().unwrap();
-            ends.iter().filter(|(of, _)| of == channel).map(|(_, end)| end.clone()).collect()
+            ends.iter()
+                .filter(|(of, _)| of == channel)
+                .map(|(_, end)| end.clone())
+                .collect()
         }
     }
 }
@@ -177,7 +182,9 @@ impl Inside {
     /// Publishes bytes as they are on the node hub, as a service without SDK.
     pub(crate) fn publish(&self, channel: &str, bytes: impl Into<Bytes>) -> blaze_brokers::PublishOutcome {
         let broker = self.node.broker();
-        let publisher = broker.publisher(&channel.parse().unwrap(), PublisherOptions::default()).unwrap();
+        let publisher = broker
+            .publisher(&channel.parse().unwrap(), PublisherOptions::default())
+            .unwrap();
         publisher.publish_bare(&bytes.into())
     }
 
@@ -236,8 +243,13 @@ impl Traffic {
         };
         let options = service("imu-driver", &inside.node, Scope::Node).on_node("robot-1".parse().unwrap());
         let publisher = ServiceManager::start(options).await.unwrap();
-        let consumer = ServiceManager::start(service("logger", &inside.layer, Scope::Layer)).await.unwrap();
-        let writer = publisher.broker().publisher(&topic, &PublishOptions::default()).unwrap();
+        let consumer = ServiceManager::start(service("logger", &inside.layer, Scope::Layer))
+            .await
+            .unwrap();
+        let writer = publisher
+            .broker()
+            .publisher(&topic, &PublishOptions::default())
+            .unwrap();
         let own = writer.writer();
         let (heard, strangers) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicU64::new(0)));
         let (count, others) = (Arc::clone(&heard), Arc::clone(&strangers));
@@ -309,7 +321,11 @@ impl Traffic {
         )
         .unwrap();
         let end = stats();
-        assert_eq!((end.lost, end.duplicated, end.reordered, end.queue_dropped), (0, 0, 0, 0), "{end:?}");
+        assert_eq!(
+            (end.lost, end.duplicated, end.reordered, end.queue_dropped),
+            (0, 0, 0, 0),
+            "{end:?}"
+        );
         self.publisher.shutdown().await;
         self.consumer.shutdown().await;
     }

@@ -11,6 +11,7 @@
 )]
 
 mod control;
+mod demo;
 mod frames;
 mod http;
 mod inside;
