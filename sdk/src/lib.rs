@@ -50,7 +50,6 @@ mod pool;
 mod publisher;
 mod service;
 mod subscription;
-mod tasks;
 
 pub use blaze_brokers::PublishOutcome;
 pub use broker::LocalBroker;

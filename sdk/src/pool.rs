@@ -12,11 +12,10 @@
 use std::collections::VecDeque;
 use std::io;
 use std::sync::Arc;
-use std::thread;
 use std::time::{Duration, Instant};
 
+use blaze_runtime::{Supervisor, TaskPolicy};
 use parking_lot::{Condvar, Mutex};
-use tokio::sync::watch;
 
 /// Spare threads of one pool at most.
 pub(crate) const MAX_SPARE_THREADS: usize = 16;
@@ -48,8 +47,8 @@ struct Shared {
     work: Condvar,
     /// The same, for the thread that watches whether it stands still.
     watched: Condvar,
-    /// Threads that live.
-    alive: watch::Sender<usize>,
+    /// Owner of the threads.
+    supervisor: Supervisor,
 }
 
 #[derive(Default)]
@@ -65,14 +64,15 @@ struct State {
 }
 
 impl Pool {
-    /// Starts the threads; at least two, so that one slow callback never holds up the others.
-    pub(crate) fn start(threads: usize) -> io::Result<Self> {
+    /// Starts the threads; at least two, so that one slow callback never holds up the others. They end with the supervisor,
+    /// after the callback that they are in.
+    pub(crate) fn start(threads: usize, supervisor: &Supervisor) -> io::Result<Self> {
         let pool = Self {
             shared: Arc::new(Shared {
                 state: Mutex::default(),
                 work: Condvar::new(),
                 watched: Condvar::new(),
-                alive: watch::Sender::new(0),
+                supervisor: supervisor.clone(),
             }),
         };
         for number in 0..threads.max(2) {
@@ -80,6 +80,11 @@ impl Pool {
                 .spawn(format!("blaze-cb-{number}"), |shared| work(shared, None))?;
         }
         pool.shared.spawn("blaze-cb-watch".to_owned(), help_when_stuck)?;
+        let (shared, stop) = (Arc::clone(&pool.shared), supervisor.shutdown_token());
+        supervisor.spawn("pool", TaskPolicy::MayEnd, async move {
+            stop.cancelled().await;
+            shared.stop();
+        });
         Ok(pool)
     }
 
@@ -91,21 +96,7 @@ impl Pool {
 
     /// Forgets what waits and tells the threads to end after the callback that they are in.
     pub(crate) fn stop(&self) {
-        let forgotten = {
-            let mut state = self.shared.state.lock();
-            state.stopped = true;
-            std::mem::take(&mut state.ready)
-        };
-        drop(forgotten);
-        self.shared.work.notify_all();
-        self.shared.watched.notify_all();
-    }
-
-    /// Waits until all threads ended. Returns how many had not within the time.
-    pub(crate) async fn ended(&self, within: Duration) -> usize {
-        let mut alive = self.shared.alive.subscribe();
-        let _ = tokio::time::timeout(within, alive.wait_for(|count| *count == 0)).await;
-        *alive.borrow()
+        self.shared.stop();
     }
 }
 
@@ -122,6 +113,17 @@ impl PoolHandle {
 }
 
 impl Shared {
+    fn stop(&self) {
+        let forgotten = {
+            let mut state = self.state.lock();
+            state.stopped = true;
+            std::mem::take(&mut state.ready)
+        };
+        drop(forgotten);
+        self.work.notify_all();
+        self.watched.notify_all();
+    }
+
     fn submit(&self, job: Arc<dyn Job>) {
         let mut state = self.state.lock();
         if state.stopped {
@@ -137,15 +139,9 @@ impl Shared {
     }
 
     fn spawn(self: &Arc<Self>, name: String, body: impl FnOnce(&Arc<Self>) + Send + 'static) -> io::Result<()> {
-        struct Alive(Arc<Shared>);
-        impl Drop for Alive {
-            fn drop(&mut self) {
-                self.0.alive.send_modify(|count| *count -= 1);
-            }
-        }
-        self.alive.send_modify(|count| *count += 1);
-        let alive = Alive(Arc::clone(self));
-        thread::Builder::new().name(name).spawn(move || body(&alive.0))?;
+        let shared = Arc::clone(self);
+        self.supervisor
+            .spawn_thread(name, TaskPolicy::MayEnd, move || body(&shared))?;
         Ok(())
     }
 
@@ -259,13 +255,14 @@ mod tests {
         let until = Instant::now() + DEADLINE;
         while !holds() {
             assert!(Instant::now() < until, "not within {DEADLINE:?}");
-            thread::sleep(Duration::from_millis(2));
+            std::thread::sleep(Duration::from_millis(2));
         }
     }
 
     #[tokio::test]
     async fn stuck_threads_get_help_up_to_a_bound_and_all_end_when_it_stops() {
-        let pool = Pool::start(2).unwrap();
+        let supervisor = Supervisor::new("t");
+        let pool = Pool::start(2, &supervisor).unwrap();
         let stuck = Arc::new(Stuck::default());
         let most = 2 + MAX_SPARE_THREADS;
         for _ in 0..most + 5 {
@@ -276,14 +273,12 @@ mod tests {
             let state = pool.shared.state.lock();
             assert_eq!((state.ready.len(), state.spare), (5, MAX_SPARE_THREADS));
         }
-        assert_eq!(*pool.shared.alive.borrow(), most + 1, "and the one that watches");
-        pool.stop();
-        assert!(
-            pool.ended(Duration::from_millis(1)).await >= most,
-            "they are still in their jobs"
-        );
+        let threads = || supervisor.running().iter().filter(|task| task.thread).count();
+        assert_eq!(threads(), most + 1, "and the one that watches");
+        let report = supervisor.shutdown(Duration::from_millis(1)).await;
+        assert_eq!(report.left.len(), most, "they are still in their jobs: {report:?}");
         stuck.let_go();
-        assert_eq!(pool.ended(DEADLINE).await, 0);
+        assert!(supervisor.shutdown(DEADLINE).await.is_clean());
         assert_eq!(stuck.running.load(Ordering::SeqCst), most, "what waited was forgotten");
     }
 
@@ -295,7 +290,7 @@ mod tests {
                 self.0.fetch_add(1, Ordering::SeqCst) + 1 < self.1
             }
         }
-        let pool = Pool::start(2).unwrap();
+        let pool = Pool::start(2, &Supervisor::new("t")).unwrap();
         let jobs: Vec<_> = (0..4).map(|_| Arc::new(Counting(AtomicUsize::new(0), 5_000))).collect();
         for job in &jobs {
             pool.handle().submit(Arc::clone(job) as Arc<dyn Job>);

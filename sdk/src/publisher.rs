@@ -4,15 +4,13 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use blaze_brokers::PublishOutcome;
+use blaze_domain::control::{MAX_ENCODING_BYTES, MAX_TYPE_BYTES};
 use blaze_domain::{MAX_PAYLOAD_BYTES, Origin, Priority, Reliability, TopicName, WriterId};
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
 use parking_lot::Mutex;
 
 use crate::SdkError;
-
-/// Longest media type and type hash, in bytes.
-pub(crate) const MAX_WORD_BYTES: usize = 200;
 
 /// What a publisher says of all its messages.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -49,12 +47,15 @@ impl Default for PublishOptions {
 
 impl PublishOptions {
     pub(crate) fn check(&self) -> Result<(), SdkError> {
-        let words = [("encoding", &self.encoding), ("type_hash", &self.type_hash)];
-        for (option, word) in words {
-            if word.len() > MAX_WORD_BYTES {
+        let words = [
+            ("encoding", &self.encoding, MAX_ENCODING_BYTES),
+            ("type_hash", &self.type_hash, MAX_TYPE_BYTES),
+        ];
+        for (option, word, most) in words {
+            if word.len() > most {
                 return Err(SdkError::Option {
                     option,
-                    reason: format!("has {} bytes, at most {MAX_WORD_BYTES} are allowed", word.len()),
+                    reason: format!("has {} bytes, at most {most} are allowed", word.len()),
                 });
             }
         }

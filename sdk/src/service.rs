@@ -4,19 +4,18 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use blaze_brokers::{Broker, BrokerError};
+use blaze_domain::control::{Common, DEFAULT_TTL_S, MAX_TTL_S};
 use blaze_domain::{InstanceName, LayerName, NodeName, Origin, Scope, ServiceName};
+use blaze_runtime::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy};
 
 use crate::broker::LocalBroker;
 use crate::flow::FlowManager;
 use crate::pool::Pool;
-use crate::tasks::Tasks;
 
 /// How long [`ServiceManager::shutdown`] waits for the flow to take leave.
 const LEAVE_WITHIN: Duration = Duration::from_secs(1);
 /// How long it waits for tasks and for callbacks that run.
 const END_WITHIN: Duration = Duration::from_secs(5);
-/// Longest time to live of a lease, in seconds.
-const MAX_TTL_S: u64 = 86_400;
 
 /// Why the SDK refused.
 #[derive(Debug, thiserror::Error)]
@@ -64,6 +63,10 @@ pub struct ServiceOptions {
     pub control_timeout: Duration,
     /// Larger is newer; 0 = milliseconds since 1970 at the start.
     pub epoch: u64,
+    /// The service's tasks and threads run under a child of it: their failure is its failure, and its shutdown ends them,
+    /// though without withdrawing leases; for that call [`ServiceManager::shutdown`] before. Absent = under a supervisor of
+    /// their own, whose failure is logged.
+    pub supervisor: Option<Supervisor>,
 }
 
 impl ServiceOptions {
@@ -78,9 +81,10 @@ impl ServiceOptions {
             broker,
             scope,
             pool_threads: 0,
-            lease_ttl: Duration::from_secs(15),
+            lease_ttl: Duration::from_secs(DEFAULT_TTL_S.into()),
             control_timeout: Duration::from_secs(10),
             epoch: 0,
+            supervisor: None,
         }
     }
 
@@ -119,6 +123,18 @@ impl Identity {
             epoch: self.epoch,
         }
     }
+
+    /// Names this service in a control message.
+    pub(crate) fn sign(&self, common: Common) -> Common {
+        Common {
+            service: self.service.clone(),
+            instance: self.instance.clone(),
+            layer: Some(self.layer.clone()),
+            node: self.node.clone(),
+            epoch: self.epoch,
+            ..common
+        }
+    }
 }
 
 /// What the parts of a service share.
@@ -128,12 +144,12 @@ pub(crate) struct Shared {
     pub(crate) scope: Scope,
     pub(crate) pool: Pool,
     pub(crate) pool_threads: usize,
-    pub(crate) tasks: Tasks,
+    pub(crate) supervisor: Supervisor,
 }
 
 impl Shared {
     pub(crate) fn refuse_when_stopping(&self) -> Result<(), SdkError> {
-        if self.tasks.is_stopping() {
+        if self.supervisor.stopping_token().is_cancelled() {
             return Err(SdkError::ShutDown);
         }
         Ok(())
@@ -154,18 +170,26 @@ impl ServiceManager {
     /// # Errors
     /// [`SdkError::Option`] or [`SdkError::Threads`].
     pub async fn start(options: ServiceOptions) -> Result<Self, SdkError> {
-        let ttl_s = options.lease_ttl.as_secs();
-        if !(1..=MAX_TTL_S).contains(&ttl_s) {
-            return Err(SdkError::Option {
+        let ttl_s = u32::try_from(options.lease_ttl.as_secs())
+            .ok()
+            .filter(|ttl_s| (1..=MAX_TTL_S).contains(ttl_s))
+            .ok_or_else(|| SdkError::Option {
                 option: "lease_ttl",
                 reason: format!("is {:?}, 1 s to {MAX_TTL_S} s are allowed", options.lease_ttl),
-            });
-        }
+            })?;
         let pool_threads = match options.pool_threads {
             0 => std::thread::available_parallelism().map_or(2, usize::from),
             threads => threads,
         }
         .max(2);
+        let name = format!("{}-{}", options.service, options.instance);
+        let supervisor = match &options.supervisor {
+            Some(parent) => parent.child(name),
+            None => observed(name),
+        };
+        let pool = Pool::start(pool_threads, &supervisor)
+            .inspect_err(|_| supervisor.shutdown_token().cancel())
+            .map_err(SdkError::Threads)?;
         let shared = Arc::new(Shared {
             identity: Identity {
                 layer: options.layer,
@@ -176,15 +200,15 @@ impl ServiceManager {
             },
             broker: options.broker,
             scope: options.scope,
-            pool: Pool::start(pool_threads).map_err(SdkError::Threads)?,
+            pool,
             pool_threads,
-            tasks: Tasks::default(),
+            supervisor,
         });
         let flow = FlowManager::start(
             shared.identity.clone(),
             Arc::clone(&shared.broker),
-            &shared.tasks,
-            Duration::from_secs(ttl_s),
+            &shared.supervisor,
+            ttl_s,
             options.control_timeout,
         );
         Ok(Self {
@@ -212,19 +236,18 @@ impl ServiceManager {
         &self.shared.identity
     }
 
-    /// Withdraws all leases, ends all subscriptions, and waits for tasks and for callbacks that run: at most some 11 s. The
+    /// Withdraws all leases, ends all subscriptions, and waits for tasks and for callbacks that run: at most some 7 s. The
     /// broker stays open.
     pub async fn shutdown(self) {
-        self.flow.leave(LEAVE_WITHIN).await;
-        self.shared.tasks.stop();
-        self.shared.pool.stop();
-        let tasks = self.shared.tasks.ended(END_WITHIN).await;
-        let threads = self.shared.pool.ended(END_WITHIN).await;
-        if tasks + threads > 0 {
+        let flow = self.flow.clone();
+        let steps = ShutdownSteps::new(LEAVE_WITHIN + END_WITHIN).on(ShutdownPhase::Drain, "leases", async move {
+            flow.leave(LEAVE_WITHIN).await;
+        });
+        let report = self.shared.supervisor.shutdown_with(steps).await;
+        if !report.is_clean() {
             tracing::warn!(
                 service = %self.shared.identity.service,
-                tasks,
-                threads,
+                ?report,
                 "the service ends, though tasks or callbacks still run"
             );
         }
@@ -233,9 +256,25 @@ impl ServiceManager {
 
 impl Drop for ServiceManager {
     fn drop(&mut self) {
-        self.shared.tasks.stop();
+        self.shared.supervisor.stopping_token().cancel();
+        self.shared.supervisor.shutdown_token().cancel();
+        // Also where no runtime is left to do it.
         self.shared.pool.stop();
     }
+}
+
+/// A supervisor of a service's own. Nobody else looks at it, so its failure is logged.
+fn observed(name: String) -> Supervisor {
+    let supervisor = Supervisor::new(name);
+    let watched = supervisor.clone();
+    supervisor.spawn("failures", TaskPolicy::MayEnd, async move {
+        let end = watched.shutdown_token();
+        tokio::select! {
+            () = end.cancelled() => {}
+            reason = watched.failed() => tracing::error!(service = watched.name(), reason, "a part of the service failed"),
+        }
+    });
+    supervisor
 }
 
 fn now_ms() -> u64 {

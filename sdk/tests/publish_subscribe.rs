@@ -12,6 +12,7 @@ use blaze_brokers::{Broker as _, PublisherOptions};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Origin, Scope, TopicName, WriterId};
 use blaze_proto::{Frame, Header};
+use blaze_runtime::Supervisor;
 use blaze_sdk::{
     Message, PublishOptions, PublishOutcome, SdkError, ServiceManager, ServiceOptions, SubscribeOptions, Subscription,
 };
@@ -588,7 +589,8 @@ async fn shutdown_leaves_no_task_and_no_reader() {
         let broker = service.broker().clone();
         if graceful {
             service.shutdown().await;
-            assert_eq!(tasks(), before);
+            // The runtime strikes a task off a moment after it has told its end.
+            eventually("all tasks end", || tasks() == before).await;
             assert_eq!(hub.stats().subscriptions, 0);
         } else {
             drop(service);
@@ -598,4 +600,45 @@ async fn shutdown_leaves_no_task_and_no_reader() {
         let refused = broker.subscribe(&topic("t"), SubscribeOptions::default(), |_| {}).await;
         assert!(matches!(refused, Err(SdkError::ShutDown)), "{refused:?}");
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_service_runs_under_the_supervisor_that_it_is_given_and_ends_with_it() {
+    let hub = MemoryHub::new("t");
+    let process = Supervisor::new("process");
+    let options = ServiceOptions::new(
+        "edge".parse().unwrap(),
+        "s".parse().unwrap(),
+        Arc::new(hub.broker()),
+        Scope::Node,
+    );
+    let options = ServiceOptions {
+        supervisor: Some(process.clone()),
+        pool_threads: 2,
+        ..options
+    };
+    let service = ServiceManager::start(options).await.unwrap();
+    let (_subscription, heard) = listen(&service, "t", SubscribeOptions::default()).await;
+    Raw::new(&hub, "t").send(1, 1, |_| {});
+    heard.recv_timeout(DEADLINE).unwrap();
+    let running = process.running();
+    for (name, thread) in [
+        ("s-0/leases", false),
+        ("s-0/subscription t", false),
+        ("s-0/blaze-cb-0", true),
+        ("s-0/blaze-cb-1", true),
+    ] {
+        assert!(
+            running.iter().any(|task| task.name == name && task.thread == thread),
+            "{name}: {running:?}"
+        );
+    }
+    let report = process.shutdown(DEADLINE).await;
+    assert!(report.is_clean(), "{report:?}");
+    assert_eq!((hub.stats().subscriptions, process.running()), (0, Vec::new()));
+    let refused = service
+        .broker()
+        .subscribe(&topic("t"), SubscribeOptions::default(), |_| {})
+        .await;
+    assert!(matches!(refused, Err(SdkError::ShutDown)), "{refused:?}");
 }

@@ -12,11 +12,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_domain::TopicName;
+use blaze_domain::control::{Answer, ControlError, ControlMessage, ErrorCode, LeaseKind, WithdrawMessage};
+use blaze_domain::names::ChannelName;
 use tokio::sync::oneshot;
 
-use super::protocol::{Answer, ControlObject, LeaseKind, Op, RefusalCode, Terms, pointer_in_object};
 use super::{FlowError, LeaseState};
-use crate::service::Identity;
 
 /// Leases of one service at most; a flow holds no more of all services together.
 pub(super) const MAX_LEASES: usize = 10_000;
@@ -48,10 +48,10 @@ pub(super) type AskResult = Result<(), FlowError>;
 struct Record {
     generation: u64,
     holders: usize,
-    /// What was last asked.
-    terms: Arc<Terms>,
+    /// What was last asked; its `id` is in [`Record::id`].
+    asked: Arc<ControlMessage>,
     /// What the flow last agreed to.
-    agreed: Option<Arc<Terms>>,
+    agreed: Option<Arc<ControlMessage>>,
     id: String,
     state: State,
     waiting: Vec<oneshot::Sender<AskResult>>,
@@ -75,9 +75,8 @@ enum State {
 
 /// The leases of a service.
 pub(super) struct LeaseBook {
-    identity: Identity,
-    reply_to: String,
-    ttl: Duration,
+    reply_to: ChannelName,
+    ttl_s: u32,
     /// Random numbers of 0 to 1.
     random: Box<dyn FnMut() -> f64 + Send>,
     /// Begins all identities of messages, so that they differ from those of other services on a shared reply topic.
@@ -90,16 +89,14 @@ pub(super) struct LeaseBook {
 
 impl LeaseBook {
     pub(super) fn new(
-        identity: Identity,
-        reply_to: String,
+        reply_to: ChannelName,
         id_prefix: String,
-        ttl: Duration,
+        ttl_s: u32,
         random: Box<dyn FnMut() -> f64 + Send>,
     ) -> Self {
         Self {
-            identity,
             reply_to,
-            ttl,
+            ttl_s,
             random,
             id_prefix,
             records: HashMap::new(),
@@ -109,24 +106,43 @@ impl LeaseBook {
         }
     }
 
-    /// Asks for a lease, or for other terms of one that there is. The answer comes to `waiting`.
+    /// Asks for a lease, or for other terms of one that there is. The answer comes to `waiting`. The book says how long the
+    /// lease lasts and where the answer goes.
     pub(super) fn ask(
         &mut self,
-        key: LeaseKey,
-        terms: Terms,
+        mut message: ControlMessage,
         waiting: oneshot::Sender<AskResult>,
         now: Instant,
     ) -> Result<Claim, FlowError> {
         if self.closed {
             return Err(FlowError::Closed);
         }
+        let kind = match &mut message {
+            ControlMessage::Advertise(advertise) => {
+                advertise.ttl_s = self.ttl_s;
+                LeaseKind::Advertise
+            }
+            ControlMessage::Request(request) => {
+                request.ttl_s = self.ttl_s;
+                LeaseKind::Request
+            }
+            ControlMessage::Withdraw(_) => {
+                return Err(FlowError::Invalid {
+                    field: "op",
+                    reason: "is no lease",
+                });
+            }
+        };
+        let common = message.common_mut();
+        common.reply_to = Some(self.reply_to.clone());
+        let key = LeaseKey {
+            kind,
+            topic: common.topic.clone(),
+        };
         if self.records.len() >= MAX_LEASES && !self.records.contains_key(&key) {
             return Err(FlowError::TooManyLeases(MAX_LEASES));
         }
-        let terms = Arc::new(Terms {
-            ttl_s: Some(self.ttl.as_secs()),
-            ..terms
-        });
+        let asked = Arc::new(message);
         let id = self.new_id(&key);
         let state = State::Asking { attempts: 0, next: now };
         let generation = self.counter;
@@ -135,7 +151,7 @@ impl LeaseBook {
             Some(mut record) if !matches!(record.state, State::Leaving { .. }) => {
                 self.by_id.remove(&record.id);
                 record.holders += 1;
-                record.terms = terms;
+                record.asked = asked;
                 record.id = id;
                 record.state = state;
                 record.waiting.push(waiting);
@@ -148,7 +164,7 @@ impl LeaseBook {
                 Record {
                     generation,
                     holders: 1,
-                    terms,
+                    asked,
                     agreed: None,
                     id,
                     state,
@@ -245,8 +261,8 @@ impl LeaseBook {
             return;
         }
         if answer.ok {
-            record.agreed = Some(Arc::clone(&record.terms));
-            let lease = answer.lease_s.map_or(self.ttl, Duration::from_secs);
+            record.agreed = Some(Arc::clone(&record.asked));
+            let lease = Duration::from_secs(answer.lease_s.unwrap_or(self.ttl_s).into());
             if matches!(record.state, State::Asking { .. }) {
                 record.state = State::Held {
                     next: (!lease.is_zero()).then(|| now + lease / 3),
@@ -259,7 +275,7 @@ impl LeaseBook {
             let superseded = matches!(
                 &refusal,
                 FlowError::Refused {
-                    code: RefusalCode::StaleEpoch,
+                    code: ErrorCode::StaleEpoch,
                     ..
                 }
             );
@@ -270,18 +286,18 @@ impl LeaseBook {
             };
             // The terms that the flow agreed to before still stand.
             settle(&mut record, &Err(refusal));
-            record.terms = agreed;
+            record.asked = agreed;
             if matches!(record.state, State::Asking { .. }) {
                 record.state = State::Held {
-                    next: Some(now + self.ttl / 3),
+                    next: Some(now + self.renewal_pause()),
                 };
             }
         }
         self.records.insert(key, record);
     }
 
-    /// The control messages that are due now, as JSON objects.
-    pub(super) fn poll(&mut self, now: Instant) -> Vec<String> {
+    /// The control messages that are due now.
+    pub(super) fn poll(&mut self, now: Instant) -> Vec<ControlMessage> {
         let due: Vec<LeaseKey> = self
             .records
             .iter()
@@ -304,18 +320,23 @@ impl LeaseBook {
         self.records.values().filter_map(Record::next).min()
     }
 
-    fn send(&mut self, key: &LeaseKey, now: Instant) -> Option<String> {
+    fn renewal_pause(&self) -> Duration {
+        Duration::from_secs(self.ttl_s.into()) / 3
+    }
+
+    fn send(&mut self, key: &LeaseKey, now: Instant) -> Option<ControlMessage> {
+        let renewal_pause = self.renewal_pause();
         let jitter = 0.75 + 0.5 * (self.random)().clamp(0.0, 1.0);
         let record = self.records.get_mut(key)?;
-        let op = match &mut record.state {
+        let is_withdraw = match &mut record.state {
             State::Asking { attempts, next } => {
                 *next = now + pause_after(*attempts).mul_f64(jitter);
                 *attempts = attempts.saturating_add(1);
-                op_of(key.kind)
+                false
             }
             State::Held { next } => {
-                *next = Some(now + self.ttl / 3);
-                op_of(key.kind)
+                *next = Some(now + renewal_pause);
+                false
             }
             State::Leaving { attempts, .. } if *attempts >= WITHDRAW_ATTEMPTS => {
                 let attempts = *attempts;
@@ -326,26 +347,19 @@ impl LeaseBook {
             State::Leaving { attempts, next } => {
                 *next = now + pause_after(*attempts).mul_f64(jitter);
                 *attempts += 1;
-                Op::Withdraw
+                true
             }
         };
-        let is_withdraw = op == Op::Withdraw;
-        let object = ControlObject {
-            op,
-            kind: is_withdraw.then_some(key.kind),
-            topic: &key.topic,
-            service: self.identity.service.as_str(),
-            instance: self.identity.instance.as_str(),
-            layer: self.identity.layer.as_str(),
-            node: self.identity.node.as_ref().map(blaze_domain::NodeName::as_str),
-            epoch: self.identity.epoch,
-            id: &record.id,
-            reply_to: &self.reply_to,
-            terms: (!is_withdraw).then_some(&*record.terms),
+        let mut message = if is_withdraw {
+            ControlMessage::Withdraw(WithdrawMessage {
+                common: record.asked.common().clone(),
+                kind: Some(key.kind),
+            })
+        } else {
+            ControlMessage::clone(&record.asked)
         };
-        serde_json::to_string(&object)
-            .inspect_err(|error| tracing::error!(%error, "a control message could not be encoded"))
-            .ok()
+        message.common_mut().id = Some(record.id.clone());
+        Some(message)
     }
 
     pub(super) fn state(&self, claim: &Claim) -> LeaseState {
@@ -408,13 +422,6 @@ fn settle(record: &mut Record, result: &AskResult) {
     }
 }
 
-fn op_of(kind: LeaseKind) -> Op {
-    match kind {
-        LeaseKind::Advertise => Op::Advertise,
-        LeaseKind::Request => Op::Request,
-    }
-}
-
 fn pause_after(attempts: u32) -> Duration {
     FIRST_RETRY
         .saturating_mul(2_u32.saturating_pow(attempts.min(10)))
@@ -422,10 +429,11 @@ fn pause_after(attempts: u32) -> Duration {
 }
 
 fn refusal(answer: &Answer) -> FlowError {
-    let error = answer.error.clone().unwrap_or_default();
+    let unknown = || ControlError::new(ErrorCode::InvalidValue, "", "the flow gave no reason");
+    let error = answer.error.clone().unwrap_or_else(unknown);
     FlowError::Refused {
-        code: RefusalCode::from(error.code.as_str()),
-        pointer: pointer_in_object(&error.pointer).to_owned(),
+        code: error.code,
+        pointer: error.pointer_in_object().to_owned(),
         detail: error.detail,
         flow: answer.flow.clone(),
     }

@@ -1,4 +1,5 @@
 use super::*;
+use blaze_domain::control::{AdvertiseMessage, RequestMessage};
 use serde_json::Value;
 
 struct Bench {
@@ -8,15 +9,8 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let identity = Identity {
-            layer: "edge".parse().unwrap(),
-            node: Some("robot-1".parse().unwrap()),
-            service: "driver".parse().unwrap(),
-            instance: "0".parse().unwrap(),
-            epoch: 7,
-        };
-        let ttl = Duration::from_secs(15);
-        let book = LeaseBook::new(identity, "blaze/reply/d".into(), "p".into(), ttl, Box::new(|| 0.5));
+        let reply_to = "blaze/reply/d".parse().unwrap();
+        let book = LeaseBook::new(reply_to, "p".into(), 15, Box::new(|| 0.5));
         Self {
             book,
             now: Instant::now(),
@@ -25,24 +19,15 @@ impl Bench {
 
     fn ask(&mut self, topic: &str, rate_hz: f64) -> (Claim, oneshot::Receiver<AskResult>) {
         let (answer, answered) = oneshot::channel();
-        let key = LeaseKey {
-            kind: LeaseKind::Advertise,
-            topic: topic.parse().unwrap(),
-        };
-        let terms = Terms {
-            rate_hz: Some(rate_hz),
-            ..Terms::default()
-        };
-        (self.book.ask(key, terms, answer, self.now).unwrap(), answered)
+        let mut message = AdvertiseMessage::new(topic.parse().unwrap(), "driver".parse().unwrap());
+        (message.common.epoch, message.rate_hz) = (7, Some(rate_hz));
+        let message = ControlMessage::Advertise(message);
+        (self.book.ask(message, answer, self.now).unwrap(), answered)
     }
 
     fn after(&mut self, ms: u64) -> Vec<Value> {
         self.now += Duration::from_millis(ms);
-        let objects = self.book.poll(self.now);
-        objects
-            .iter()
-            .map(|object| serde_json::from_str(object).unwrap())
-            .collect()
+        self.book.poll(self.now).iter().map(ControlMessage::to_json).collect()
     }
 
     fn answer(&mut self, sent: &Value, json: &str) {
@@ -62,6 +47,10 @@ impl Bench {
         assert_eq!(answered.try_recv().unwrap(), Ok(()));
         (claim, sent)
     }
+}
+
+fn request(topic: &str) -> ControlMessage {
+    ControlMessage::Request(RequestMessage::new(topic.parse().unwrap(), "driver".parse().unwrap()))
 }
 
 const REFUSED: &str = r#"{"ok":false,"error":{"code":"invalid_value","pointer":"/2/rate_hz","detail":"no"}}"#;
@@ -144,7 +133,7 @@ fn a_refusal_tells_code_and_pointer_and_leaves_nothing() {
     };
     assert_eq!(
         (code, pointer.as_str(), detail.as_str()),
-        (RefusalCode::InvalidValue, "/rate_hz", "no")
+        (ErrorCode::InvalidValue, "/rate_hz", "no")
     );
     assert_eq!(bench.book.state(&claim), LeaseState::Ended);
     assert!(bench.book.is_empty() && bench.book.by_id.is_empty());
@@ -257,11 +246,7 @@ fn leaving_withdraws_all_and_takes_nothing_new() {
         bench.agree(sent);
     }
     assert!(bench.book.is_empty());
-    let key = LeaseKey {
-        kind: LeaseKind::Request,
-        topic: "a".parse().unwrap(),
-    };
-    let refused = bench.book.ask(key, Terms::default(), oneshot::channel().0, bench.now);
+    let refused = bench.book.ask(request("a"), oneshot::channel().0, bench.now);
     assert_eq!(refused.unwrap_err(), FlowError::Closed);
 }
 
@@ -272,10 +257,6 @@ fn leases_are_bounded() {
     for number in 0..MAX_LEASES {
         answers.push(bench.ask(&format!("t/{number}"), 1.0));
     }
-    let key = LeaseKey {
-        kind: LeaseKind::Request,
-        topic: "one/more".parse().unwrap(),
-    };
-    let refused = bench.book.ask(key, Terms::default(), oneshot::channel().0, bench.now);
+    let refused = bench.book.ask(request("one/more"), oneshot::channel().0, bench.now);
     assert_eq!(refused.unwrap_err(), FlowError::TooManyLeases(MAX_LEASES));
 }

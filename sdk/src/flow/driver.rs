@@ -4,12 +4,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{Broker, BrokerError, BrokerKind, Content, Health, PublisherOptions, Received, SubscribeOptions};
+use blaze_domain::control::{Answer, ControlMessage, Event, EventKind};
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 use tokio::time::sleep_until;
 
 use super::Shared;
-use super::protocol::{self, Answer, FlowEventKind, each};
 
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
@@ -21,24 +21,24 @@ pub(super) fn now() -> Instant {
 }
 
 /// Where a service gets its answers. On Kafka and DDS all share one topic.
-pub(super) fn reply_channel(kind: BrokerKind, own: &ChannelName) -> Option<ChannelName> {
+fn reply_channel(kind: BrokerKind, own: ChannelName) -> ChannelName {
     match kind {
-        BrokerKind::Memory | BrokerKind::Redis => Some(own.clone()),
-        BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => "blaze/reply".parse().ok(),
+        BrokerKind::Memory | BrokerKind::Redis => own,
+        BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => ChannelName::shared_reply(),
     }
 }
 
 /// Runs until the broker is closed.
 pub(super) async fn run(shared: Arc<Shared>, broker: Arc<dyn Broker>, own_reply: ChannelName) {
-    if let Err(error) = drive(&shared, broker.as_ref(), &own_reply).await {
+    if let Err(error) = drive(&shared, broker.as_ref(), own_reply).await {
         tracing::warn!(%error, "the service cannot reach flows any more");
     }
     shared.book.lock().close();
     shared.changed.notify_waiters();
 }
 
-async fn drive(shared: &Shared, broker: &dyn Broker, own_reply: &ChannelName) -> Result<(), BrokerError> {
-    let reply = reply_channel(broker.kind(), own_reply).unwrap_or_else(|| own_reply.clone());
+async fn drive(shared: &Shared, broker: &dyn Broker, own_reply: ChannelName) -> Result<(), BrokerError> {
+    let reply = reply_channel(broker.kind(), own_reply);
     let mut replies = subscribe(broker, &reply).await?;
     let mut events = subscribe(broker, &ChannelName::events()).await?;
     let control = broker.publisher(&ChannelName::control(), PublisherOptions::default())?;
@@ -46,11 +46,11 @@ async fn drive(shared: &Shared, broker: &dyn Broker, own_reply: &ChannelName) ->
     let mut was_up = status.borrow_and_update().health == Health::Up;
     let (mut answers, mut told) = (Vec::new(), Vec::new());
     loop {
-        let (objects, next) = {
+        let (messages, next) = {
             let mut book = shared.book.lock();
             (book.poll(now()), book.next_due())
         };
-        for payload in protocol::payloads(&objects) {
+        for payload in ControlMessage::to_payloads(&messages) {
             // Refused while the broker is away: the book sends again until there is an answer.
             control.publish_bare(&Bytes::from(payload));
         }
@@ -87,17 +87,17 @@ async fn drive(shared: &Shared, broker: &dyn Broker, own_reply: &ChannelName) ->
 
 fn on_answers(shared: &Shared, answers: impl Iterator<Item = Received>) {
     for payload in answers.filter_map(bare) {
-        let parsed: Vec<Answer> = each(&payload);
+        let answers = Answer::read_all(&payload);
         let mut book = shared.book.lock();
-        for answer in &parsed {
+        for answer in &answers {
             book.on_answer(answer, now());
         }
     }
 }
 
 fn on_events(shared: &Shared, events: impl Iterator<Item = Received>) {
-    for event in events.filter_map(bare).flat_map(|payload| protocol::events(&payload)) {
-        if event.kind == FlowEventKind::FlowStarted {
+    for event in events.filter_map(bare).flat_map(|payload| Event::read_all(&payload)) {
+        if event.kind == EventKind::FlowStarted {
             shared.book.lock().send_all_again(now());
         }
         // Without a listener there is nobody to tell.

@@ -7,7 +7,6 @@
 
 mod book;
 mod driver;
-mod protocol;
 mod terms;
 
 use std::fmt;
@@ -16,17 +15,19 @@ use std::time::Duration;
 
 use blaze_brokers::Broker;
 use blaze_domain::TopicName;
+use blaze_domain::control::ControlMessage;
+pub use blaze_domain::control::{
+    ErrorCode as RefusalCode, Event as FlowEvent, EventKind as FlowEventKind, OriginSelector as OriginFilter,
+};
 use blaze_domain::names::ChannelName;
+use blaze_runtime::{Supervisor, TaskPolicy};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, broadcast, oneshot};
 
-use book::{AskResult, Claim, LeaseBook, LeaseKey};
-pub use protocol::{FlowEvent, FlowEventKind, OriginFilter, RefusalCode};
-use protocol::{LeaseKind, Terms};
+use book::{AskResult, Claim, LeaseBook};
 pub use terms::{Advertise, Request};
 
 use crate::service::Identity;
-use crate::tasks::Tasks;
 
 /// Events that wait for a listener at most; the oldest give way.
 const EVENT_QUEUE: usize = 256;
@@ -93,6 +94,7 @@ pub enum LeaseState {
 }
 
 struct Shared {
+    identity: Identity,
     book: Mutex<LeaseBook>,
     /// The book has something to send.
     wake: Notify,
@@ -112,22 +114,18 @@ impl FlowManager {
     pub(crate) fn start(
         identity: Identity,
         broker: Arc<dyn Broker>,
-        tasks: &Tasks,
-        ttl: Duration,
+        supervisor: &Supervisor,
+        ttl_s: u32,
         control_timeout: Duration,
     ) -> Self {
-        let id_prefix = format!("{:016x}", rand::random::<u64>());
-        let reply_text = format!("blaze/reply/{}-{}-{id_prefix}", identity.service, identity.instance);
-        // Names of services and instances and hexadecimal digits are letters of channels too.
-        let reply = reply_text
-            .parse::<ChannelName>()
-            .unwrap_or_else(|_| ChannelName::control());
+        let life = rand::random::<u64>();
+        let reply = ChannelName::reply(&identity.service, &identity.instance, life);
         let shared = Arc::new(Shared {
+            identity,
             book: Mutex::new(LeaseBook::new(
-                identity,
-                reply_text,
-                id_prefix,
-                ttl,
+                reply.clone(),
+                format!("{life:016x}"),
+                ttl_s,
                 Box::new(rand::random::<f64>),
             )),
             wake: Notify::new(),
@@ -135,10 +133,10 @@ impl FlowManager {
             events: broadcast::Sender::new(EVENT_QUEUE),
             control_timeout,
         });
-        let (running, stop) = (Arc::clone(&shared), tasks.clone());
-        tasks.spawn("leases", async move {
+        let (running, stop) = (Arc::clone(&shared), supervisor.shutdown_token());
+        supervisor.spawn("leases", TaskPolicy::MayEnd, async move {
             tokio::select! {
-                () = stop.stopping() => running.book.lock().close(),
+                () = stop.cancelled() => running.book.lock().close(),
                 () = driver::run(Arc::clone(&running), broker, reply) => {}
             }
             running.changed.notify_waiters();
@@ -152,8 +150,8 @@ impl FlowManager {
     /// # Errors
     /// [`FlowError`]: refused, no answer within `control_timeout`, or a value that cannot be.
     pub async fn advertise(&self, advertise: Advertise) -> Result<Lease, FlowError> {
-        let terms = advertise.terms()?;
-        self.ask(LeaseKind::Advertise, advertise.topic, terms).await
+        let message = advertise.message(&self.shared.identity)?;
+        self.ask(ControlMessage::Advertise(message)).await
     }
 
     /// Tells that the service wants to receive a topic; as [`FlowManager::advertise`] otherwise.
@@ -161,8 +159,8 @@ impl FlowManager {
     /// # Errors
     /// As [`FlowManager::advertise`].
     pub async fn request(&self, request: Request) -> Result<Lease, FlowError> {
-        let terms = request.terms()?;
-        self.ask(LeaseKind::Request, request.topic, terms).await
+        let message = request.message(&self.shared.identity)?;
+        self.ask(ControlMessage::Request(message)).await
     }
 
     /// What flows tell to all from now on.
@@ -174,10 +172,9 @@ impl FlowManager {
         }
     }
 
-    async fn ask(&self, kind: LeaseKind, topic: TopicName, terms: Terms) -> Result<Lease, FlowError> {
+    async fn ask(&self, message: ControlMessage) -> Result<Lease, FlowError> {
         let (answer, answered) = oneshot::channel();
-        let key = LeaseKey { kind, topic };
-        let claim = self.shared.book.lock().ask(key, terms, answer, driver::now())?;
+        let claim = self.shared.book.lock().ask(message, answer, driver::now())?;
         self.shared.wake.notify_one();
         // From here on dropping it withdraws, also when the caller stops waiting.
         let lease = Lease {

@@ -2,11 +2,15 @@
 
 use std::time::Duration;
 
+use blaze_domain::control::{
+    AdvertiseMessage, DEFAULT_ENCODING, MAX_DEPTH, MAX_ENCODING_BYTES, MAX_TYPE_BYTES, OriginSelector, Quality,
+    RequestMessage,
+};
 use blaze_domain::{Durability, MAX_PAYLOAD_BYTES, Priority, Reliability, TopicName};
 
 use super::FlowError;
-use super::protocol::{OriginFilter, Terms};
-use crate::publisher::{MAX_WORD_BYTES, lifespan_ms};
+use crate::publisher::lifespan_ms;
+use crate::service::Identity;
 
 /// What a service publishes.
 #[derive(Debug, Clone, PartialEq)]
@@ -27,7 +31,7 @@ pub struct Advertise {
     pub reliability: Reliability,
     /// Whether late joiners get what was published before.
     pub durability: Durability,
-    /// Messages kept per writer for late joiners, 1 or more.
+    /// Messages kept per writer for late joiners, 1 to 65,535.
     pub depth: u32,
     /// Class on the inter scope; absent = by size.
     pub priority: Option<Priority>,
@@ -43,7 +47,7 @@ impl Advertise {
             topic,
             rate_hz: None,
             max_bytes: None,
-            encoding: "application/octet-stream".to_owned(),
+            encoding: DEFAULT_ENCODING.to_owned(),
             type_name: String::new(),
             type_hash: String::new(),
             reliability: Reliability::BestEffort,
@@ -54,22 +58,30 @@ impl Advertise {
         }
     }
 
-    pub(super) fn terms(&self) -> Result<Terms, FlowError> {
+    /// The message of a service that says so.
+    pub(super) fn message(self, identity: &Identity) -> Result<AdvertiseMessage, FlowError> {
         if self.max_bytes.is_some_and(|bytes| bytes > MAX_PAYLOAD_BYTES as u64) {
             return Err(invalid("max_bytes", "is above 16 MiB"));
         }
-        Ok(Terms {
-            rate_hz: rate("rate_hz", self.rate_hz)?,
-            max_bytes: self.max_bytes,
-            encoding: word("encoding", &self.encoding)?,
-            type_name: word("type", &self.type_name)?,
-            type_hash: word("type_hash", &self.type_hash)?,
-            reliability: Some(self.reliability),
-            durability: Some(self.durability),
-            depth: depth(self.depth)?,
+        check_rate("rate_hz", self.rate_hz)?;
+        let quality = Quality {
+            encoding: Some(self.encoding).filter(|text| !text.is_empty()),
+            type_name: self.type_name,
+            type_hash: self.type_hash,
+            reliability: self.reliability,
+            durability: self.durability,
+            depth: self.depth,
             priority: self.priority,
-            lifespan_ms: Some(lifespan_ms(self.lifespan)),
-            ..Terms::default()
+            lifespan_ms: lifespan_ms(self.lifespan),
+        };
+        check_quality(&quality)?;
+        let message = AdvertiseMessage::new(self.topic, identity.service.clone());
+        Ok(AdvertiseMessage {
+            common: identity.sign(message.common),
+            rate_hz: self.rate_hz,
+            max_bytes: self.max_bytes,
+            quality,
+            ..message
         })
     }
 }
@@ -93,12 +105,12 @@ pub struct Request {
     pub reliability: Reliability,
     /// Whether to begin with what was published before.
     pub durability: Durability,
-    /// Messages per writer to begin with, 1 or more.
+    /// Messages per writer to begin with, 1 to 65,535.
     pub depth: u32,
     /// May lower the publisher's class on the inter scope, never raise it.
     pub priority: Option<Priority>,
     /// Only messages of this origin.
-    pub from: OriginFilter,
+    pub from: OriginSelector,
     /// Serve payloads without a header on `blaze/bare/<topic>`, for clients that do not use an SDK.
     pub bare: bool,
 }
@@ -118,25 +130,33 @@ impl Request {
             durability: Durability::Volatile,
             depth: 1,
             priority: None,
-            from: OriginFilter::default(),
+            from: OriginSelector::default(),
             bare: false,
         }
     }
 
-    pub(super) fn terms(&self) -> Result<Terms, FlowError> {
-        Ok(Terms {
-            max_rate_hz: rate("max_rate_hz", self.max_rate_hz)?,
-            encoding: word("encoding", &self.encoding)?,
-            type_name: word("type", &self.type_name)?,
-            type_hash: word("type_hash", &self.type_hash)?,
-            reliability: Some(self.reliability),
-            durability: Some(self.durability),
-            depth: depth(self.depth)?,
+    /// The message of a service that says so.
+    pub(super) fn message(self, identity: &Identity) -> Result<RequestMessage, FlowError> {
+        check_rate("max_rate_hz", self.max_rate_hz)?;
+        let quality = Quality {
+            encoding: Some(self.encoding).filter(|text| !text.is_empty()),
+            type_name: self.type_name,
+            type_hash: self.type_hash,
+            reliability: self.reliability,
+            durability: self.durability,
+            depth: self.depth,
             priority: self.priority,
-            lifespan_ms: Some(lifespan_ms(self.lifespan)),
-            from: (self.from != OriginFilter::default()).then(|| self.from.clone()),
-            bare: self.bare.then_some(true),
-            ..Terms::default()
+            lifespan_ms: lifespan_ms(self.lifespan),
+        };
+        check_quality(&quality)?;
+        let message = RequestMessage::new(self.topic, identity.service.clone());
+        Ok(RequestMessage {
+            common: identity.sign(message.common),
+            max_rate_hz: self.max_rate_hz,
+            bare: self.bare,
+            from: self.from,
+            quality,
+            ..message
         })
     }
 }
@@ -145,24 +165,29 @@ fn invalid(field: &'static str, reason: &'static str) -> FlowError {
     FlowError::Invalid { field, reason }
 }
 
-fn rate(field: &'static str, rate: Option<f64>) -> Result<Option<f64>, FlowError> {
+fn check_rate(field: &'static str, rate: Option<f64>) -> Result<(), FlowError> {
     match rate {
         Some(rate) if !rate.is_finite() || rate <= 0.0 => Err(invalid(field, "must be above 0")),
-        rate => Ok(rate),
+        _ => Ok(()),
     }
 }
 
-fn depth(depth: u32) -> Result<Option<u32>, FlowError> {
-    match depth {
-        0 => Err(invalid("depth", "must be 1 or more")),
-        depth => Ok(Some(depth)),
+fn check_quality(quality: &Quality) -> Result<(), FlowError> {
+    if !(1..=MAX_DEPTH).contains(&quality.depth) {
+        return Err(invalid("depth", "must be 1 to 65,535"));
     }
-}
-
-/// Absent when empty.
-fn word(field: &'static str, text: &str) -> Result<Option<String>, FlowError> {
-    if text.len() > MAX_WORD_BYTES {
-        return Err(invalid(field, "is longer than 200 bytes"));
+    let encoding = quality.encoding.as_deref().unwrap_or_default();
+    for (field, text, most) in [
+        ("encoding", encoding, MAX_ENCODING_BYTES),
+        ("type", &quality.type_name, MAX_TYPE_BYTES),
+        ("type_hash", &quality.type_hash, MAX_TYPE_BYTES),
+    ] {
+        if text.len() > most {
+            return Err(invalid(field, "is longer than 200 bytes"));
+        }
+        if text.chars().any(char::is_control) {
+            return Err(invalid(field, "holds a control character"));
+        }
     }
-    Ok((!text.is_empty()).then(|| text.to_owned()))
+    Ok(())
 }

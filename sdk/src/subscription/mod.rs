@@ -11,6 +11,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use blaze_brokers::Received;
 use blaze_domain::{Scope, TopicName};
+use blaze_runtime::TaskPolicy;
 use tokio_util::sync::CancellationToken;
 
 pub(crate) use dispatch::Callback;
@@ -165,10 +166,11 @@ pub(crate) fn start(
         counters: Arc::clone(&counters),
         pool: service.pool.handle(),
     };
-    let (tasks, end) = (service.tasks.clone(), ended.clone());
-    service.tasks.spawn("subscription", async move {
+    let (stop, end) = (service.supervisor.shutdown_token(), ended.clone());
+    let name = format!("subscription {topic}");
+    service.supervisor.spawn(name, TaskPolicy::MayEnd, async move {
         tokio::select! {
-            () = tasks.stopping() => {}
+            () = stop.cancelled() => {}
             () = end.cancelled() => {}
             () = reading.run(source) => {}
         }
