@@ -122,6 +122,11 @@ impl FromStr for Setting {
                 "{key:?} is no key: words joined by dots, for example flow.bandwidth.limit_mbps"
             ));
         }
+        if matches!(key.split('.').next(), Some("layer" | "node")) {
+            return Err(format!(
+                "{key}: the demo gives its nodes their names; choose some of them with --only"
+            ));
+        }
         yaml_serde::from_str::<serde_json::Value>(value).map_err(|error| format!("the value is no YAML: {error}"))?;
         Ok(Self {
             key: key.to_owned(),
@@ -247,6 +252,7 @@ mod tests {
             (&["--duration", "1e9"], "not one of"),
             (&["--only", "robot-9"], "robot-1"),
             (&["--set", "flow"], "KEY=VALUE"),
+            (&["--set", "node.name=x"], "--only"),
             (&["--set", "flow..x=1"], "is no key"),
             (&["--set", "a.b=[1"], "no YAML"),
             (&["--listen", "here"], "invalid IP"),

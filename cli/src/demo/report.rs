@@ -271,6 +271,9 @@ fn summary_text(summary: &Summary, width: Option<u16>) -> String {
 }
 
 fn verdict_text(summary: &Summary) -> String {
+    if summary.ok && summary.topics.iter().all(|row| row.to.is_none()) {
+        return "OK: everything was published; nobody listens in this process.\n".to_owned();
+    }
     if summary.ok {
         return "OK: every topic arrived at every consumer here, nothing that must arrive was lost, doubled or out of \
                 order, and what was left out has its reason above.\n"

@@ -1,6 +1,6 @@
 //! `/metrics`: the counters of the flow in Prometheus' words. Made anew for each scrape from the state under its lock.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 
 use blaze_domain::{Priority, Scope};
@@ -8,7 +8,7 @@ use prometheus::core::Collector;
 use prometheus::{CounterVec, Encoder, GaugeVec, Opts, Registry, TextEncoder};
 
 use super::{Shared, class_label};
-use crate::lane::path::{BridgeState, Phase, TopicPath};
+use crate::lane::path::{BridgeState, Phase, TopicId, TopicPath};
 use crate::registry::Terms;
 
 /// Topics that have label values of their own; the rest share one.
@@ -150,6 +150,7 @@ impl Page {
 
     fn fill_topics(&self, shared: &Shared) {
         let now = Instant::now();
+        let subscribed = shared.routes.subscribed();
         let mut histograms: BTreeMap<(String, String), Histogram> = BTreeMap::new();
         shared.plane.read(|state| {
             for (reason, count) in state.core.unattributed.iter() {
@@ -163,7 +164,8 @@ impl Page {
                 } else {
                     OTHER.to_owned()
                 };
-                self.fill_topic(now, &topic, path, &mut histograms);
+                let id = TopicId(u32::try_from(index).unwrap_or(u32::MAX));
+                self.fill_topic(now, (&topic, id), path, &subscribed, &mut histograms);
             }
         });
         let mut text = String::new();
@@ -180,8 +182,9 @@ impl Page {
     fn fill_topic(
         &self,
         now: Instant,
-        topic: &str,
+        (topic, id): (&str, TopicId),
         path: &mut TopicPath,
+        subscribed: &BTreeSet<(TopicId, Scope)>,
         histograms: &mut BTreeMap<(String, String), Histogram>,
     ) {
         for (reason, count) in path.ingress_drops.iter() {
@@ -212,6 +215,9 @@ impl Page {
                 .or_default()
                 .add(bridge);
             let state = match bridge.phase {
+                Phase::Up { .. } if bridge.from != Scope::Inter && !subscribed.contains(&(id, bridge.from)) => {
+                    "starting"
+                }
                 Phase::Up { .. } => "up",
                 Phase::Draining { .. } => "draining",
                 Phase::Ended => continue,

@@ -1,6 +1,6 @@
 //! Makes reality equal to the plan: writers of brokers, and one task for each (topic, scope) that is read.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -113,6 +113,15 @@ impl Routes {
                 .get(&(topic, scope))
                 .is_some_and(|s| s.subscribed.load(Ordering::Relaxed)),
         }
+    }
+
+    /// What is subscribed.
+    pub(super) fn subscribed(&self) -> BTreeSet<(TopicId, Scope)> {
+        let sources = self.sources.lock();
+        let there = sources
+            .iter()
+            .filter(|(_, source)| source.subscribed.load(Ordering::Relaxed));
+        there.map(|(key, _)| *key).collect()
     }
 
     /// Ends all source tasks.

@@ -10,7 +10,7 @@ use blaze_brokers::{Broker, BrokerKind, Health};
 use blaze_domain::control::LeaseKind;
 use blaze_domain::{Scope, TopicName, WhyCode};
 use blaze_proto::link::link_control::RouteState;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::Shared;
 use super::admin::{answer, query_text, refusal};
@@ -25,27 +25,26 @@ use crate::why::{
 const MAX_HINTS: usize = 16;
 
 pub(super) async fn why(State(shared): State<Arc<Shared>>, query: Query<BTreeMap<String, String>>) -> Response {
-    let Some(topic) = query_text(&query, "topic") else {
+    let Some(text) = query_text(&query, "topic").filter(|text| !text.is_empty()) else {
         return refusal(
             StatusCode::BAD_REQUEST,
             "invalid_request",
             "the parameter topic is missing: /v1/why?topic=imu/data",
         );
     };
-    let topic: TopicName = match topic.parse() {
+    let asked_to = query_text(&query, "to");
+    let topic: TopicName = match text.parse() {
         Ok(topic) => topic,
         Err(error) => {
-            return refusal(StatusCode::BAD_REQUEST, "invalid_topic", &format!("topic {error}"));
+            let remedy = format!("No topic has such a name: it {error}.");
+            return nothing_such(&shared, &text, asked_to.as_deref(), WhyCode::NoAdvertise, &remedy);
         }
     };
-    let to: Option<WhyTarget> = match query_text(&query, "to").map(|text| text.parse()).transpose() {
+    let to: Option<WhyTarget> = match asked_to.as_deref().map(str::parse).transpose() {
         Ok(to) => to,
         Err(error) => {
-            return refusal(
-                StatusCode::BAD_REQUEST,
-                "invalid_request",
-                &format!("to is layer[/node[/service]]: {error}"),
-            );
+            let remedy = format!("Nobody has such a name: to is layer[/node[/service]], and a part of it {error}.");
+            return nothing_such(&shared, &text, asked_to.as_deref(), WhyCode::NoRequest, &remedy);
         }
     };
     let bridges = bridge_facts(&shared, &topic);
@@ -64,6 +63,14 @@ pub(super) async fn why(State(shared): State<Arc<Shared>>, query: Query<BTreeMap
     });
     drop(control);
     answer(&shared, serde_json::to_value(verdict).unwrap_or(Value::Null)).into_response()
+}
+
+/// The verdict for names that nothing can have.
+fn nothing_such(shared: &Shared, topic: &str, to: Option<&str>, code: WhyCode, remedy: &str) -> Response {
+    let verdict = json!({
+        "topic": topic, "to": to, "verdict": "not_flowing", "code": code, "remedy": remedy, "steps": [],
+    });
+    answer(shared, verdict).into_response()
 }
 
 fn bridge_facts(shared: &Shared, topic: &TopicName) -> Vec<BridgeFacts> {

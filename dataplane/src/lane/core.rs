@@ -13,19 +13,18 @@ use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Content, PublishOutcome, Publisher, Received};
-use blaze_domain::{DropReason, FlowId, Origin, Priority, Scope, TopicName, WriterId};
+use blaze_brokers::{Content, Publisher, Received};
+use blaze_domain::{DropReason, FlowId, Origin, Scope, TopicName, WriterId};
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
 use lru::LruCache;
 
-use super::measure::{RateMeter, micros};
+use super::measure::micros;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
-use super::stats::{BridgeStats, Drops};
+use super::stats::Drops;
 use super::window::DuplicateWindow;
-use crate::limit::bucket::TokenBucket;
-use crate::link::{Engine, LaneId, StreamKey, Submit};
-use crate::plan::{Bridge, Target, TopicPlan};
+use crate::link::{Engine, LaneId, Submit};
+use crate::plan::{Target, TopicPlan};
 
 /// Writers whose duplicate window a flow keeps; the least recently used go first.
 pub const MAX_WRITERS: usize = 65_536;
@@ -86,12 +85,12 @@ pub struct DataCore {
 }
 
 /// Where a message stands when it reaches the bridges.
-struct Admitted {
-    frame: Frame,
-    born_here: bool,
-    age_us: u64,
+pub(super) struct Admitted {
+    pub(super) frame: Frame,
+    pub(super) born_here: bool,
+    pub(super) age_us: u64,
     /// Since it came to this flow.
-    here_us: u64,
+    pub(super) here_us: u64,
 }
 
 impl DataCore {
@@ -379,24 +378,29 @@ impl DataCore {
         if frame.topic() != self.path(topic).name.as_str() {
             return Err(DropReason::DecodeError);
         }
-        if !self.is_new(topic, &frame) {
-            // What a flow has written carries hops; a publisher that repeats itself does not.
-            return Err(if frame.hops() > 0 {
-                DropReason::Echo
-            } else {
-                DropReason::Duplicate
-            });
+        let born_here = frame.hops() == 0;
+        if from == Scope::Node && !born_here {
+            // Only this flow writes to its node scope, and what it writes carries hops.
+            return Err(DropReason::Echo);
         }
         let me = &self.config.me;
         let own_layer = frame.origin_layer() == me.layer.as_str();
         let own_node = frame.origin_node() == me.node.as_str();
-        let born_here = frame.hops() == 0;
         let foreign = match from {
-            Scope::Node => born_here && !(own_layer && own_node),
-            _ => born_here && !own_layer,
+            Scope::Node => !(own_layer && own_node),
+            Scope::Layer | Scope::Inter => born_here && !own_layer,
         };
+        // Before the window takes the number: a foreign message must not silence the writer whose name it bears.
         if foreign {
             return Err(DropReason::ForeignOrigin);
+        }
+        if !self.is_new(topic, &frame) {
+            // What a flow has written carries hops; a publisher that repeats itself does not.
+            return Err(if born_here {
+                DropReason::Duplicate
+            } else {
+                DropReason::Echo
+            });
         }
         let mut age_us = frame.age_us().saturating_add(waited_us);
         if from == Scope::Node && !bare {
@@ -480,128 +484,6 @@ impl DataCore {
         for bridge in path.bridges.iter_mut().filter(|bridge| bridge.from == from) {
             if matches!(bridge.phase, Phase::Up { .. }) && bridge.wants(message) {
                 bridge.pass(now, topic, message, large, link);
-            }
-        }
-    }
-}
-
-impl BridgeState {
-    fn new(now: Instant, planned: &Bridge, sink: Sink) -> Self {
-        Self {
-            from: planned.from,
-            target: planned.to.clone(),
-            lane: planned.lane.clone(),
-            phase: Phase::Up { since: now },
-            bucket: planned.lane.max_rate_hz.map(|rate| TokenBucket::new(rate, now)),
-            sink,
-            stats: BridgeStats::default(),
-            out_rate: RateMeter::new(now),
-        }
-    }
-
-    fn renew(
-        &mut self,
-        now: Instant,
-        planned: &Bridge,
-        publisher: &mut impl FnMut(&Target) -> Option<Arc<dyn Publisher>>,
-    ) {
-        if !matches!(self.phase, Phase::Up { .. }) {
-            self.phase = Phase::Up { since: now };
-        }
-        if let Sink::Publish { publisher: current, .. } = &mut self.sink
-            && let Some(publisher) = publisher(&planned.to)
-        {
-            *current = publisher;
-        }
-        match (planned.lane.max_rate_hz, &mut self.bucket) {
-            (Some(rate), Some(bucket)) => bucket.set_rate(rate, now),
-            (Some(rate), bucket) => *bucket = Some(TokenBucket::new(rate, now)),
-            (None, bucket) => *bucket = None,
-        }
-        self.lane = planned.lane.clone();
-    }
-
-    /// Whether the message is meant for this bridge at all; what is not is not counted as taken.
-    fn wants(&self, message: &Admitted) -> bool {
-        let frame = &message.frame;
-        // What a flow wrote stays in the layer: only what was born here leaves for another one.
-        if matches!(self.target, Target::Inter { .. }) && !message.born_here {
-            return false;
-        }
-        if self.from == Scope::Node && !message.born_here {
-            return false;
-        }
-        self.lane
-            .carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
-    }
-
-    fn pass(&mut self, now: Instant, topic: TopicId, message: &Admitted, large: bool, link: &mut dyn LaneLink) {
-        let frame = &message.frame;
-        let bytes = frame.payload().len() as u64;
-        self.stats.taken.add(bytes);
-        let lifespan_ms = match (frame.lifespan_ms(), self.lane.lifespan_ms) {
-            (0, other) | (other, 0) => other,
-            (one, other) => one.min(other),
-        };
-        if lifespan_ms > 0 && message.age_us > u64::from(lifespan_ms) * 1000 {
-            self.stats.dropped.add(DropReason::Lifespan, 1);
-            return;
-        }
-        if self.bucket.as_mut().is_some_and(|bucket| !bucket.admit(now)) {
-            self.stats.dropped.add(DropReason::MaxRate, 1);
-            return;
-        }
-        match &mut self.sink {
-            Sink::Publish { publisher, bare } => {
-                let outcome = if *bare {
-                    publisher.publish_bare(frame.payload())
-                } else {
-                    publisher.publish(&frame.clone().with_hops_and_age(frame.hops() + 1, message.age_us))
-                };
-                match outcome {
-                    PublishOutcome::Taken => {
-                        self.stats.out.add(bytes);
-                        self.stats.latency.record(message.here_us);
-                        self.out_rate.add(now, bytes);
-                    }
-                    PublishOutcome::Dropped => self.stats.dropped.add(DropReason::BrokerError, 1),
-                    PublishOutcome::TooLarge => self.stats.dropped.add(DropReason::TooLarge, 1),
-                }
-            }
-            Sink::Lane { lane, class } => {
-                let wanted = if large {
-                    Priority::Bulk
-                } else {
-                    self.lane.priority.unwrap_or(Priority::State)
-                };
-                // A small message of the new class must not overtake a large one of the old.
-                if wanted != *class && link.queued(*lane) == 0 {
-                    *class = wanted;
-                }
-                let Target::Inter { receiver, .. } = &self.target else {
-                    return;
-                };
-                let submit = Submit {
-                    to: receiver,
-                    class: *class,
-                    lane: *lane,
-                    stream: StreamKey {
-                        topic: topic.0,
-                        writer: frame.writer(),
-                    },
-                    frame: frame.clone().with_hops_and_age(frame.hops(), message.age_us),
-                    arrived: now,
-                    reliable: self.lane.reliable,
-                    lifespan: (lifespan_ms > 0).then(|| Duration::from_millis(lifespan_ms.into())),
-                    keep_newest: if *class == Priority::Bulk && !self.lane.reliable {
-                        self.lane.depth.max(1) as usize
-                    } else {
-                        0
-                    },
-                };
-                if let Err(reason) = link.submit(now, submit) {
-                    self.stats.dropped.add(reason, 1);
-                }
             }
         }
     }

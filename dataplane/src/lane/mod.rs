@@ -1,5 +1,6 @@
 //! The path of a message through one flow.
 
+mod bridge;
 pub mod core;
 pub mod measure;
 pub mod path;

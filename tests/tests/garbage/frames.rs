@@ -205,7 +205,6 @@ async fn headers_with_extreme_values_are_messages_or_counted() {
 
 /// Only the flow writes messages with hops on the node scope; whoever else does must find them counted.
 #[tokio::test(flavor = "multi_thread", worker_threads = 3)]
-#[ignore = "known fault: DataCore admits them, no bridge wants them, and nothing counts them"]
 async fn messages_of_strangers_with_hops_are_counted() {
     let inside = Inside::start().await;
     let traffic = Traffic::start(&inside).await;
@@ -226,7 +225,6 @@ async fn messages_of_strangers_with_hops_are_counted() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 3)]
-#[ignore = "known fault: DataCore looks at the origin only after the duplicate window has taken the number"]
 async fn a_foreign_message_cannot_silence_the_writer_whose_name_it_bears() {
     let inside = Inside::start().await;
     let traffic = Traffic::start(&inside).await;

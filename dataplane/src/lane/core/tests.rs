@@ -2,11 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use blaze_domain::LayerName;
+use blaze_brokers::PublishOutcome;
+use blaze_domain::{LayerName, Priority};
 use parking_lot::Mutex;
 use proptest::prelude::*;
 
 use super::*;
+use crate::plan::Bridge;
 
 #[derive(Default)]
 struct NotingLink {
