@@ -14,7 +14,7 @@ use blaze_runtime::admin::{CheckStatus, Readiness};
 use blaze_runtime::config::{Current, Loaded, Schema, Sources, WatchSettings, load_typed, parse_override, watch};
 use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
-use blaze_runtime::{logs, ready_line, state};
+use blaze_runtime::{logs, ready_line, say, state};
 use clap::Parser;
 
 /// A shutdown takes at most this long.
@@ -48,12 +48,12 @@ fn main() -> ExitCode {
     let loaded = match load_typed(&sources, &schema()) {
         Ok(loaded) => loaded,
         Err(faults) => {
-            faults.iter().for_each(|fault| eprintln!("{fault}"));
+            faults.iter().for_each(|fault| say(format_args!("{fault}")));
             return ExitCode::from(exit_code::CONFIGURATION);
         }
     };
     for warning in &loaded.warnings {
-        eprintln!("warning: {warning}");
+        say(format_args!("warning: {warning}"));
     }
     if arguments.check {
         return ExitCode::SUCCESS;
@@ -61,7 +61,7 @@ fn main() -> ExitCode {
     match block_on(run(sources.pinned(), loaded)) {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("blaze-flow failed: {error}");
+            say(format_args!("blaze-flow failed: {error}"));
             ExitCode::from(exit_code::FAILED)
         }
     }
@@ -88,7 +88,7 @@ async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
     let flow = match start(&supervisor, &loaded.value).await {
         Ok(started) => started,
         Err(error) => {
-            eprintln!("blaze-flow failed: {error:#}");
+            say(format_args!("blaze-flow failed: {error:#}"));
             return ExitCode::from(exit_code::FAILED);
         }
     };

@@ -17,5 +17,5 @@ pub use admin::{AdminServer, CheckStatus, Gate, Readiness};
 pub use ready::ready_line;
 pub use supervisor::{
     ShutdownPhase, ShutdownReport, ShutdownSteps, StopOnDrop, Supervisor, TaskEnd, TaskHandle, TaskInfo, TaskPolicy,
-    block_on, exit_code,
+    block_on, exit_code, say,
 };

@@ -347,13 +347,9 @@ impl Board {
         };
         let heard = consumers.iter().filter_map(|entry| {
             let publisher = publishers.get(entry.publisher)?;
-            // One that has left is measured up to its last message.
-            let until = entry
-                .stats
-                .last
-                .map(|(at, _)| at)
-                .filter(|_| !entry.active)
-                .unwrap_or(end);
+            // One that has left is measured up to its last message, and so is one to which messages still came after the end.
+            let last = entry.stats.last.map_or(end, |(at, _)| at);
+            let until = if entry.active { last.max(end) } else { last };
             let (count, seconds) = sent(publisher);
             let mut period = entry.stats.total(until);
             period.counters.duplicated += entry.at_consumer.duplicated;

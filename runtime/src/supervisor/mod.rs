@@ -24,8 +24,7 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-pub(crate) use process::say;
-pub use process::{block_on, exit_code};
+pub use process::{block_on, exit_code, say};
 pub use shutdown::{ShutdownPhase, ShutdownReport, ShutdownSteps};
 pub use task::{StopOnDrop, TaskEnd, TaskHandle, TaskInfo, TaskPolicy};
 

@@ -101,6 +101,6 @@ impl Signals {
 }
 
 /// One line on stderr; a closed stderr is no reason to fail.
-pub(crate) fn say(line: std::fmt::Arguments<'_>) {
+pub fn say(line: std::fmt::Arguments<'_>) {
     let _ = writeln!(std::io::stderr().lock(), "{line}");
 }
