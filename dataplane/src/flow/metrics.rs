@@ -49,6 +49,7 @@ struct Page {
     leases: GaugeVec,
     link: CounterVec,
     build: GaugeVec,
+    started: GaugeVec,
     latency: parking_lot::Mutex<String>,
 }
 
@@ -128,6 +129,12 @@ impl Page {
                 "Things that happened on the link.",
                 &["event"],
             )?,
+            started: gauge(
+                &r,
+                "process_start_time_seconds",
+                "When the flow started, since 1970.",
+                &[],
+            )?,
             build: gauge(
                 &r,
                 "blaze_build_info",
@@ -140,6 +147,7 @@ impl Page {
     }
 
     fn fill(&self, shared: &Shared) {
+        self.started.with_label_values::<&str>(&[]).set(shared.started_s);
         self.build
             .with_label_values(&[env!("CARGO_PKG_VERSION"), "blaze-flow"])
             .set(1.0);
@@ -281,6 +289,9 @@ impl Page {
             self.link
                 .with_label_values(&["not_sent"])
                 .inc_by(status.not_sent as f64);
+            self.link
+                .with_label_values(&["dropped_by_kernel"])
+                .inc_by(status.dropped_by_kernel as f64);
             self.link
                 .with_label_values(&["malformed_sample"])
                 .inc_by(status.malformed as f64);

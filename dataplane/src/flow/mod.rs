@@ -121,6 +121,8 @@ pub(crate) struct Shared {
     pub(crate) egress: Arc<Egress>,
     pub(crate) live: Mutex<LiveSettings>,
     pub(crate) readiness: Readiness,
+    /// When the flow started, in seconds since 1970.
+    pub(crate) started_s: f64,
 }
 
 impl Shared {
@@ -238,6 +240,7 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         egress,
         live: Mutex::new(settings.live),
         readiness: readiness.clone(),
+        started_s: wall_ns() as f64 / 1e9,
     });
 
     let metrics_of = Arc::clone(&shared);
