@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::control::EventKind;
 use blaze_domain::names::ChannelName;
-use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
+use blaze_domain::{Durability, FlowId, LayerKind, Scope, TopicName};
 use blaze_proto::link::link_control::{Body, RouteState};
 use bytes::Bytes;
 
@@ -116,6 +116,8 @@ pub struct ControlCore {
     addresses: BTreeMap<FlowId, String>,
     /// Control payloads or parts of them that were refused.
     pub refused: u64,
+    /// Control payloads that came faster than they could be read.
+    pub overrun: u64,
 }
 
 impl ControlCore {
@@ -144,6 +146,7 @@ impl ControlCore {
             announced: (0, 0),
             addresses: BTreeMap::new(),
             refused: 0,
+            overrun: 0,
         }
     }
 
@@ -426,6 +429,8 @@ fn local_info(own: Option<&FlowView>, topic: &TopicName) -> TopicInfo {
     let only = (sources.len() == 1 && !advertised.iter().any(|a| a.more_sources))
         .then(|| sources.first())
         .flatten();
+    let kept = advertised.iter().filter(|a| a.durability == Durability::TransientLocal);
+    let endless = advertised.iter().any(|a| a.lifespan_ms == 0);
     TopicInfo {
         encoding: first.encoding.clone(),
         service: only.map(|source| source.service.clone()).unwrap_or_default(),
@@ -436,7 +441,12 @@ fn local_info(own: Option<&FlowView>, topic: &TopicName) -> TopicInfo {
         reliable: advertised
             .iter()
             .any(|a| a.reliability == blaze_domain::Reliability::Reliable),
-        depth: advertised.iter().map(|a| a.depth).max().unwrap_or(0),
-        lifespan_ms: advertised.iter().map(|a| a.lifespan_ms).max().unwrap_or(0),
+        depth: kept.map(|a| a.depth).max().unwrap_or(0),
+        // 0 = endless, which is the longest.
+        lifespan_ms: if endless {
+            0
+        } else {
+            advertised.iter().map(|a| a.lifespan_ms).max().unwrap_or(0)
+        },
     }
 }

@@ -1,6 +1,7 @@
 //! The task that drives the control core: control channels and link news in, answers, plans and registry messages out.
 
 use std::collections::HashMap;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -61,6 +62,11 @@ impl ControlTask {
             }
             self.take_control(Scope::Node, &mut of_node);
             self.take_control(Scope::Layer, &mut of_layer);
+            let overrun = node.take_dropped() + layer.take_dropped();
+            if overrun > 0 {
+                tracing::warn!(overrun, "control messages came faster than they could be read");
+                self.shared.control.lock().overrun += overrun;
+            }
             if !announced && node.is_settled() && layer.is_settled() {
                 announced = true;
                 self.shared.control.lock().announce_start(wall_ms());
@@ -169,13 +175,18 @@ impl ControlTask {
 struct ControlChannel {
     broker: Option<Arc<dyn Broker>>,
     subscription: Option<Subscription>,
+    attempt: Option<Attempt>,
 }
+
+/// An attempt to subscribe that goes on.
+type Attempt = Pin<Box<dyn Future<Output = Result<Subscription, BrokerError>> + Send>>;
 
 impl ControlChannel {
     fn new(broker: Option<Arc<dyn Broker>>) -> Self {
         Self {
             broker,
             subscription: None,
+            attempt: None,
         }
     }
 
@@ -184,7 +195,8 @@ impl ControlChannel {
         self.broker.is_none() || self.subscription.is_some()
     }
 
-    /// Waits for payloads; returns also when it has just been subscribed. Without a broker it never returns.
+    /// Waits for payloads; returns also when it has just been subscribed. Without a broker it never returns. Cancelling it
+    /// loses nothing: an attempt to subscribe goes on with the next call, however long the broker takes.
     async fn receive(&mut self, batch: &mut Vec<Received>) {
         let Some(broker) = &self.broker else {
             return std::future::pending().await;
@@ -195,17 +207,36 @@ impl ControlChannel {
             }
             self.subscription = None;
         }
-        let options = SubscribeOptions {
-            max_messages: MAX_WAITING,
-            ..SubscribeOptions::default()
-        };
-        match broker.subscribe(&ChannelName::control(), options).await {
+        let attempt = self
+            .attempt
+            .get_or_insert_with(|| Box::pin(subscribe(Arc::clone(broker))));
+        let subscribed = attempt.await;
+        self.attempt = None;
+        match subscribed {
             Ok(subscription) => self.subscription = Some(subscription),
-            Err(BrokerError::Closed) => std::future::pending().await,
-            Err(error) => {
-                tracing::debug!(%error, "cannot subscribe to the control channel, trying on");
-                tokio::time::sleep(RETRY).await;
+            Err(BrokerError::Closed) => {
+                self.broker = None;
+                std::future::pending::<()>().await;
             }
+            Err(error) => tracing::debug!(%error, "cannot subscribe to the control channel, trying on"),
         }
     }
+
+    /// Payloads that the broker dropped because this flow was slow, since the last call.
+    fn take_dropped(&self) -> u64 {
+        self.subscription.as_ref().map_or(0, Subscription::take_dropped)
+    }
+}
+
+/// Subscribes to the control channel; a failure is told after a while, so that trying on does no harm.
+async fn subscribe(broker: Arc<dyn Broker>) -> Result<Subscription, BrokerError> {
+    let options = SubscribeOptions {
+        max_messages: MAX_WAITING,
+        ..SubscribeOptions::default()
+    };
+    let subscribed = broker.subscribe(&ChannelName::control(), options).await;
+    if subscribed.is_err() {
+        tokio::time::sleep(RETRY).await;
+    }
+    subscribed
 }

@@ -328,6 +328,9 @@ impl Page {
             self.leases.with_label_values(&[kind]).inc();
         }
         self.link
+            .with_label_values(&["control_message_overrun"])
+            .inc_by(control.overrun as f64);
+        self.link
             .with_label_values(&["control_message_refused"])
             .inc_by(control.refused as f64);
     }

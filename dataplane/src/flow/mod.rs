@@ -21,7 +21,7 @@ use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicU64;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
@@ -95,7 +95,9 @@ impl InterTransport {
                 self.dds
                     .disconnect(&endpoint(flow, *epoch), &[Priority::State, Priority::Bulk]);
             }
-            LinkEvent::PeerDown { flow, epoch, .. } | LinkEvent::PeerForgotten { flow, epoch } => {
+            LinkEvent::PeerDown { flow, epoch, .. }
+            | LinkEvent::PeerForgotten { flow, epoch }
+            | LinkEvent::PeerRemoved { flow, epoch } => {
                 self.dds.disconnect(&endpoint(flow, *epoch), Priority::ALL);
             }
             LinkEvent::Addresses(addresses) => self.dds.learn_addresses(addresses),
@@ -150,6 +152,7 @@ pub struct RunningFlow {
     admin: SocketAddr,
     draining: CancellationToken,
     pacer: Option<TaskHandle>,
+    control: TaskHandle,
 }
 
 /// How long a flow takes at most to let out what is queued.
@@ -175,6 +178,7 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
     let epochs = Arc::new(Epochs {
         me: settings.me.clone(),
         state_dir,
+        last: AtomicU64::new(0),
     });
     let epoch = epochs.next().context("keeping the epoch")?;
     let now = Instant::now();
@@ -262,7 +266,7 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         writers: HashMap::new(),
         draining: draining.clone(),
     };
-    supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
+    let control = supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
     supervisor.spawn(
         "health",
         TaskPolicy::Essential,
@@ -285,6 +289,7 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         admin: address,
         draining,
         pacer,
+        control,
     })
 }
 
@@ -328,13 +333,15 @@ impl RunningFlow {
         let shared = &self.shared;
         shared.readiness.stop();
         self.draining.cancel();
+        let until = Instant::now() + DRAIN;
+        // Its last act is to plan nothing any more: only then are the bridges draining.
+        let _ = tokio::time::timeout(DRAIN, self.control.finished()).await;
         let still_draining = || {
             shared.plane.with(|state| {
                 state.run_timers(Instant::now());
                 state.core.is_draining()
             })
         };
-        let until = Instant::now() + DRAIN;
         while Instant::now() < until && still_draining() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
@@ -379,7 +386,7 @@ fn connect(
             flow: me.clone(),
             epoch,
         },
-        next_epoch: Arc::new(move || epochs.next().unwrap_or_else(|_| wall_ns() / 1_000_000)),
+        next_epoch: Arc::new(move || epochs.next_anyhow()),
         sink: Arc::new(move |event| sink.transport_event(event)),
     })
     .context("brokers.inter.dds")?;
@@ -390,14 +397,33 @@ fn connect(
 struct Epochs {
     me: FlowId,
     state_dir: Option<PathBuf>,
+    last: AtomicU64,
 }
 
 impl Epochs {
     fn next(&self) -> std::io::Result<u64> {
-        match &self.state_dir {
-            Some(dir) => blaze_runtime::state::next_epoch(dir, self.me.layer.as_str(), self.me.node.as_str()),
-            None => Ok(wall_ns() / 1_000_000),
-        }
+        let given = match &self.state_dir {
+            Some(dir) => blaze_runtime::state::next_epoch(dir, self.me.layer.as_str(), self.me.node.as_str())?,
+            None => wall_ns() / 1_000_000,
+        };
+        Ok(self.after_last(given))
+    }
+
+    /// One for a rebuilt participant: a directory that cannot be written any more does not hold it up.
+    fn next_anyhow(&self) -> u64 {
+        self.next().unwrap_or_else(|error| {
+            tracing::warn!(%error, "the epoch is not kept");
+            self.after_last(wall_ns() / 1_000_000)
+        })
+    }
+
+    /// The clock may have been set back.
+    fn after_last(&self, given: u64) -> u64 {
+        let newer = |last: u64| given.max(last + 1);
+        let before = self
+            .last
+            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |last| Some(newer(last)));
+        newer(before.unwrap_or_else(|last| last))
     }
 }
 

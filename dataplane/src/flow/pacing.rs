@@ -14,6 +14,8 @@ use crate::link::transport::Transport;
 
 /// The pacer wakes at least that often, to notice a new limit or the end.
 const IDLE: Duration = Duration::from_millis(100);
+/// A debt from which on LinkControl is let out all the same; shorter ones delay it by no more than this.
+const LONG_DEBT: Duration = Duration::from_millis(10);
 /// A burst is at most this many datagrams.
 const BURST_DATAGRAMS: usize = 2;
 
@@ -102,13 +104,17 @@ impl Egress {
                 pacer.set_limit(budget, now);
             }
             let wait = pacer.wait(now);
-            if !wait.is_zero() {
-                std::thread::sleep(wait.min(IDLE));
-                continue;
-            }
-            let Some(transmit) = plane.next_transmit(IDLE) else {
-                continue;
+            // Data waits off a debt. LinkControl does not, where that is long: peers would think this flow dead.
+            let transmit = if wait.is_zero() {
+                plane.next_transmit(IDLE)
+            } else {
+                let control = if wait > LONG_DEBT { plane.next_control() } else { None };
+                if control.is_none() {
+                    std::thread::sleep(wait.min(IDLE));
+                }
+                control
             };
+            let Some(transmit) = transmit else { continue };
             let wire_bytes = transport.wire_bytes(transmit.datagram.len());
             let outcome = transport.send(&transmit.to, transmit.class, transmit.datagram);
             let now = Instant::now();

@@ -138,15 +138,21 @@ impl Plane {
 
     /// Does something under the lock, carries out what the link then wants, and wakes the pacer.
     pub fn with<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> R {
-        let mut events = Vec::new();
-        let result = {
+        let (result, told) = {
             let mut state = self.state.lock();
             let result = action(&mut state);
-            state.pump(Instant::now(), |event| events.push(event));
-            result
+            // Told under the lock: who is up and who is down must reach the control core in the order of its happening.
+            let mut told = false;
+            state.pump(Instant::now(), |event| {
+                told = true;
+                self.tell(event);
+            });
+            (result, told)
         };
         self.work.notify_one();
-        self.tell(events);
+        if told {
+            self.news_waits.notify_one();
+        }
         result
     }
 
@@ -162,44 +168,68 @@ impl Plane {
 
     /// Takes what the transport found.
     pub fn transport_event(&self, event: TransportEvent) {
-        let news = match &event {
-            TransportEvent::Discovered(endpoint) => Some(News::Discovered(endpoint.clone())),
-            TransportEvent::Rebuilt { epoch } => Some(News::Rebuilt(*epoch)),
-            TransportEvent::Lost(_) | TransportEvent::Received { .. } => None,
-        };
-        if let Some(news) = news {
-            self.news.lock().push_back(news);
+        let told = self.with(|state| {
+            let Some(engine) = &mut state.engine else { return false };
+            let now = Instant::now();
+            let news = match event {
+                // One that is refused (an older life, no room) gets no writers.
+                TransportEvent::Discovered(endpoint) => engine
+                    .peer_discovered(now, endpoint.clone())
+                    .then_some(News::Discovered(endpoint)),
+                TransportEvent::Lost(endpoint) => {
+                    engine.peer_lost(now, &endpoint);
+                    None
+                }
+                TransportEvent::Received { class, datagram } => {
+                    engine.receive(now, datagram, class);
+                    None
+                }
+                TransportEvent::Rebuilt { epoch } => {
+                    engine.restart(now, epoch);
+                    Some(News::Rebuilt(epoch))
+                }
+            };
+            let told = news.is_some();
+            self.news.lock().extend(news);
+            told
+        });
+        if told {
             self.news_waits.notify_one();
         }
-        self.with(|state| {
-            let Some(engine) = &mut state.engine else { return };
-            let now = Instant::now();
-            match event {
-                TransportEvent::Discovered(endpoint) => engine.peer_discovered(now, endpoint),
-                TransportEvent::Lost(endpoint) => engine.peer_lost(now, &endpoint),
-                TransportEvent::Received { class, datagram } => engine.receive(now, datagram, class),
-                TransportEvent::Rebuilt { epoch } => engine.restart(now, epoch),
-            }
-        });
     }
 
     /// The next datagram to send, or how long there is nothing to do (at most `idle`). Waits that long.
     pub fn next_transmit(&self, idle: Duration) -> Option<Transmit> {
-        let mut events = Vec::new();
+        self.transmit(idle, Engine::poll_transmit)
+    }
+
+    /// The next datagram that carries no message; for a pacer in debt. Does not wait.
+    pub fn next_control(&self) -> Option<Transmit> {
+        self.transmit(Duration::ZERO, Engine::poll_control)
+    }
+
+    fn transmit(&self, idle: Duration, next: impl Fn(&mut Engine, Instant) -> Option<Transmit>) -> Option<Transmit> {
+        let mut told = false;
         let transmit = {
             let mut state = self.state.lock();
             let now = Instant::now();
             let due = state.run_timers(now);
-            state.pump(now, |event| events.push(event));
-            let transmit = state.engine.as_mut().and_then(|engine| engine.poll_transmit(now));
-            state.pump(now, |event| events.push(event));
-            if transmit.is_none() && events.is_empty() {
+            let mut tell = |event| {
+                told = true;
+                self.tell(event);
+            };
+            state.pump(now, &mut tell);
+            let transmit = state.engine.as_mut().and_then(|engine| next(engine, now));
+            state.pump(now, &mut tell);
+            if transmit.is_none() && !told && !idle.is_zero() {
                 let until = due.map_or(now + idle, |due| due.min(now + idle));
                 self.work.wait_until(&mut state, until);
             }
             transmit
         };
-        self.tell(events);
+        if told {
+            self.news_waits.notify_one();
+        }
         transmit
     }
 
@@ -224,21 +254,15 @@ impl Plane {
         self.news_dropped.load(Ordering::Relaxed)
     }
 
-    fn tell(&self, events: Vec<LinkEvent>) {
-        if events.is_empty() {
+    /// Puts an event into the inbox. Called with the state locked; the inbox is never locked the other way round.
+    fn tell(&self, event: LinkEvent) {
+        let mut news = self.news.lock();
+        // Who is there and who is not must not be lost; what peers repeat may be.
+        let repeated = matches!(event, LinkEvent::Hello { .. } | LinkEvent::Control { .. });
+        if repeated && news.len() >= MAX_NEWS {
+            self.news_dropped.fetch_add(1, Ordering::Relaxed);
             return;
         }
-        let mut news = self.news.lock();
-        for event in events {
-            // Who is there and who is not must not be lost; what peers repeat may be.
-            let repeated = matches!(event, LinkEvent::Hello { .. } | LinkEvent::Control { .. });
-            if repeated && news.len() >= MAX_NEWS {
-                self.news_dropped.fetch_add(1, Ordering::Relaxed);
-                continue;
-            }
-            news.push_back(News::Link(Box::new(event)));
-        }
-        drop(news);
-        self.news_waits.notify_one();
+        news.push_back(News::Link(Box::new(event)));
     }
 }

@@ -30,7 +30,7 @@ pub struct TopicInfo {
     pub priority: Option<Priority>,
     /// Largest payload as advertised.
     pub max_bytes: Option<u64>,
-    /// Advertised rate in Hz, summed over the writers that give one.
+    /// Advertised rate in Hz, summed over the writers; `None` where one of them gives none.
     pub rate_hz: Option<f64>,
     /// Advertised as reliable.
     pub reliable: bool,

@@ -134,13 +134,20 @@ pub enum LinkEvent {
         /// Its life.
         epoch: u64,
     },
+    /// The engine holds nothing of this life of a peer any more: what the transport has for it can go.
+    PeerRemoved {
+        /// The peer.
+        flow: FlowId,
+        /// Its life.
+        epoch: u64,
+    },
     /// Addresses that were not known before.
     Addresses(Vec<String>),
     /// The last byte of a message was sent for the first time: for rates. Each message has at most one of these.
     LaneSent {
         /// Its lane.
         lane: LaneId,
-        /// Bytes of the frame.
+        /// Bytes of the payload.
         bytes: usize,
         /// Since it arrived at this flow.
         wait: Duration,
@@ -151,7 +158,7 @@ pub enum LinkEvent {
         lane: LaneId,
         /// Messages, 1.
         messages: u64,
-        /// Bytes of the frame.
+        /// Bytes of the payload.
         bytes: usize,
         /// Since it arrived at this flow.
         wait: Duration,
@@ -164,7 +171,7 @@ pub enum LinkEvent {
         reason: DropReason,
         /// Messages, 1.
         messages: u64,
-        /// Bytes of the frame.
+        /// Bytes of the payload.
         bytes: usize,
     },
     /// Something that came over the link was dropped here.
@@ -183,7 +190,7 @@ pub enum LinkEvent {
 pub struct Tally {
     /// Messages.
     pub messages: u64,
-    /// Bytes of their frames.
+    /// Bytes of their payloads.
     pub bytes: u64,
 }
 

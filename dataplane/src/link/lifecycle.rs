@@ -12,14 +12,19 @@ use super::wire::SenderId;
 
 impl Engine {
     /// The transport can write to an endpoint.
-    pub fn peer_discovered(&mut self, now: Instant, endpoint: Endpoint) {
-        if let Some(at) = self.place_of(now, endpoint)
-            && let Some(peer) = &mut self.peers[at]
+    ///
+    /// Returns whether it is wanted: not an older life, not this flow itself, and there is room.
+    pub fn peer_discovered(&mut self, now: Instant, endpoint: Endpoint) -> bool {
+        let Some(at) = self.place_of(now, endpoint) else {
+            return false;
+        };
+        if let Some(peer) = &mut self.peers[at]
             && peer.phase != Phase::Gone
         {
             peer.hello_due = true;
             peer.hello_at = now + HELLO_EVERY;
         }
+        true
     }
 
     /// The transport no longer sees an endpoint. One that says Hello stays; one that never did is forgotten.
@@ -131,6 +136,10 @@ impl Engine {
         if let Some(peer) = self.peers.get_mut(at).and_then(Option::take) {
             self.by_flow.remove(&peer.endpoint.flow);
             self.by_sender.remove(&peer.sender);
+            self.ledger.events.push_back(LinkEvent::PeerRemoved {
+                flow: peer.endpoint.flow,
+                epoch: peer.endpoint.epoch,
+            });
         }
     }
 

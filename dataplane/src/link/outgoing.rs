@@ -66,8 +66,14 @@ impl Outgoing {
         }
     }
 
+    /// Bytes of the frame, for queues and parts.
     pub(crate) fn bytes(&self) -> usize {
         self.frame.wire_len()
+    }
+
+    /// Bytes of the payload, for whom it is counted.
+    pub(crate) fn payload_bytes(&self) -> usize {
+        self.frame.payload().len()
     }
 
     pub(crate) fn is_started(&self) -> bool {

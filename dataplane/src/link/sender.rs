@@ -203,7 +203,7 @@ impl SendClass {
         if let Some(deadline) = message.deadline {
             self.next_expiry = Some(self.next_expiry.map_or(deadline, |next| next.min(deadline)));
         }
-        ledger.submitted(message.lane, message.bytes());
+        ledger.submitted(message.lane, message.payload_bytes());
         self.waiting_bytes += cost;
         let key = self.messages.insert(message);
         self.waiting.push_back(key);
@@ -226,7 +226,7 @@ impl SendClass {
     /// Takes a message away and counts it. A started one leaves its place in the order to the one before it.
     fn drop_message(&mut self, key: Key, reason: DropReason, ledger: &mut Ledger) {
         if let Some(message) = self.take(key) {
-            ledger.dropped(message.lane, message.bytes(), reason);
+            ledger.dropped(message.lane, message.payload_bytes(), reason);
             if message.is_started() {
                 let newest = self.streams.peek(&message.stream).copied();
                 if newest == Some(message.number) {
@@ -265,7 +265,7 @@ impl SendClass {
     /// Drops everything and begins a new link epoch, as when the peer went down.
     pub(crate) fn restart(&mut self, link_epoch: u32, reason: DropReason, ledger: &mut Ledger) {
         for message in self.messages.iter() {
-            ledger.dropped(message.lane, message.bytes(), reason);
+            ledger.dropped(message.lane, message.payload_bytes(), reason);
         }
         let untold = self.announce.is_some() || self.highest_reported < self.last_user_sequence;
         let used = self.next_number > 1 || untold;
@@ -279,8 +279,8 @@ impl SendClass {
     pub(crate) fn drop_lane(&mut self, lane: LaneId, dropped: &mut Tally, ledger: &mut Ledger) {
         for key in self.messages.keys(|m| m.lane == lane && !m.is_started()) {
             if let Some(message) = self.take(key) {
-                dropped.add(message.bytes());
-                ledger.withdrawn(lane, message.bytes());
+                dropped.add(message.payload_bytes());
+                ledger.withdrawn(lane, message.payload_bytes());
             }
         }
         self.prune_waiting();
@@ -444,7 +444,7 @@ impl SendClass {
                 continue;
             }
             self.current = None;
-            let (lane, bytes, wait) = (message.lane, message.bytes(), message.waited(ctx.now));
+            let (lane, bytes, wait) = (message.lane, message.payload_bytes(), message.waited(ctx.now));
             let is_out = !message.ordered;
             ctx.ledger.sent(lane, bytes, wait);
             if is_out {

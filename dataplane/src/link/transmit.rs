@@ -21,6 +21,11 @@ const LARGEST_FEEDBACK: usize = 760;
 
 impl Engine {
     /// LinkControl or a probe, for the next peer that has any.
+    /// The next datagram that carries no message, if there is one.
+    pub fn poll_control(&mut self, now: Instant) -> Option<Transmit> {
+        self.transmit_control(now)
+    }
+
     pub(super) fn transmit_control(&mut self, now: Instant) -> Option<Transmit> {
         let count = self.peers.len();
         for step in 1..=count {

@@ -116,7 +116,8 @@ impl SendClass {
             if message.acknowledged == message.parts.len()
                 && let Some(message) = self.take(part.key)
             {
-                ctx.ledger.out(message.lane, message.bytes(), message.waited(ctx.now));
+                ctx.ledger
+                    .out(message.lane, message.payload_bytes(), message.waited(ctx.now));
             }
         }
     }
@@ -136,7 +137,8 @@ impl SendClass {
             if !message.is_sent() {
                 self.drop_message(key, DropReason::ReassemblyTimeout, ctx.ledger);
             } else if let Some(message) = self.take(key) {
-                ctx.ledger.out(message.lane, message.bytes(), message.waited(ctx.now));
+                ctx.ledger
+                    .out(message.lane, message.payload_bytes(), message.waited(ctx.now));
             }
         }
     }
