@@ -270,7 +270,7 @@ impl DataCore {
         let own_layer = frame.origin_layer() == self.config.me.layer.as_str();
         let refused = if own_layer && frame.origin_node() == self.config.me.node.as_str() {
             Some(DropReason::Echo)
-        } else if !self.topics[topic.0 as usize].reads(Scope::Inter) {
+        } else if !self.topics[topic.0 as usize].delivers() {
             Some(DropReason::NoDestination)
         } else if !self.is_new(topic, &frame) {
             Some(DropReason::Duplicate)
@@ -337,7 +337,9 @@ impl DataCore {
                 Sink::Lane { lane, .. } => Some(lane),
                 Sink::Publish { .. } => None,
             };
-            if lane.is_none_or(|lane| link.queued(lane) == 0) || now >= until {
+            // What a bridge from the inter scope has to empty is on its way to it: it stays until the end.
+            let empty = bridge.from != Scope::Inter && lane.is_none_or(|lane| link.queued(lane) == 0);
+            if empty || now >= until {
                 if let Some(lane) = lane {
                     bridge
                         .stats
@@ -482,7 +484,7 @@ impl DataCore {
         let path = &mut self.topics[topic.0 as usize];
         let large = path.largest_bytes.max(path.info.max_bytes.unwrap_or(0)) > large_bytes;
         for bridge in path.bridges.iter_mut().filter(|bridge| bridge.from == from) {
-            if matches!(bridge.phase, Phase::Up { .. }) && bridge.wants(message) {
+            if bridge.takes() && bridge.wants(message) {
                 bridge.pass(now, topic, message, large, link);
             }
         }

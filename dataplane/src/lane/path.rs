@@ -106,6 +106,17 @@ impl BridgeState {
         }
     }
 
+    /// Whether it takes messages in now. One from the inter scope does so while it drains, too: a flow that stops says so
+    /// at once, and what it had queued for us comes after.
+    #[must_use]
+    pub fn takes(&self) -> bool {
+        match self.phase {
+            Phase::Up { .. } => true,
+            Phase::Draining { .. } => self.from == Scope::Inter,
+            Phase::Ended => false,
+        }
+    }
+
     /// Layer and receiver of a bridge to the inter scope.
     #[must_use]
     pub fn receiver(&self) -> Option<(&LayerName, &FlowId)> {
@@ -168,6 +179,14 @@ impl TopicPath {
         } else {
             lane.priority.unwrap_or(Priority::State)
         }
+    }
+
+    /// Whether messages that come over the link are written somewhere.
+    #[must_use]
+    pub fn delivers(&self) -> bool {
+        self.bridges
+            .iter()
+            .any(|bridge| bridge.from == Scope::Inter && bridge.takes())
     }
 
     /// Whether a bridge takes messages in from that scope.

@@ -5,6 +5,7 @@
 
 #![allow(clippy::expect_used, reason = "the helpers of a test fail like the test")]
 
+mod drain;
 mod lossy_link;
 mod meeting;
 mod pace;
