@@ -7,7 +7,7 @@
 //!
 //! A flow reads three topics of its own, `blaze/link/<layer>/<node>/<epoch>/<class>`. Others find them by discovery and
 //! write to them, best effort: the link repairs itself, and a lost packet must hold back nobody. One thread
-//! ([`lifecycle`]) owns the participant, makes all writers, tells the relay which hosts answer, and builds everything
+//! (`lifecycle`) owns the participant, makes all writers, tells the relay which hosts answer, and builds everything
 //! anew with a new epoch when RustDDS dies.
 
 mod lifecycle;

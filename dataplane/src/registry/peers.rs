@@ -152,7 +152,7 @@ impl Registry {
         topics
     }
 
-    /// What is to be sent to other flows now; each encodes to at most [`MAX_LINK_CONTROL_BYTES`].
+    /// What is to be sent to other flows now; each encodes to at most [`MAX_LINK_CONTROL_BYTES`](super::MAX_LINK_CONTROL_BYTES).
     pub fn poll(&mut self, now: Instant) -> Vec<(FlowId, Body)> {
         let mut messages: Vec<(FlowId, Body)> = self.outgoing.drain(..).collect();
         self.announcer.tidy(now);

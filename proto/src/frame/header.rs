@@ -5,7 +5,7 @@ use bytes::Bytes;
 
 use crate::{priority_to_wire, v1};
 
-/// What a publisher says of a message; [`Frame::new`] encodes it.
+/// What a publisher says of a message; [`Frame::new`](super::Frame::new) encodes it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Header {
     /// User topic.
