@@ -6,9 +6,11 @@
 pub mod conformance;
 pub mod dds;
 pub mod memory;
+#[allow(dead_code, reason = "its users, the adapters of Redis and Kafka, follow")]
+mod outbox;
 pub mod port;
 
 pub use port::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, Content, Health, PublishOutcome, Publisher, PublisherOptions,
-    Received, SubscribeOptions, Subscription, SubscriptionSender, subscription,
+    Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, PublishOutcome, Publisher,
+    PublisherOptions, Received, Role, SubscribeOptions, Subscription, SubscriptionSender, subscription,
 };

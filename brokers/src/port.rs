@@ -15,8 +15,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 use async_trait::async_trait;
-use blaze_domain::WriterId;
 use blaze_domain::names::ChannelName;
+use blaze_domain::{DropReason, FlowId, WriterId};
 use blaze_proto::{Frame, FrameError};
 use bytes::Bytes;
 use parking_lot::Mutex;
@@ -66,6 +66,8 @@ pub enum Health {
     Up,
     /// It did answer and does not any more.
     Down,
+    /// It answers, but the scope belongs to another flow, which the detail names: nothing is read or written.
+    InUse,
     /// Closed by us; final.
     Closed,
 }
@@ -209,16 +211,51 @@ pub enum PublishOutcome {
     TooLarge,
 }
 
+/// What became of messages after a publisher had taken them, since it was made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Later {
+    /// Neither at the server nor dropped yet.
+    pub queued: u64,
+    /// Gave way to newer ones in a full queue.
+    pub queue_full: u64,
+    /// Their time was over before the server could take them.
+    pub lifespan: u64,
+    /// Refused by the server because of their size.
+    pub too_large: u64,
+    /// Refused by the server for another reason, or lost with the connection.
+    pub broker_error: u64,
+}
+
+impl Later {
+    /// All that were dropped.
+    #[must_use]
+    pub fn dropped(&self) -> u64 {
+        self.by_reason().iter().map(|(_, count)| count).sum()
+    }
+
+    /// What was dropped, by reason.
+    #[must_use]
+    pub fn by_reason(&self) -> [(DropReason, u64); 4] {
+        [
+            (DropReason::QueueFull, self.queue_full),
+            (DropReason::Lifespan, self.lifespan),
+            (DropReason::TooLarge, self.too_large),
+            (DropReason::BrokerError, self.broker_error),
+        ]
+    }
+}
+
 /// Writes one channel. Never waits.
 pub trait Publisher: Send + Sync {
-    /// Hands over a message with its header. Hops and age are written as the frame has them.
-    fn publish(&self, frame: &Frame) -> PublishOutcome;
+    /// Hands over a message with its header. Hops are written as the frame has them; its age grows by what it waits here.
+    /// One that the server could not be given before `deadline` is dropped.
+    fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome;
 
     /// Hands over a payload as it is: for reserved channels and bare ones.
-    fn publish_bare(&self, payload: &Bytes) -> PublishOutcome;
+    fn publish_bare(&self, payload: &Bytes, deadline: Option<Instant>) -> PublishOutcome;
 
-    /// Messages that were taken and then dropped, because the server was slow or away.
-    fn dropped_later(&self) -> u64;
+    /// What became of the messages that were taken.
+    fn later(&self) -> Later;
 }
 
 /// A message system, seen from one process. Dropping it closes it.
@@ -243,8 +280,60 @@ pub trait Broker: Send + Sync + 'static {
     /// [`BrokerError`] when it cannot be subscribed now.
     async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError>;
 
+    /// What only the flow of a scope does on its broker; absent where the client is a service's, or where nothing outlives
+    /// the process.
+    fn flow_side(&self) -> Option<Arc<dyn FlowSide>> {
+        None
+    }
+
     /// Delivers what was taken, as far as the server takes it within a second, then closes all subscriptions.
     async fn close(&self);
+}
+
+/// Who uses a broker.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Role {
+    /// A service: it publishes and subscribes.
+    Service,
+    /// The flow of the scope: it alone makes channels, keeps leases and claims the scope.
+    Flow {
+        /// Layer and node.
+        flow: FlowId,
+        /// Its life: larger is newer.
+        epoch: u64,
+    },
+}
+
+/// What only the flow of a scope does on its broker, beside messages. Nothing here waits but reading leases.
+#[async_trait]
+pub trait FlowSide: Send + Sync {
+    /// Makes a channel where channels must be made (Kafka), and makes it again when it vanishes, until it is released.
+    /// `depth` is what the channel keeps per writer for late joiners; 0 = nothing.
+    ///
+    /// # Errors
+    /// [`BrokerError::Name`] when the server can have no such channel.
+    fn prepare(&self, channel: &ChannelName, depth: u32) -> Result<(), BrokerError>;
+
+    /// Nobody leases a channel any more: it stays as it is.
+    fn release(&self, channel: &ChannelName);
+
+    /// All leases that the server keeps, as they are now: key and value.
+    ///
+    /// # Errors
+    /// [`BrokerError`] when the server does not answer.
+    async fn load_leases(&self) -> Result<Vec<(String, Bytes)>, BrokerError>;
+
+    /// Keeps a lease, also across outages of the server: what it has lost is written again.
+    fn put_lease(&self, key: &str, value: Bytes);
+
+    /// Forgets a lease.
+    fn remove_lease(&self, key: &str);
+
+    /// A writer's lease has lapsed: what is kept of it for late joiners goes.
+    fn forget_writer(&self, channel: &ChannelName, writer: WriterId);
+
+    /// Another layer's flow was first on this broker (given as text): neither read nor write until told `None`.
+    fn stand_back(&self, for_whom: Option<String>);
 }
 
 struct Ring {

@@ -3,13 +3,14 @@
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use async_trait::async_trait;
 use blaze_brokers::conformance::{self, Capabilities, Fixture};
 use blaze_brokers::memory::{MemoryBroker, MemoryHub};
 use blaze_brokers::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, PublishOutcome, Publisher, PublisherOptions, SubscribeOptions,
-    Subscription,
+    Broker, BrokerError, BrokerKind, BrokerStatus, Later, PublishOutcome, Publisher, PublisherOptions,
+    SubscribeOptions, Subscription,
 };
 use blaze_domain::names::ChannelName;
 use blaze_proto::Frame;
@@ -55,11 +56,11 @@ struct FaultyPublisher {
 }
 
 impl Publisher for FaultyPublisher {
-    fn publish(&self, frame: &Frame) -> PublishOutcome {
+    fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
         let mut held = self.held.lock();
         match self.fault {
             Fault::Repeats if frame.sequence() % 10 == 3 => {
-                self.inner.publish(frame);
+                self.inner.publish(frame, deadline);
             }
             Fault::Swaps if frame.sequence() % 10 == 3 => {
                 held.push(frame.clone());
@@ -69,12 +70,12 @@ impl Publisher for FaultyPublisher {
                 let payload = frame.payload().slice(..frame.payload().len() - 1);
                 return self
                     .inner
-                    .publish(&Frame::from_parts(frame.head_to_write(), payload).unwrap());
+                    .publish(&Frame::from_parts(frame.head_to_write(), payload).unwrap(), deadline);
             }
-            Fault::ForgetsAge => return self.inner.publish(&frame.clone().with_hops_and_age(0, 0)),
+            Fault::ForgetsAge => return self.inner.publish(&frame.clone().with_hops_and_age(0, 0), deadline),
             _ => {}
         }
-        let outcome = self.inner.publish(frame);
+        let outcome = self.inner.publish(frame, deadline);
         if outcome == PublishOutcome::Dropped {
             match self.fault {
                 Fault::HoardsWhileAway => held.push(frame.clone()),
@@ -84,24 +85,26 @@ impl Publisher for FaultyPublisher {
             }
         } else if self.fault != Fault::HoardsWhileAway {
             for late in held.drain(..) {
-                self.inner.publish(&late);
+                self.inner.publish(&late, deadline);
             }
         }
         outcome
     }
 
-    fn publish_bare(&self, payload: &Bytes) -> PublishOutcome {
+    fn publish_bare(&self, payload: &Bytes, deadline: Option<Instant>) -> PublishOutcome {
         if self.fault == Fault::MarksBare {
-            return self.inner.publish_bare(&Bytes::from([b"bare:", &payload[..]].concat()));
+            return self
+                .inner
+                .publish_bare(&Bytes::from([b"bare:", &payload[..]].concat()), deadline);
         }
-        match self.inner.publish_bare(payload) {
+        match self.inner.publish_bare(payload, deadline) {
             PublishOutcome::TooLarge if self.fault == Fault::AlwaysTaken => PublishOutcome::Taken,
             outcome => outcome,
         }
     }
 
-    fn dropped_later(&self) -> u64 {
-        self.inner.dropped_later()
+    fn later(&self) -> Later {
+        self.inner.later()
     }
 }
 

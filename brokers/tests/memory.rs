@@ -83,7 +83,10 @@ async fn payloads_are_shared_not_copied() {
         .unwrap();
     let publisher = broker.publisher(&channel("t"), PublisherOptions::default()).unwrap();
     let payload = Bytes::from(vec![7; 1_000_000]);
-    assert_eq!(publisher.publish(&frame(1, payload.clone())), PublishOutcome::Taken);
+    assert_eq!(
+        publisher.publish(&frame(1, payload.clone()), None),
+        PublishOutcome::Taken
+    );
     let mut batch = Vec::new();
     subscription.receive(&mut batch, 1).await;
     let Content::Frame(found) = &batch[0].content else {
@@ -104,7 +107,7 @@ async fn an_outage_is_seen_by_every_client_and_refuses_new_readers() {
         assert!(matches!(refused, Err(BrokerError::Away(_))));
         let publisher = broker.publisher(&channel("t"), PublisherOptions::default()).unwrap();
         assert_eq!(
-            publisher.publish_bare(&Bytes::from_static(b"x")),
+            publisher.publish_bare(&Bytes::from_static(b"x"), None),
             PublishOutcome::Dropped
         );
     }
@@ -138,7 +141,7 @@ async fn kept_messages_tell_how_long_they_lay_there() {
     };
     let publisher = broker.publisher(&channel("t"), options).unwrap();
     let before = std::time::Instant::now();
-    publisher.publish(&frame(1, Bytes::new()));
+    publisher.publish(&frame(1, Bytes::new()), None);
     let published = std::time::Instant::now();
     while published.elapsed() < std::time::Duration::from_millis(5) {
         tokio::task::yield_now().await;

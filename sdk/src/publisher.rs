@@ -1,7 +1,7 @@
 //! Publishing on a topic.
 
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use blaze_brokers::PublishOutcome;
 use blaze_domain::control::{MAX_ENCODING_BYTES, MAX_TYPE_BYTES};
@@ -73,6 +73,8 @@ struct Shared {
     to: Arc<dyn blaze_brokers::Publisher>,
     topic: TopicName,
     writer: WriterId,
+    /// How long a message is of use; zero = for ever.
+    lifespan: Duration,
     /// What all messages have in common, and the last sequence. Locked until the broker has the message, so that
     /// sequences reach it in order.
     next: Mutex<Header>,
@@ -101,6 +103,7 @@ impl Publisher {
                 to,
                 topic: topic.clone(),
                 writer,
+                lifespan: options.lifespan,
                 next: Mutex::new(header),
             }),
         }
@@ -118,11 +121,12 @@ impl Publisher {
             return PublishOutcome::TooLarge;
         }
         let since_epoch = time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        let deadline = (self.shared.lifespan > Duration::ZERO).then(|| Instant::now() + self.shared.lifespan);
         let mut header = self.shared.next.lock();
         header.sequence += 1;
         header.publish_time_ns = u64::try_from(since_epoch.as_nanos()).unwrap_or(u64::MAX);
         match Frame::new(&header, payload) {
-            Ok(frame) => self.shared.to.publish(&frame),
+            Ok(frame) => self.shared.to.publish(&frame, deadline),
             Err(error) => {
                 // The options were checked, so this is a fault of the SDK; the publisher goes on.
                 header.sequence -= 1;
@@ -153,7 +157,7 @@ impl Publisher {
     /// Messages that were taken and then dropped, because the broker was slow or away.
     #[must_use]
     pub fn dropped_later(&self) -> u64 {
-        self.shared.to.dropped_later()
+        self.shared.to.later().dropped()
     }
 }
 

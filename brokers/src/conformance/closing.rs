@@ -35,7 +35,7 @@ pub async fn close_delivers_and_ends(fixture: &dyn Fixture) -> Outcome {
     }
     while own.next_or_end("the closed client's reader ends").await?.is_some() {}
     wait_for_health(closing.as_ref(), Health::Closed).await?;
-    let outcome = publisher.publish(&numbered(&channel, writer(1), MESSAGES + 1)?);
+    let outcome = publisher.publish(&numbered(&channel, writer(1), MESSAGES + 1)?, None);
     if outcome != PublishOutcome::Dropped {
         return Err(format!("publishing on a closed client was {outcome:?}, not dropped"));
     }
@@ -84,7 +84,7 @@ pub async fn close_leaves_nothing_behind(fixture: &dyn Fixture) -> Outcome {
             .await?
             .is_some()
         {}
-        let outcome = publisher.publish(&numbered(&channel, writer(1), 2)?);
+        let outcome = publisher.publish(&numbered(&channel, writer(1), 2)?, None);
         if outcome != PublishOutcome::Dropped {
             return Err(format!("publishing on a {how} client was {outcome:?}"));
         }

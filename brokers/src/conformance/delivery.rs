@@ -196,7 +196,7 @@ pub async fn too_large_is_refused(fixture: &dyn Fixture) -> Outcome {
     }
     let channel = channel("too-large")?;
     let (mut reader, publisher, _clients) = apart(fixture, &channel, true).await?;
-    let outcome = publisher.publish_bare(&Bytes::from(vec![0; MAX_PAYLOAD_BYTES + 1]));
+    let outcome = publisher.publish_bare(&Bytes::from(vec![0; MAX_PAYLOAD_BYTES + 1]), None);
     if outcome != PublishOutcome::TooLarge {
         return Err(format!("one byte more than {MAX_PAYLOAD_BYTES} was {outcome:?}"));
     }
@@ -247,7 +247,7 @@ fn sizes(fixture: &dyn Fixture) -> impl Iterator<Item = usize> {
 }
 
 fn publish_bare(publisher: &dyn Publisher, payload: &Bytes) -> Outcome {
-    match publisher.publish_bare(payload) {
+    match publisher.publish_bare(payload, None) {
         PublishOutcome::Taken => Ok(()),
         other => Err(format!(
             "a bare payload of {} bytes was {other:?}, though the server is up",

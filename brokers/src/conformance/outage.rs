@@ -41,10 +41,10 @@ pub async fn server_away_and_back(fixture: &dyn Fixture) -> Outcome {
         for client in &clients {
             wait_for_health(client.as_ref(), Health::Down).await?;
         }
-        let dropped_before = publisher.dropped_later();
+        let dropped_before = publisher.later().dropped();
         for _ in 0..20 {
             sequence += 1;
-            if publisher.publish(&numbered(&channel, writer(1), sequence)?) == PublishOutcome::Taken {
+            if publisher.publish(&numbered(&channel, writer(1), sequence)?, None) == PublishOutcome::Taken {
                 taken_away.push(sequence);
             }
         }
@@ -57,9 +57,9 @@ pub async fn server_away_and_back(fixture: &dyn Fixture) -> Outcome {
         let until = Instant::now() + DEADLINE;
         while last <= last_away {
             sequence += 1;
-            publisher.publish(&numbered(&channel, writer(1), sequence)?);
+            publisher.publish(&numbered(&channel, writer(1), sequence)?, None);
             if let Some(found) = arrived(&mut reader, last).await? {
-                if capabilities.keeps_while_away && publisher.dropped_later() == dropped_before {
+                if capabilities.keeps_while_away && publisher.later().dropped() == dropped_before {
                     taken_away.retain(|sequence| *sequence != found);
                 }
                 last = found;
@@ -68,7 +68,7 @@ pub async fn server_away_and_back(fixture: &dyn Fixture) -> Outcome {
                 return Err("after the server came back, nothing was received any more".to_owned());
             }
         }
-        if capabilities.keeps_while_away && publisher.dropped_later() == dropped_before && !taken_away.is_empty() {
+        if capabilities.keeps_while_away && publisher.later().dropped() == dropped_before && !taken_away.is_empty() {
             return Err(format!(
                 "taken while the server was away and not counted as dropped, but lost: {taken_away:?}"
             ));
@@ -129,7 +129,7 @@ pub async fn publishing_never_waits(fixture: &dyn Fixture) -> Outcome {
                 let payload = tracked(vec![b'x'; SIZE], &alive);
                 let frame = frame(&channel, writer(1), sequence, payload)?;
                 let start = Instant::now();
-                publisher.publish(&frame);
+                publisher.publish(&frame, None);
                 slowest = slowest.max(start.elapsed());
                 Ok(())
             });

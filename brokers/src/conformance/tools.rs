@@ -136,7 +136,7 @@ pub(super) fn open_publisher_with(
 
 /// Publishes and insists that it is taken.
 pub(super) fn publish(publisher: &dyn Publisher, frame: &Frame) -> Outcome {
-    match publisher.publish(frame) {
+    match publisher.publish(frame, None) {
         PublishOutcome::Taken => Ok(()),
         other => Err(format!(
             "message {} of {} was {other:?}, though the server is up",
@@ -181,9 +181,9 @@ impl Reader {
         let until = Instant::now() + DEADLINE;
         for sequence in 1.. {
             if bare {
-                publisher.publish_bare(&Bytes::from_static(PROBE_JSON));
+                publisher.publish_bare(&Bytes::from_static(PROBE_JSON), None);
             } else {
-                publisher.publish(&numbered(&channel, PROBE_WRITER, sequence)?);
+                publisher.publish(&numbered(&channel, PROBE_WRITER, sequence)?, None);
             }
             let mut batch = Vec::new();
             let wait = self.subscription.receive(&mut batch, 64);

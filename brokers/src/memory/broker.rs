@@ -14,7 +14,7 @@ use tokio::sync::watch;
 
 use super::{Channel, MemoryHub};
 use crate::port::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, Content, Health, PublishOutcome, Publisher, PublisherOptions,
+    Broker, BrokerError, BrokerKind, BrokerStatus, Content, Health, Later, PublishOutcome, Publisher, PublisherOptions,
     SubscribeOptions, Subscription, SubscriptionSender,
 };
 
@@ -168,7 +168,7 @@ impl MemoryPublisher {
 }
 
 impl Publisher for MemoryPublisher {
-    fn publish(&self, frame: &Frame) -> PublishOutcome {
+    fn publish(&self, frame: &Frame, _deadline: Option<Instant>) -> PublishOutcome {
         if let Some(refusal) = self.refusal(frame.payload()) {
             return refusal;
         }
@@ -178,7 +178,7 @@ impl Publisher for MemoryPublisher {
     }
 
     /// As [`Publisher::publish_bare`]. A payload without a header has no writer, so it is not kept for late joiners.
-    fn publish_bare(&self, payload: &Bytes) -> PublishOutcome {
+    fn publish_bare(&self, payload: &Bytes, _deadline: Option<Instant>) -> PublishOutcome {
         if let Some(refusal) = self.refusal(payload) {
             return refusal;
         }
@@ -194,7 +194,7 @@ impl Publisher for MemoryPublisher {
         PublishOutcome::Taken
     }
 
-    fn dropped_later(&self) -> u64 {
-        0
+    fn later(&self) -> Later {
+        Later::default()
     }
 }

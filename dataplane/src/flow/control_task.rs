@@ -167,7 +167,7 @@ impl ControlTask {
                 }
             },
         };
-        writer.publish_bare(body);
+        writer.publish_bare(body, None);
     }
 }
 

@@ -86,10 +86,12 @@ impl BridgeState {
         }
         match &mut self.sink {
             Sink::Publish { publisher, bare } => {
+                let deadline = (lifespan_ms > 0)
+                    .then(|| now + Duration::from_millis(lifespan_ms.into()) - Duration::from_micros(message.age_us));
                 let outcome = if *bare {
-                    publisher.publish_bare(frame.payload())
+                    publisher.publish_bare(frame.payload(), deadline)
                 } else {
-                    publisher.publish(&frame.clone().with_hops_and_age(frame.hops() + 1, message.age_us))
+                    publisher.publish(&frame.clone().with_hops_and_age(frame.hops() + 1, message.age_us), deadline)
                 };
                 match outcome {
                     PublishOutcome::Taken => {

@@ -57,7 +57,7 @@ struct ScopeWriter {
 }
 
 impl Publisher for ScopeWriter {
-    fn publish(&self, frame: &Frame) -> PublishOutcome {
+    fn publish(&self, frame: &Frame, _: Option<Instant>) -> PublishOutcome {
         let mut scope = self.scope.lock();
         let key = (self.topic.clone(), frame.writer(), frame.sequence());
         if !scope.seen.insert(key.clone()) {
@@ -70,11 +70,11 @@ impl Publisher for ScopeWriter {
             .push(((&self.topic).into(), Content::from_bytes(frame.to_bytes())));
         PublishOutcome::Taken
     }
-    fn publish_bare(&self, _payload: &Bytes) -> PublishOutcome {
+    fn publish_bare(&self, _payload: &Bytes, _: Option<Instant>) -> PublishOutcome {
         PublishOutcome::Taken
     }
-    fn dropped_later(&self) -> u64 {
-        0
+    fn later(&self) -> blaze_brokers::Later {
+        blaze_brokers::Later::default()
     }
 }
 

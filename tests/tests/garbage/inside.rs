@@ -185,7 +185,7 @@ impl Inside {
         let publisher = broker
             .publisher(&channel.parse().unwrap(), PublisherOptions::default())
             .unwrap();
-        publisher.publish_bare(&bytes.into())
+        publisher.publish_bare(&bytes.into(), None)
     }
 
     /// Ends everything; fails if a task of the flow did.

@@ -41,16 +41,16 @@ struct Collector {
 }
 
 impl Publisher for Collector {
-    fn publish(&self, frame: &Frame) -> PublishOutcome {
+    fn publish(&self, frame: &Frame, _: Option<Instant>) -> PublishOutcome {
         self.frames.lock().push(frame.clone());
         PublishOutcome::Taken
     }
-    fn publish_bare(&self, payload: &Bytes) -> PublishOutcome {
+    fn publish_bare(&self, payload: &Bytes, _: Option<Instant>) -> PublishOutcome {
         self.bare.lock().push(payload.clone());
         PublishOutcome::Taken
     }
-    fn dropped_later(&self) -> u64 {
-        0
+    fn later(&self) -> blaze_brokers::Later {
+        blaze_brokers::Later::default()
     }
 }
 

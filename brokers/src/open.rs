@@ -1,0 +1,57 @@
+//! From the node file to a broker.
+
+use std::sync::Arc;
+
+use blaze_domain::node_file::{LayerBroker, NodeBroker};
+
+use crate::port::{Broker, Role};
+
+/// Why a broker of the node file cannot be used at all. A server that is merely away is no error.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum OpenError {
+    /// A file that the section names cannot be read or holds no such thing, or a value that the client library refuses.
+    #[error("{key}: {reason}")]
+    Setting {
+        /// Key below `brokers.node` or `brokers.layer`, such as `redis.password_file`.
+        key: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// This program was built without that adapter.
+    #[error("this program was built without {feature}: build it with `--features {feature}`")]
+    NotBuilt {
+        /// The cargo feature.
+        feature: &'static str,
+    },
+    /// It has no server: it lives inside the process that opens it.
+    #[error("memory: {{}} lives inside one process; other processes need a server")]
+    InProcess,
+}
+
+/// Connects to the server of a node scope, in the background.
+///
+/// # Errors
+/// [`OpenError`] where it can never work.
+pub fn open_node(section: &NodeBroker, role: &Role) -> Result<Arc<dyn Broker>, OpenError> {
+    match section {
+        NodeBroker::Memory => Err(OpenError::InProcess),
+        NodeBroker::Redis(redis) => Ok(Arc::new(crate::redis::RedisBroker::open(redis, role)?)),
+    }
+}
+
+/// Connects to the server of a layer scope, in the background.
+///
+/// # Errors
+/// [`OpenError`] where it can never work.
+pub fn open_layer(section: &LayerBroker, role: &Role) -> Result<Arc<dyn Broker>, OpenError> {
+    match section {
+        LayerBroker::Memory | LayerBroker::Dds(_) => Err(OpenError::InProcess),
+        #[cfg(feature = "kafka")]
+        LayerBroker::Kafka(kafka) => Ok(Arc::new(crate::kafka::KafkaBroker::open(kafka, role)?)),
+        #[cfg(not(feature = "kafka"))]
+        LayerBroker::Kafka(_) => {
+            let _ = role;
+            Err(OpenError::NotBuilt { feature: "kafka" })
+        }
+    }
+}

@@ -1,0 +1,528 @@
+//! What waits for a server: bounded queues, one per publisher, emptied in turns by the one writer of a connection.
+//!
+//! ```text
+//! publisher ─► lane (oldest give way) ─┐
+//! publisher ─► lane                    ├─► Outbox::take, a piece of each lane in turn ─► server ─► Waiting::settle
+//! publisher ─► lane                   ─┘        (what is over its deadline is dropped here)
+//! ```
+//!
+//! A message counts as queued from [`Lane::push`] until it is settled, so that nothing is ever uncounted.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use blaze_domain::DropReason;
+use blaze_proto::Frame;
+use bytes::Bytes;
+use parking_lot::Mutex;
+use tokio::sync::Notify;
+
+use crate::port::{Later, PublishOutcome};
+
+/// Messages that one lane gives per turn.
+const TURN: usize = 16;
+/// Bookkeeping that a message costs beside its bytes, so that many empty messages are bounded, too.
+const OVERHEAD_BYTES: usize = 128;
+
+/// Bounds of one outbox.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct OutboxLimits {
+    /// Most messages that one lane holds.
+    pub(crate) lane_messages: usize,
+    /// Most bytes that one lane holds; one message always fits.
+    pub(crate) lane_bytes: usize,
+    /// Most bytes of all lanes together.
+    pub(crate) total_bytes: usize,
+}
+
+/// What is to be written.
+#[derive(Debug, Clone)]
+pub(crate) enum Body {
+    /// A message with its header.
+    Frame(Frame),
+    /// A payload as it is.
+    Bare(Bytes),
+}
+
+impl Body {
+    fn size(&self) -> usize {
+        OVERHEAD_BYTES
+            + match self {
+                Self::Frame(frame) => frame.wire_len(),
+                Self::Bare(payload) => payload.len(),
+            }
+    }
+}
+
+/// Counters of one lane.
+#[derive(Debug, Default)]
+struct Counts {
+    queued: AtomicU64,
+    queue_full: AtomicU64,
+    lifespan: AtomicU64,
+    too_large: AtomicU64,
+    broker_error: AtomicU64,
+}
+
+impl Counts {
+    fn settle(&self, fate: Fate) {
+        match fate {
+            Fate::Delivered => None,
+            Fate::Dropped(DropReason::QueueFull) => Some(&self.queue_full),
+            Fate::Dropped(DropReason::Lifespan) => Some(&self.lifespan),
+            Fate::Dropped(DropReason::TooLarge) => Some(&self.too_large),
+            Fate::Dropped(_) => Some(&self.broker_error),
+        }
+        .map(|counter| counter.fetch_add(1, Ordering::Relaxed));
+        self.queued.fetch_sub(1, Ordering::Relaxed);
+    }
+
+    fn later(&self) -> Later {
+        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        Later {
+            queued: get(&self.queued),
+            queue_full: get(&self.queue_full),
+            lifespan: get(&self.lifespan),
+            too_large: get(&self.too_large),
+            broker_error: get(&self.broker_error),
+        }
+    }
+}
+
+/// How a message ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Fate {
+    /// The server has it.
+    Delivered,
+    /// It is lost; a reason that [`Later`] does not know counts as `broker_error`.
+    Dropped(DropReason),
+}
+
+/// A message that was taken out of its lane. Dropping it without [`Waiting::settle`] counts it as `broker_error`.
+#[derive(Debug)]
+pub(crate) struct Waiting<C> {
+    /// What is to be written.
+    pub(crate) body: Body,
+    /// What its lane is for: the adapter's own data (channel, topic).
+    pub(crate) to: Arc<C>,
+    /// When it was handed over.
+    pub(crate) since: Instant,
+    counts: Option<Arc<Counts>>,
+}
+
+impl<C> Waiting<C> {
+    /// The frame as it is to be written now: its age has grown by what it waited.
+    pub(crate) fn aged(frame: &Frame, since: Instant, now: Instant) -> Frame {
+        let waited = u64::try_from(now.saturating_duration_since(since).as_micros()).unwrap_or(u64::MAX);
+        frame
+            .clone()
+            .with_hops_and_age(frame.hops(), frame.age_us().saturating_add(waited))
+    }
+
+    /// Bytes that it holds.
+    pub(crate) fn size(&self) -> usize {
+        self.body.size()
+    }
+
+    /// Ends its story.
+    pub(crate) fn settle(mut self, fate: Fate) {
+        if let Some(counts) = self.counts.take() {
+            counts.settle(fate);
+        }
+    }
+
+    /// Leaves the bytes and keeps the duty to settle.
+    pub(crate) fn into_receipt(mut self) -> Receipt {
+        Receipt(self.counts.take())
+    }
+}
+
+impl<C> Drop for Waiting<C> {
+    fn drop(&mut self) {
+        if let Some(counts) = self.counts.take() {
+            counts.settle(Fate::Dropped(DropReason::BrokerError));
+        }
+    }
+}
+
+/// The duty to settle a message whose bytes are with the server's client already. Dropped unsettled it counts as
+/// `broker_error`.
+#[derive(Debug)]
+pub(crate) struct Receipt(Option<Arc<Counts>>);
+
+impl Receipt {
+    /// Ends the message's story.
+    pub(crate) fn settle(mut self, fate: Fate) {
+        if let Some(counts) = self.0.take() {
+            counts.settle(fate);
+        }
+    }
+}
+
+impl Drop for Receipt {
+    fn drop(&mut self) {
+        if let Some(counts) = self.0.take() {
+            counts.settle(Fate::Dropped(DropReason::BrokerError));
+        }
+    }
+}
+
+struct Entry {
+    body: Body,
+    since: Instant,
+    /// When it is of no use any more, and what it then counts as.
+    expires: Option<(Instant, DropReason)>,
+}
+
+struct Queue<C> {
+    entries: VecDeque<Entry>,
+    bytes: usize,
+    to: Arc<C>,
+    counts: Arc<Counts>,
+    /// It stands in the list of turns.
+    has_turn: bool,
+    /// Its publisher has gone: it ends when it is empty.
+    orphaned: bool,
+}
+
+impl<C> Queue<C> {
+    fn drop_oldest(&mut self, reason: DropReason) -> usize {
+        let Some(entry) = self.entries.pop_front() else {
+            return 0;
+        };
+        let size = entry.body.size();
+        self.bytes -= size;
+        self.counts.settle(Fate::Dropped(reason));
+        size
+    }
+}
+
+struct State<C> {
+    lanes: HashMap<u64, Queue<C>>,
+    /// Lanes that hold something, in the order of their turns.
+    turns: VecDeque<u64>,
+    bytes: usize,
+    next: u64,
+    closed: bool,
+}
+
+/// The queues of one connection.
+pub(crate) struct Outbox<C> {
+    state: Mutex<State<C>>,
+    limits: OutboxLimits,
+    filled: Notify,
+}
+
+/// One publisher's queue.
+pub(crate) struct Lane<C> {
+    outbox: Arc<Outbox<C>>,
+    id: u64,
+    counts: Arc<Counts>,
+    /// How long a message may wait at most, whatever its deadline.
+    longest_wait: Option<Duration>,
+}
+
+impl<C> Outbox<C> {
+    pub(crate) fn new(limits: OutboxLimits) -> Arc<Self> {
+        Arc::new(Self {
+            state: Mutex::new(State {
+                lanes: HashMap::new(),
+                turns: VecDeque::new(),
+                bytes: 0,
+                next: 0,
+                closed: false,
+            }),
+            limits,
+            filled: Notify::new(),
+        })
+    }
+
+    /// A queue for a publisher. What waits longer than `longest_wait` is dropped as `broker_error`.
+    pub(crate) fn lane(self: &Arc<Self>, to: C, longest_wait: Option<Duration>) -> Lane<C> {
+        let counts = Arc::<Counts>::default();
+        let mut state = self.state.lock();
+        let id = state.next;
+        state.next += 1;
+        let queue = Queue {
+            entries: VecDeque::new(),
+            bytes: 0,
+            to: Arc::new(to),
+            counts: Arc::clone(&counts),
+            has_turn: false,
+            orphaned: false,
+        };
+        state.lanes.insert(id, queue);
+        drop(state);
+        Lane {
+            outbox: Arc::clone(self),
+            id,
+            counts,
+            longest_wait,
+        }
+    }
+
+    /// Waits until something may be there. Cancelling it loses nothing.
+    pub(crate) async fn filled(&self) {
+        self.filled.notified().await;
+    }
+
+    /// Whether nothing waits.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.state.lock().bytes == 0
+    }
+
+    /// Takes messages in turns of the lanes until `messages` or `bytes` are reached (one message is always taken), and drops
+    /// those whose time is over. Returns the bytes taken.
+    pub(crate) fn take(
+        &self,
+        now: Instant,
+        messages: usize,
+        bytes: usize,
+        into: &mut Vec<Waiting<C>>,
+    ) -> usize {
+        let mut state = self.state.lock();
+        let state = &mut *state;
+        let mut taken = 0;
+        let first = into.len();
+        while into.len() - first < messages {
+            let Some(id) = state.turns.pop_front() else { break };
+            let Some(queue) = state.lanes.get_mut(&id) else { continue };
+            let mut full = false;
+            for _ in 0..TURN {
+                let Some(entry) = queue.entries.front() else { break };
+                if let Some((at, reason)) = entry.expires
+                    && at <= now
+                {
+                    state.bytes -= queue.drop_oldest(reason);
+                    continue;
+                }
+                let size = entry.body.size();
+                if into.len() > first && (taken + size > bytes || into.len() - first >= messages) {
+                    full = true;
+                    break;
+                }
+                let Some(entry) = queue.entries.pop_front() else { break };
+                queue.bytes -= size;
+                state.bytes -= size;
+                taken += size;
+                into.push(Waiting {
+                    body: entry.body,
+                    to: Arc::clone(&queue.to),
+                    since: entry.since,
+                    counts: Some(Arc::clone(&queue.counts)),
+                });
+            }
+            queue.has_turn = !queue.entries.is_empty();
+            if queue.has_turn {
+                state.turns.push_back(id);
+            } else if queue.orphaned {
+                state.lanes.remove(&id);
+            }
+            if full {
+                break;
+            }
+        }
+        taken
+    }
+
+    /// Drops what is over its deadline, in all lanes; for a server that takes nothing.
+    pub(crate) fn expire(&self, now: Instant) {
+        let mut state = self.state.lock();
+        let state = &mut *state;
+        for queue in state.lanes.values_mut() {
+            while let Some((at, reason)) = queue.entries.front().and_then(|entry| entry.expires)
+                && at <= now
+            {
+                state.bytes -= queue.drop_oldest(reason);
+            }
+        }
+    }
+
+    /// Drops all that waits.
+    pub(crate) fn clear(&self, reason: DropReason) {
+        let mut state = self.state.lock();
+        let state = &mut *state;
+        for queue in state.lanes.values_mut() {
+            while !queue.entries.is_empty() {
+                state.bytes -= queue.drop_oldest(reason);
+            }
+            queue.has_turn = false;
+        }
+        state.turns.clear();
+        state.lanes.retain(|_, queue| !queue.orphaned);
+    }
+
+    /// Takes nothing more from publishers.
+    pub(crate) fn close(&self) {
+        self.state.lock().closed = true;
+        self.filled.notify_one();
+    }
+}
+
+impl<C> Lane<C> {
+    /// Queues a message; the oldest of the lane give way.
+    pub(crate) fn push(&self, body: Body, deadline: Option<Instant>) -> PublishOutcome {
+        let since = Instant::now();
+        let longest = self.longest_wait.map(|wait| (since + wait, DropReason::BrokerError));
+        let expires = match (deadline.map(|at| (at, DropReason::Lifespan)), longest) {
+            (Some(one), Some(other)) => Some(if one.0 <= other.0 { one } else { other }),
+            (one, other) => one.or(other),
+        };
+        let size = body.size();
+        let limits = self.outbox.limits;
+        {
+            let mut state = self.outbox.state.lock();
+            let state = &mut *state;
+            if state.closed {
+                return PublishOutcome::Dropped;
+            }
+            let Some(queue) = state.lanes.get_mut(&self.id) else {
+                return PublishOutcome::Dropped;
+            };
+            while !queue.entries.is_empty()
+                && (queue.entries.len() >= limits.lane_messages
+                    || queue.bytes + size > limits.lane_bytes
+                    || state.bytes + size > limits.total_bytes)
+            {
+                state.bytes -= queue.drop_oldest(DropReason::QueueFull);
+            }
+            if state.bytes + size > limits.total_bytes && state.bytes > 0 {
+                // Others hold the room, and this lane has nothing older to give.
+                self.counts.queue_full.fetch_add(1, Ordering::Relaxed);
+                return PublishOutcome::Taken;
+            }
+            if !queue.has_turn {
+                queue.has_turn = true;
+                state.turns.push_back(self.id);
+            }
+            queue.bytes += size;
+            state.bytes += size;
+            queue.entries.push_back(Entry { body, since, expires });
+            self.counts.queued.fetch_add(1, Ordering::Relaxed);
+        }
+        self.outbox.filled.notify_one();
+        PublishOutcome::Taken
+    }
+
+    /// What became of what was pushed.
+    pub(crate) fn later(&self) -> Later {
+        self.counts.later()
+    }
+}
+
+impl<C> Drop for Lane<C> {
+    fn drop(&mut self) {
+        let mut state = self.outbox.state.lock();
+        let gone = state.lanes.get_mut(&self.id).is_some_and(|queue| {
+            queue.orphaned = true;
+            !queue.has_turn
+        });
+        if gone {
+            state.lanes.remove(&self.id);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SMALL: OutboxLimits = OutboxLimits {
+        lane_messages: 4,
+        lane_bytes: 10_000,
+        total_bytes: 20_000,
+    };
+
+    fn bare(number: u8, bytes: usize) -> Body {
+        Body::Bare(Bytes::from(vec![number; bytes]))
+    }
+
+    fn number(waiting: &Waiting<&'static str>) -> (&'static str, u8) {
+        match &waiting.body {
+            Body::Bare(payload) => (*waiting.to, payload[0]),
+            Body::Frame(_) => ("frame", 0),
+        }
+    }
+
+    fn take_all(outbox: &Outbox<&'static str>, messages: usize, bytes: usize) -> Vec<(&'static str, u8)> {
+        let mut into = Vec::new();
+        outbox.take(Instant::now(), messages, bytes, &mut into);
+        let seen = into.iter().map(number).collect();
+        into.into_iter().for_each(|waiting| waiting.settle(Fate::Delivered));
+        seen
+    }
+
+    #[test]
+    fn a_full_lane_loses_its_oldest_and_keeps_order() {
+        let outbox = Outbox::new(SMALL);
+        let lane = outbox.lane("a", None);
+        for count in 1..=6 {
+            assert_eq!(lane.push(bare(count, 10), None), PublishOutcome::Taken);
+        }
+        assert_eq!(lane.later().queue_full, 2);
+        assert_eq!(take_all(&outbox, 100, 10_000), [("a", 3), ("a", 4), ("a", 5), ("a", 6)]);
+        let later = lane.later();
+        assert_eq!((later.queued, later.dropped()), (0, 2));
+        assert!(outbox.is_empty());
+    }
+
+    #[test]
+    fn lanes_take_turns_and_limits_stop_a_take() {
+        let outbox = Outbox::new(OutboxLimits { lane_messages: 100, ..SMALL });
+        let (a, b) = (outbox.lane("a", None), outbox.lane("b", None));
+        for count in 0..20 {
+            a.push(bare(count, 10), None);
+        }
+        b.push(bare(7, 10), None);
+        let seen = take_all(&outbox, 18, 10_000);
+        assert_eq!(seen.len(), 18);
+        assert_eq!(seen[16], ("b", 7), "b has its turn after {TURN} of a");
+        assert_eq!(take_all(&outbox, 100, 1), [("a", 17)], "one message is always taken");
+        assert_eq!(take_all(&outbox, 100, 10_000), [("a", 18), ("a", 19)]);
+    }
+
+    #[test]
+    fn what_is_over_its_time_is_dropped_with_its_reason() {
+        let outbox = Outbox::new(SMALL);
+        let lane = outbox.lane("a", Some(Duration::ZERO));
+        let other = outbox.lane("b", None);
+        let now = Instant::now();
+        lane.push(bare(1, 10), None);
+        other.push(bare(2, 10), Some(now));
+        other.push(bare(3, 10), Some(now + Duration::from_secs(60)));
+        outbox.expire(now + Duration::from_secs(1));
+        assert_eq!(take_all(&outbox, 100, 10_000), [("b", 3)]);
+        assert_eq!((lane.later().broker_error, lane.later().lifespan), (1, 0));
+        assert_eq!((other.later().broker_error, other.later().lifespan), (0, 1));
+    }
+
+    #[test]
+    fn the_total_is_bounded_over_all_lanes() {
+        let outbox = Outbox::new(SMALL);
+        let lanes: Vec<_> = (0..4).map(|_| outbox.lane("x", None)).collect();
+        for lane in &lanes {
+            lane.push(bare(1, 9_000), None);
+        }
+        assert_eq!(lanes.iter().map(|lane| lane.later().queued).sum::<u64>(), 2);
+        assert_eq!(lanes.iter().map(|lane| lane.later().queue_full).sum::<u64>(), 2);
+    }
+
+    #[test]
+    fn nothing_is_uncounted_when_it_is_forgotten() {
+        let outbox = Outbox::new(SMALL);
+        let lane = outbox.lane("a", None);
+        lane.push(bare(1, 10), None);
+        lane.push(bare(2, 10), None);
+        lane.push(bare(3, 10), None);
+        let mut into = Vec::new();
+        outbox.take(Instant::now(), 2, 10_000, &mut into);
+        drop(into.pop());
+        drop(into.pop().map(Waiting::into_receipt));
+        outbox.clear(DropReason::BrokerError);
+        assert_eq!(lane.later(), Later { broker_error: 3, ..Later::default() });
+        outbox.close();
+        assert_eq!(lane.push(bare(4, 10), None), PublishOutcome::Dropped);
+    }
+}
