@@ -121,7 +121,9 @@ pub(super) async fn keep(shared: Arc<Shared>, mut service: impl Serve) {
             report(&shared, line, &failure);
             let (Failure::Away(why) | Failure::Refused(why)) = &failure;
             service.interrupted(why);
-            shared.state.change(|conditions| conditions.set_line(line, failure.into()));
+            shared
+                .state
+                .change(|conditions| conditions.set_line(line, failure.into()));
             if began.elapsed() >= HELD {
                 backoff.reset();
             }
@@ -163,7 +165,11 @@ async fn connect(shared: &Shared, subscriptions: Option<Arc<Subscriptions>>) -> 
     let client = &shared.settings.client;
     let connection = client.get_multiplexed_async_connection_with_config(&config).await?;
     heard.note(Instant::now());
-    Ok(Session { connection, lost, heard })
+    Ok(Session {
+        connection,
+        lost,
+        heard,
+    })
 }
 
 /// A lost reader may have been too slow for the server: that would be seen nowhere else.

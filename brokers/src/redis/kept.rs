@@ -245,7 +245,9 @@ mod tests {
     }
 
     fn sequences(mirror: &Mirror, writer: u8) -> Vec<u64> {
-        let Some(value) = value(mirror, writer) else { return Vec::new() };
+        let Some(value) = value(mirror, writer) else {
+            return Vec::new();
+        };
         let (frames, damaged) = read_field(value, WriterId([writer; 16]));
         assert!(!damaged);
         frames.iter().map(|(_, frame)| frame.sequence()).collect()

@@ -81,7 +81,11 @@ impl Ledger {
     /// The server may have lost everything.
     pub(super) fn rewrite_all(&mut self) {
         let removed = self.pending.iter().filter(|key| !self.kept.contains_key(*key));
-        let mut all: VecDeque<String> = if self.clear_first { VecDeque::new() } else { removed.cloned().collect() };
+        let mut all: VecDeque<String> = if self.clear_first {
+            VecDeque::new()
+        } else {
+            removed.cloned().collect()
+        };
         all.extend(self.kept.keys().cloned());
         self.is_pending = all.iter().cloned().collect();
         self.pending = all;
@@ -154,7 +158,11 @@ impl Leases {
     pub(super) fn put(&self, key: &str, value: Bytes) {
         let taken = self.ledger.lock().put(key, value);
         if !taken {
-            tracing::warn!(key, limit = MAX_LEASES, "too many leases: this one does not survive a restart");
+            tracing::warn!(
+                key,
+                limit = MAX_LEASES,
+                "too many leases: this one does not survive a restart"
+            );
         }
         self.wake();
     }
@@ -214,7 +222,10 @@ fn judge(answers: redis::RedisResult<Vec<redis::Value>>) -> Result<(), Option<St
         _ => None,
     };
     match answers {
-        Ok(answers) => answers.into_iter().find_map(refusal).map_or(Ok(()), |why| Err(Some(why))),
+        Ok(answers) => answers
+            .into_iter()
+            .find_map(refusal)
+            .map_or(Ok(()), |why| Err(Some(why))),
         Err(_) => Err(None),
     }
 }
@@ -257,7 +268,11 @@ pub(super) async fn load(shared: &Shared, leases: &Leases) -> Result<Vec<(String
         .filter_map(|(key, value)| Some((String::from_utf8(key).ok()?, Bytes::from(value))))
         .collect();
     if loaded.len() > MAX_LEASES {
-        tracing::warn!(found = loaded.len(), limit = MAX_LEASES, "too many leases on the server: some are left out");
+        tracing::warn!(
+            found = loaded.len(),
+            limit = MAX_LEASES,
+            "too many leases on the server: some are left out"
+        );
         loaded.truncate(MAX_LEASES);
     }
     leases.ledger.lock().merge(&loaded);

@@ -159,7 +159,10 @@ impl Shared {
     fn met(&self, facts: ServerFacts, limits: Option<BufferLimits>) {
         let before = std::mem::replace(&mut *self.run_id.lock(), facts.run_id.clone());
         if before.is_some() && before != facts.run_id {
-            tracing::info!(server = facts.version, "redis was restarted: what is kept for late joiners is written again");
+            tracing::info!(
+                server = facts.version,
+                "redis was restarted: what is kept for late joiners is written again"
+            );
             self.mirror.lock().rewrite_all();
         }
         match limits {
@@ -239,7 +242,9 @@ impl RedisBroker {
     }
 
     fn start_flow(&self) {
-        let Some(Flow { flow, epoch, leases }) = &self.flow else { return };
+        let Some(Flow { flow, epoch, leases }) = &self.flow else {
+            return;
+        };
         let shared = || Arc::clone(&self.shared);
         let owner = Owner::new(shared(), Arc::clone(leases), flow.to_string(), *epoch);
         self.supervisor.spawn("redis-owner", TaskPolicy::MayEnd, owner.run());

@@ -75,7 +75,11 @@ impl Claim {
                 let value = other.strip_prefix("held ").unwrap_or(other);
                 let who = value.rsplit_once('/').map_or(value, |(who, _)| who);
                 // A newer life of the same node would read as this flow itself.
-                Self::Held(if who == flow { format!("{flow} with a newer epoch") } else { who.to_owned() })
+                Self::Held(if who == flow {
+                    format!("{flow} with a newer epoch")
+                } else {
+                    who.to_owned()
+                })
             }
         }
     }
@@ -129,7 +133,9 @@ impl Owner {
 
     /// Waits for something; should the scope run out meanwhile, gives it up and waits on.
     async fn or_give_up<F: Future>(&mut self, future: F) -> F::Output {
-        let Some(renewed) = self.renewed else { return future.await };
+        let Some(renewed) = self.renewed else {
+            return future.await;
+        };
         let mut future = std::pin::pin!(future);
         tokio::select! {
             biased;
@@ -200,11 +206,16 @@ pub(super) async fn release(shared: &Shared, flow: &str, epoch: u64) {
     if shared.state.read(|conditions| conditions.scope != Scope::Owned) {
         return;
     }
-    let Some(mut connection) = shared.commands_now() else { return };
+    let Some(mut connection) = shared.commands_now() else {
+        return;
+    };
     let script = RELEASE_OURS.key(shared.settings.names.owner());
     let released = async {
         let mut script = script;
-        script.arg(format!("{flow}/{epoch}")).invoke_async::<i64>(&mut connection).await
+        script
+            .arg(format!("{flow}/{epoch}"))
+            .invoke_async::<i64>(&mut connection)
+            .await
     };
     // Left behind, the key ends by itself.
     let _ = tokio::time::timeout(RELEASE, released).await;

@@ -276,12 +276,18 @@ mod tests {
         let waiting = taken.pop().unwrap();
         let later = waiting.since + Duration::from_millis(5);
         let mirror = Mutex::new(Mirror::default());
-        let keeper = Keeper { mirror: &mirror, line: Line::PublishSmall };
+        let keeper = Keeper {
+            mirror: &mirror,
+            line: Line::PublishSmall,
+        };
         let mut batch = Batch::with_capacity(1);
         batch.publish(waiting, &keeper, later);
         let commands: Vec<_> = batch.pipeline.cmd_iter().map(arguments).collect();
         assert_eq!(commands.len(), 1);
-        assert_eq!((&commands[0][0][..], &commands[0][1][..]), (&b"PUBLISH"[..], &b"p:t"[..]));
+        assert_eq!(
+            (&commands[0][0][..], &commands[0][1][..]),
+            (&b"PUBLISH"[..], &b"p:t"[..])
+        );
         let written = Frame::parse(Bytes::from(commands[0][2].clone())).unwrap();
         assert_eq!((written.sequence(), written.hops(), written.age_us()), (7, 2, 6_000));
         assert_eq!(written.payload(), frame(7).payload());
@@ -296,12 +302,19 @@ mod tests {
         let mut taken = Vec::new();
         outbox.take(Instant::now(), 10, 10_000, &mut taken);
         let mirror = Mutex::new(Mirror::default());
-        let keeper = Keeper { mirror: &mirror, line: Line::PublishSmall };
+        let keeper = Keeper {
+            mirror: &mirror,
+            line: Line::PublishSmall,
+        };
         let mut batch = Batch::with_capacity(3);
         for waiting in taken {
             batch.publish(waiting, &keeper, Instant::now());
         }
-        let names: Vec<_> = batch.pipeline.cmd_iter().map(|command| arguments(command)[0].clone()).collect();
+        let names: Vec<_> = batch
+            .pipeline
+            .cmd_iter()
+            .map(|command| arguments(command)[0].clone())
+            .collect();
         assert_eq!(names, [b"HSET".to_vec(), b"PUBLISH".to_vec(), b"PUBLISH".to_vec()]);
         let no: redis::Value = redis::parse_redis_value(b"-NOPERM no\r\n").unwrap();
         let refusals = batch.settle(&[redis::Value::Int(1), redis::Value::Int(0), no]);

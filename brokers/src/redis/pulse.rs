@@ -85,7 +85,11 @@ impl Pulse {
             None if now.saturating_duration_since(heard) >= ASK_AFTER => Look::Ask,
             Some(since) if !stalled => {
                 let allowance = self.silence + Duration::from_millis(bytes as u64 * 1000 / SLOWEST);
-                if now.saturating_duration_since(since.max(heard)) >= allowance { Look::Silent } else { Look::Fine }
+                if now.saturating_duration_since(since.max(heard)) >= allowance {
+                    Look::Silent
+                } else {
+                    Look::Fine
+                }
             }
             _ => Look::Fine,
         }
@@ -129,7 +133,11 @@ mod tests {
         pulse.expect(true, start + 1000 * MS);
         assert_eq!(pulse.look(start + 1500 * MS, start, 0), Look::Fine);
         assert_eq!(pulse.look(start + 2000 * MS, start, 0), Look::Silent);
-        assert_eq!(pulse.look(start + 2100 * MS, start + 1900 * MS, 0), Look::Fine, "something was heard");
+        assert_eq!(
+            pulse.look(start + 2100 * MS, start + 1900 * MS, 0),
+            Look::Fine,
+            "something was heard"
+        );
         pulse.expect(false, start + 2200 * MS);
         assert_eq!(pulse.look(start + 2200 * MS, start + 2200 * MS, 0), Look::Fine);
     }
@@ -140,7 +148,11 @@ mod tests {
         let mut pulse = Pulse::new(false, start);
         pulse.expect(true, start);
         for (after, expected) in [(700, Look::Fine), (1400, Look::Fine), (2100, Look::Silent)] {
-            assert_eq!(pulse.look(start + after * MS, start, 10_000_000), expected, "{after} ms");
+            assert_eq!(
+                pulse.look(start + after * MS, start, 10_000_000),
+                expected,
+                "{after} ms"
+            );
         }
     }
 

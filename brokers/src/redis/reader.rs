@@ -89,8 +89,14 @@ impl Reader {
     }
 
     fn set(&self, state: LineState) {
-        if self.shared.state.read(|conditions| *conditions.line(self.line) != state) {
-            self.shared.state.change(|conditions| conditions.set_line(self.line, state));
+        if self
+            .shared
+            .state
+            .read(|conditions| *conditions.line(self.line) != state)
+        {
+            self.shared
+                .state
+                .change(|conditions| conditions.set_line(self.line, state));
         }
     }
 
@@ -229,9 +235,18 @@ pub(super) async fn read_kept(mut connection: MultiplexedConnection, hash: &str)
     let value = match answer {
         Ok(Ok(value)) => value,
         Ok(Err(error)) => return Err(BrokerError::Away(error.to_string())),
-        Err(_) => return Err(BrokerError::Away("what is kept for late joiners was not read in time".to_owned())),
+        Err(_) => {
+            return Err(BrokerError::Away(
+                "what is kept for late joiners was not read in time".to_owned(),
+            ));
+        }
     };
-    Ok(kept_messages(server::pairs(value), hash, unix_time_ns(), Instant::now()))
+    Ok(kept_messages(
+        server::pairs(value),
+        hash,
+        unix_time_ns(),
+        Instant::now(),
+    ))
 }
 
 fn kept_messages(fields: Vec<(Vec<u8>, Vec<u8>)>, hash: &str, now_ns: u64, now: Instant) -> Vec<Received> {
@@ -289,7 +304,10 @@ mod tests {
         let field = |writer: u8| WriterId([writer; 16]).to_string().into_bytes();
         let fields = vec![
             (field(1), [entry(1, 1, 1_000), entry(1, 2, 4_000_000)].concat()),
-            (field(2), [entry(2, 7, 2_000_000), entry(2, 7, 2_000_000), entry(2, 8, 5_000_000)].concat()),
+            (
+                field(2),
+                [entry(2, 7, 2_000_000), entry(2, 7, 2_000_000), entry(2, 8, 5_000_000)].concat(),
+            ),
             (b"no writer".to_vec(), entry(3, 1, 1)),
         ];
         let found: Vec<_> = kept_messages(fields, "h", 6_000_000, Instant::now())

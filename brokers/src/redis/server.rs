@@ -132,7 +132,10 @@ mod tests {
     fn redis_and_valkey_tell_their_versions() {
         let redis = "# Server\r\nredis_version:7.0.15\r\nredis_git_sha1:0\r\nrun_id:abc\r\n";
         let facts = ServerFacts::parse(redis);
-        assert_eq!((facts.version.as_str(), facts.run_id.as_deref()), ("redis 7.0.15", Some("abc")));
+        assert_eq!(
+            (facts.version.as_str(), facts.run_id.as_deref()),
+            ("redis 7.0.15", Some("abc"))
+        );
         let valkey = "# Server\r\nredis_version:7.2.4\r\nserver_name:valkey\r\nvalkey_version:9.1.2\r\nrun_id:d\r\n";
         assert_eq!(ServerFacts::parse(valkey).version, "valkey 9.1.2");
         assert_eq!(ServerFacts::parse("").version, "redis");

@@ -7,7 +7,7 @@ use std::time::Duration;
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::RedisBroker as Section;
 use redis::io::tcp::TcpSettings;
-use redis::{ConnectionAddr, ConnectionInfo, IntoConnectionInfo, ProtocolVersion};
+use redis::{ConnectionInfo, IntoConnectionInfo, ProtocolVersion};
 
 use crate::open::OpenError;
 
@@ -96,13 +96,13 @@ fn secure(info: ConnectionInfo, section: &Section) -> Result<redis::Client, Open
     // Without effect where the program has chosen one already.
     let _ = rustls::crypto::aws_lc_rs::default_provider().install_default();
     let address = match info.addr() {
-        ConnectionAddr::Tcp(host, port) => ConnectionAddr::TcpTls {
+        redis::ConnectionAddr::Tcp(host, port) => redis::ConnectionAddr::TcpTls {
             host: host.clone(),
             port: *port,
             insecure: false,
             tls_params: None,
         },
-        ConnectionAddr::Unix(_) => return Err(fault("redis.tls", "a unix socket has no TLS")),
+        redis::ConnectionAddr::Unix(_) => return Err(fault("redis.tls", "a unix socket has no TLS")),
         other => other.clone(),
     };
     let files = section.tls.clone().unwrap_or_default();
@@ -116,7 +116,10 @@ fn secure(info: ConnectionInfo, section: &Section) -> Result<redis::Client, Open
     let client_key = bytes("redis.tls.key_file", &files.key_file)?;
     let client_tls = client_cert
         .zip(client_key)
-        .map(|(client_cert, client_key)| redis::ClientTlsConfig { client_cert, client_key });
+        .map(|(client_cert, client_key)| redis::ClientTlsConfig {
+            client_cert,
+            client_key,
+        });
     let certificates = redis::TlsCertificates { client_tls, root_cert };
     redis::Client::build_with_tls(info.set_addr(address), certificates)
         .map_err(|error| fault("redis.tls", error.to_string()))

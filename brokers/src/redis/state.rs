@@ -119,7 +119,13 @@ struct Verdict {
 
 impl Conditions {
     fn new(scope: Scope, place: String) -> Self {
-        let start = |line: Line| if line.is_core() { LineState::Starting } else { LineState::Unused };
+        let start = |line: Line| {
+            if line.is_core() {
+                LineState::Starting
+            } else {
+                LineState::Unused
+            }
+        };
         Self {
             lines: Line::ALL.map(start),
             scope,
@@ -327,7 +333,11 @@ mod tests {
         assert_eq!(c.health(), (Health::Up, "redis 7".to_owned()));
         assert!(c.accepts(Line::PublishSmall) && !c.accepts(Line::PublishLarge));
         c.set_line(Line::PublishLarge, LineState::Starting);
-        assert_eq!(c.health().0, Health::Up, "a connection that is first needed now takes nothing away");
+        assert_eq!(
+            c.health().0,
+            Health::Up,
+            "a connection that is first needed now takes nothing away"
+        );
         assert!(c.accepts(Line::PublishLarge));
         c.set_line(Line::PublishLarge, LineState::Away("refused".to_owned()));
         assert_eq!(c.health(), (Health::Down, "host:1: refused".to_owned()));
@@ -338,7 +348,10 @@ mod tests {
     fn a_server_that_was_never_there_is_connecting_and_one_that_says_no_is_down() {
         let mut c = conditions(Scope::Free);
         c.set_line(Line::ReadSmall, LineState::Away("connection refused".to_owned()));
-        assert_eq!(c.health(), (Health::Connecting, "host:1: connection refused".to_owned()));
+        assert_eq!(
+            c.health(),
+            (Health::Connecting, "host:1: connection refused".to_owned())
+        );
         c.set_line(Line::PublishSmall, LineState::Refused("WRONGPASS".to_owned()));
         assert_eq!(c.health(), (Health::Down, "host:1: WRONGPASS".to_owned()));
     }
@@ -365,7 +378,10 @@ mod tests {
         let mut c = up(Scope::Owned);
         assert_eq!(c.health().0, Health::Up);
         c.stand_back = Some("fog/first".to_owned());
-        assert_eq!(c.health(), (Health::InUse, "scope_in_use: fog/first holds it".to_owned()));
+        assert_eq!(
+            c.health(),
+            (Health::InUse, "scope_in_use: fog/first holds it".to_owned())
+        );
         assert!(!c.accepts(Line::PublishSmall));
     }
 
@@ -379,7 +395,10 @@ mod tests {
         }
         c.set_line(Line::PublishSmall, LineState::Away("reset".to_owned()));
         c.set_line(Line::PublishSmall, LineState::Up);
-        assert_eq!(c.health(), (Health::Up, "redis 7; reading was interrupted 2 times".to_owned()));
+        assert_eq!(
+            c.health(),
+            (Health::Up, "redis 7; reading was interrupted 2 times".to_owned())
+        );
         c.closed = true;
         assert_eq!(c.health().0, Health::Closed);
     }

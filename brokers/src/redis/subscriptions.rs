@@ -63,7 +63,11 @@ impl Held {
     fn push(&mut self, message: Received) {
         self.bytes += message.content.size();
         self.messages.push_back(message);
-        let SubscribeOptions { max_messages, max_bytes, .. } = self.options;
+        let SubscribeOptions {
+            max_messages,
+            max_bytes,
+            ..
+        } = self.options;
         while self.messages.len() > 1 && (self.messages.len() > max_messages || self.bytes > max_bytes) {
             let oldest = self.messages.pop_front();
             self.bytes -= oldest.map_or(0, |message| message.content.size());
@@ -259,13 +263,18 @@ impl Subscriptions {
         let Ok(name) = std::str::from_utf8(name) else { return };
         let payload = Bytes::from(payload);
         let mut channels = self.channels.lock();
-        let Some(channel) = channels.by_name.get_mut(name) else { return };
+        let Some(channel) = channels.by_name.get_mut(name) else {
+            return;
+        };
         // One that is to be subscribed anew was left before: what still comes is of the time before.
         if channel.stage == Stage::Asked || channel.readers.is_empty() {
             return;
         }
         let content = if channel.reserved {
-            Content::Bare { payload, identity: None }
+            Content::Bare {
+                payload,
+                identity: None,
+            }
         } else {
             Content::from_bytes(payload)
         };
@@ -349,7 +358,9 @@ impl Subscriptions {
     /// The server does not let us read a channel: its readers end.
     pub(super) fn refuse(&self, name: &Name, why: &str) {
         let mut channels = self.channels.lock();
-        let Some(channel) = self.remove(&mut channels, name) else { return };
+        let Some(channel) = self.remove(&mut channels, name) else {
+            return;
+        };
         for waiting in channel.waiting {
             let _ = waiting.send(Err(BrokerError::Name {
                 channel: name.to_string(),

@@ -37,7 +37,10 @@ fn names(names: &[&str]) -> Vec<Name> {
 
 fn frame(writer: u8, sequence: u64) -> Vec<u8> {
     let header = Header::new("t", Origin::default(), WriterId([writer; 16]), sequence, 0);
-    Frame::new(&header, Bytes::from_static(b"x")).unwrap().to_bytes().to_vec()
+    Frame::new(&header, Bytes::from_static(b"x"))
+        .unwrap()
+        .to_bytes()
+        .to_vec()
 }
 
 fn received(writer: u8, sequence: u64) -> Received {
@@ -80,7 +83,10 @@ fn readers_of_one_channel_share_its_subscription() {
     assert_eq!(one.confirmation.try_recv(), Ok(Ok(())));
     deliver(&registry, "a", b"hello");
     deliver(&registry, "b", b"not ours");
-    assert_eq!((waiting(&mut first), waiting(&mut second)), (vec!["hello".to_owned()], vec!["hello".to_owned()]));
+    assert_eq!(
+        (waiting(&mut first), waiting(&mut second)),
+        (vec!["hello".to_owned()], vec!["hello".to_owned()])
+    );
     let (_third, mut three) = add(&registry, "a");
     assert_eq!(three.confirmation.try_recv(), Ok(Ok(())), "it is subscribed already");
 }
@@ -129,9 +135,14 @@ fn after_a_lost_connection_all_is_subscribed_again() {
     let (_b, mut two) = add(&registry, "b");
     assert!(matches!(registry.take_work(), Some(Work::Subscribe(names)) if names.len() == 2));
     registry.fail_waiting("gone");
-    assert_eq!(two.confirmation.try_recv(), Ok(Err(BrokerError::Away("gone".to_owned()))));
+    assert_eq!(
+        two.confirmation.try_recv(),
+        Ok(Err(BrokerError::Away("gone".to_owned())))
+    );
     registry.forget_server();
-    let Some(Work::Subscribe(mut again)) = registry.take_work() else { panic!("nothing is asked") };
+    let Some(Work::Subscribe(mut again)) = registry.take_work() else {
+        panic!("nothing is asked")
+    };
     again.sort();
     assert_eq!(again, names(&["a", "b"]));
 }
@@ -155,7 +166,12 @@ fn channels_are_bounded_over_all_connections() {
     let (_reader, _added) = add(&small, "a");
     let (_same, _added) = add(&small, "a");
     let (sender, _subscription) = subscription(SubscribeOptions::default());
-    let refused = large.add(&Arc::from("b"), &"b".parse().unwrap(), sender, SubscribeOptions::default());
+    let refused = large.add(
+        &Arc::from("b"),
+        &"b".parse().unwrap(),
+        sender,
+        SubscribeOptions::default(),
+    );
     assert_eq!(refused.err(), Some(BrokerError::TooManyChannels(MAX_CHANNELS)));
     small.close();
     add(&large, "b");
@@ -208,5 +224,8 @@ fn reserved_channels_are_bare_whatever_they_carry() {
     for name in ["blaze/flow/control", "a"] {
         deliver(&registry, name, b"BLZ1");
     }
-    assert_eq!((waiting(&mut control), waiting(&mut user)), (vec!["BLZ1".to_owned()], vec!["malformed".to_owned()]));
+    assert_eq!(
+        (waiting(&mut control), waiting(&mut user)),
+        (vec!["BLZ1".to_owned()], vec!["malformed".to_owned()])
+    );
 }

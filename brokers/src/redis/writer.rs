@@ -121,9 +121,7 @@ impl Writer {
     }
 
     fn messages(&mut self, now: Instant) -> Option<Batch> {
-        self.gate
-            .outbox
-            .take(now, BATCH_MESSAGES, BATCH_BYTES, &mut self.taken);
+        self.gate.outbox.take(now, BATCH_MESSAGES, BATCH_BYTES, &mut self.taken);
         if self.taken.is_empty() {
             return None;
         }
@@ -151,7 +149,9 @@ impl Writer {
     fn fill(&mut self, flight: &mut Flight) {
         while self.gate.is_open() && flight.has_room() {
             let busy = self.gate.busy();
-            let Some(batch) = self.next_batch(Instant::now()) else { return };
+            let Some(batch) = self.next_batch(Instant::now()) else {
+                return;
+            };
             flight.send(batch, busy);
         }
     }
@@ -171,7 +171,10 @@ impl Writer {
 
     fn complain(&mut self, why: &str) {
         let now = Instant::now();
-        if self.complained.is_none_or(|at| now.duration_since(at) >= COMPLAIN_EVERY) {
+        if self
+            .complained
+            .is_none_or(|at| now.duration_since(at) >= COMPLAIN_EVERY)
+        {
             tracing::warn!(
                 connection = self.line.name(),
                 refused = self.refused,
@@ -184,8 +187,14 @@ impl Writer {
     }
 
     fn set(&self, state: LineState) {
-        if self.shared.state.read(|conditions| *conditions.line(self.line) != state) {
-            self.shared.state.change(|conditions| conditions.set_line(self.line, state));
+        if self
+            .shared
+            .state
+            .read(|conditions| *conditions.line(self.line) != state)
+        {
+            self.shared
+                .state
+                .change(|conditions| conditions.set_line(self.line, state));
         }
     }
 
