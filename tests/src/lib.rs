@@ -3,6 +3,7 @@
 pub mod admin;
 pub mod network;
 pub mod process;
+pub mod servers;
 pub mod wait;
 
 /// Whether the full counts are wanted (`scripts/test --long`).
