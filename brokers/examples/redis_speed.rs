@@ -26,8 +26,13 @@ const RUN: Duration = Duration::from_secs(5);
 const AHEAD: u64 = 8_192;
 
 fn main() {
-    let url = std::env::args().nth(1).unwrap_or_else(|| "redis://127.0.0.1:6379".to_owned());
-    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().unwrap();
+    let url = std::env::args()
+        .nth(1)
+        .unwrap_or_else(|| "redis://127.0.0.1:6379".to_owned());
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .unwrap();
     runtime.block_on(async {
         let (source, sink) = (open(&url).await, open(&url).await);
         println!("server: {}", source.status().borrow().detail);
@@ -47,10 +52,13 @@ async fn open(url: &str) -> RedisBroker {
     };
     let broker = RedisBroker::open(&section, &Role::Service).unwrap();
     let mut status = broker.status();
-    tokio::time::timeout(Duration::from_secs(5), status.wait_for(|status| status.health == Health::Up))
-        .await
-        .unwrap()
-        .unwrap();
+    tokio::time::timeout(
+        Duration::from_secs(5),
+        status.wait_for(|status| status.health == Health::Up),
+    )
+    .await
+    .unwrap()
+    .unwrap();
     broker
 }
 
@@ -78,7 +86,9 @@ async fn throughput(source: &RedisBroker, sink: Option<&RedisBroker>) -> String 
     };
     let publisher = source.publisher(&name, PublisherOptions::default()).unwrap();
     let counting = reader.map(|reader| tokio::task::spawn_blocking(move || count(reader)));
-    let (sent, took) = tokio::task::spawn_blocking(move || produce(publisher.as_ref())).await.unwrap();
+    let (sent, took) = tokio::task::spawn_blocking(move || produce(publisher.as_ref()))
+        .await
+        .unwrap();
     let rate = sent as f64 / took.as_secs_f64();
     match counting {
         None => format!("{rate:.0} messages/s ({sent} in {took:.2?})"),
@@ -100,7 +110,10 @@ fn produce(publisher: &dyn Publisher) -> (u64, Duration) {
         }
         for _ in 0..64 {
             sequence += 1;
-            assert_eq!(publisher.publish(&frame(sequence, &payload), None), PublishOutcome::Taken);
+            assert_eq!(
+                publisher.publish(&frame(sequence, &payload), None),
+                PublishOutcome::Taken
+            );
         }
     }
     while publisher.later().queued > 0 {
@@ -127,7 +140,11 @@ async fn delays(source: &RedisBroker, sink: &RedisBroker, with_large: bool) -> S
     let name = channel("speed/small");
     let mut reader = sink.subscribe(&name, SubscribeOptions::default()).await.unwrap();
     let publisher = source.publisher(&name, PublisherOptions::default()).unwrap();
-    let large = if with_large { Some(stream_large(source, sink).await) } else { None };
+    let large = if with_large {
+        Some(stream_large(source, sink).await)
+    } else {
+        None
+    };
     let base = Instant::now();
     let mut ticks = tokio::time::interval(Duration::from_millis(5));
     let mut found: Vec<Duration> = Vec::new();

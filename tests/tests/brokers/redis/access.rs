@@ -54,7 +54,10 @@ async fn a_user_of_the_access_list_is_enough() {
     let Err(BrokerError::Name { channel, reason }) = refused else {
         panic!("it may not be read");
     };
-    assert!(channel == "c:imu" && reason.to_uppercase().contains("PERM"), "{channel}: {reason}");
+    assert!(
+        channel == "c:imu" && reason.to_uppercase().contains("PERM"),
+        "{channel}: {reason}"
+    );
 }
 
 /// A refused login is told in the server's words, without the password.
@@ -113,7 +116,11 @@ async fn a_unix_socket_is_as_good() {
             ..RedisOptions::default()
         },
     );
-    let broker = open(&json!({ "url": format!("redis+unix://{}", socket.display()) }), &Role::Service).unwrap();
+    let broker = open(
+        &json!({ "url": format!("redis+unix://{}", socket.display()) }),
+        &Role::Service,
+    )
+    .unwrap();
     wait_for(&broker, Health::Up).await;
     let mut reader = subscribe(&broker, "imu").await;
     publish(publisher(&broker, "imu", 0).as_ref(), 1, 1);
@@ -137,10 +144,22 @@ async fn prefixes_keep_scopes_apart() {
     let (mut first, mut second) = (subscribe(&one, "imu").await, subscribe(&two, "imu").await);
     publish(publisher(&one, "imu", 1).as_ref(), 1, 1);
     publish(publisher(&two, "imu", 1).as_ref(), 2, 1);
-    assert_eq!((next_number(&mut first).await, next_number(&mut second).await), ((1, 1), (2, 1)));
-    let mut keys: Vec<_> = server.cli(&["KEYS", "*"]).split_whitespace().map(str::to_owned).collect();
+    assert_eq!(
+        (next_number(&mut first).await, next_number(&mut second).await),
+        ((1, 1), (2, 1))
+    );
+    let mut keys: Vec<_> = server
+        .cli(&["KEYS", "*"])
+        .split_whitespace()
+        .map(str::to_owned)
+        .collect();
     keys.sort();
-    let expected = ["one:blaze:flow:owner", "one:blaze:last:imu", "two:blaze:flow:owner", "two:blaze:last:imu"];
+    let expected = [
+        "one:blaze:flow:owner",
+        "one:blaze:last:imu",
+        "two:blaze:flow:owner",
+        "two:blaze:last:imu",
+    ];
     assert_eq!(keys, expected);
 }
 
@@ -148,10 +167,16 @@ async fn prefixes_keep_scopes_apart() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn bad_settings_are_told_at_once() {
     let cases = [
-        (json!({ "url": "redis://h:1", "password_file": "/nowhere/password" }), "redis.password_file"),
+        (
+            json!({ "url": "redis://h:1", "password_file": "/nowhere/password" }),
+            "redis.password_file",
+        ),
         (json!({ "url": "redis://user:secret@h:99999" }), "redis.url"),
         (json!({ "url": "redis+unix:///s", "tls": {} }), "redis.tls"),
-        (json!({ "url": "rediss://h:1", "tls": { "ca_file": "/nowhere/ca" } }), "redis.tls.ca_file"),
+        (
+            json!({ "url": "rediss://h:1", "tls": { "ca_file": "/nowhere/ca" } }),
+            "redis.tls.ca_file",
+        ),
     ];
     for (section, expected) in cases {
         match open(&section, &Role::Service).err() {

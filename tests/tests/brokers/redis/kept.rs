@@ -28,7 +28,11 @@ async fn late_joiners_get_an_unbroken_row() {
         let mut late = subscribe_with_kept(&sink, "map").await;
         let (_, first) = next_number(&mut late).await;
         for expected in first + 1..first + 100 {
-            assert_eq!(next_number(&mut late).await, (1, expected), "round {round}, from {first}");
+            assert_eq!(
+                next_number(&mut late).await,
+                (1, expected),
+                "round {round}, from {first}"
+            );
         }
     }
     drop(stop);
@@ -64,7 +68,13 @@ async fn a_forgotten_writer_stays_forgotten() {
     publish(gone.as_ref(), 2, 1);
     settled(kept.as_ref()).await;
     settled(gone.as_ref()).await;
-    let fields = || server.cli(&["HKEYS", "blaze:last:map"]).split_whitespace().map(str::to_owned).collect::<Vec<_>>();
+    let fields = || {
+        server
+            .cli(&["HKEYS", "blaze:last:map"])
+            .split_whitespace()
+            .map(str::to_owned)
+            .collect::<Vec<_>>()
+    };
     assert_eq!(fields().len(), 2);
     flow.flow_side().unwrap().forget_writer(&channel("map"), writer(2));
     let only_the_first = || (fields() == [writer(1).to_string()]).then_some(());
@@ -84,7 +94,10 @@ async fn a_restarted_server_gets_back_what_a_service_keeps() {
     }
     settled(publisher.as_ref()).await;
     server.server.restart().unwrap();
-    eventually("the field is back", || (server.cli(&["HLEN", "blaze:last:map"]).trim() == "1").then_some(())).await;
+    eventually("the field is back", || {
+        (server.cli(&["HLEN", "blaze:last:map"]).trim() == "1").then_some(())
+    })
+    .await;
     wait_for(&sink, Health::Up).await;
     let mut late = subscribe_with_kept(&sink, "map").await;
     assert_eq!(next_number(&mut late).await, (1, 2));

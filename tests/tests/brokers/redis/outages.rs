@@ -29,12 +29,19 @@ async fn a_frozen_server_is_noticed_and_nothing_comes_twice() {
             if publisher.publish(&frame(1, sequence, 100), None) == PublishOutcome::Taken {
                 taken.push(sequence);
             } else if source.status().borrow().health == Health::Down {
-                assert!(frozen.elapsed() < Duration::from_secs(3), "down after {:?}", frozen.elapsed());
+                assert!(
+                    frozen.elapsed() < Duration::from_secs(3),
+                    "down after {:?}",
+                    frozen.elapsed()
+                );
                 break;
             }
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
-        assert_eq!(wait_for(&sink, Health::Down).await, format!("127.0.0.1:{} does not answer", server.server.port()));
+        assert_eq!(
+            wait_for(&sink, Health::Down).await,
+            format!("127.0.0.1:{} does not answer", server.server.port())
+        );
         assert!(matches!(
             sink.subscribe(&channel("other"), SubscribeOptions::default()).await,
             Err(BrokerError::Away(_))
@@ -42,7 +49,10 @@ async fn a_frozen_server_is_noticed_and_nothing_comes_twice() {
         // Up to the end of the freeze nothing is taken.
         while frozen.elapsed() < Duration::from_secs(5) {
             sequence += 1;
-            assert_eq!(publisher.publish(&frame(1, sequence, 100), None), PublishOutcome::Dropped);
+            assert_eq!(
+                publisher.publish(&frame(1, sequence, 100), None),
+                PublishOutcome::Dropped
+            );
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
         server.server.thaw().unwrap();
@@ -53,12 +63,19 @@ async fn a_frozen_server_is_noticed_and_nothing_comes_twice() {
         let found = numbers_until_silence(&mut reader).await;
         assert_eq!(found.last(), Some(&after));
         assert!(found.is_sorted_by(|a, b| a < b), "{found:?}");
-        let late: Vec<_> = found.iter().filter(|&&number| number != after && !taken.contains(&number)).collect();
+        let late: Vec<_> = found
+            .iter()
+            .filter(|&&number| number != after && !taken.contains(&number))
+            .collect();
         assert!(late.is_empty(), "dropped and delivered: {late:?}");
         let later = publisher.later();
         let delivered = found.len() as u64 - 1;
         assert_eq!(later.queued, 0);
-        assert_eq!(delivered + later.dropped(), taken.len() as u64, "each is delivered or counted: {later:?}");
+        assert_eq!(
+            delivered + later.dropped(),
+            taken.len() as u64,
+            "each is delivered or counted: {later:?}"
+        );
     }
 }
 
@@ -86,7 +103,10 @@ async fn a_killed_server_loses_nothing_uncounted() {
         })
         .await;
         assert!(later.dropped() - before.dropped() <= taken);
-        assert!(later.broker_error > before.broker_error, "what was under way is counted: {later:?}");
+        assert!(
+            later.broker_error > before.broker_error,
+            "what was under way is counted: {later:?}"
+        );
         server.server.restart().unwrap();
         wait_for(&source, Health::Up).await;
     }
@@ -127,7 +147,11 @@ async fn a_reader_that_is_cut_off_comes_back() {
     assert!(detail.starts_with("redis 7.0.15; reading was interrupted"), "{detail}");
     let mut small = subscribe(&sink, "imu").await;
     publish(self::publisher(&source, "imu", 0).as_ref(), 1, 1);
-    assert_eq!(next_number(&mut small).await, (1, 1), "small topics have a connection of their own");
+    assert_eq!(
+        next_number(&mut small).await,
+        (1, 1),
+        "small topics have a connection of their own"
+    );
     let mut sequence = 100;
     let until = Instant::now() + DEADLINE;
     loop {
@@ -153,7 +177,11 @@ async fn closed_connections_are_made_again() {
         server.cli(&["CLIENT", "KILL", "TYPE", "pubsub"]);
         eventually("the interruption is counted", || {
             let status = sink.status().borrow().clone();
-            let count = if round == 1 { "once".to_owned() } else { format!("{round} times") };
+            let count = if round == 1 {
+                "once".to_owned()
+            } else {
+                format!("{round} times")
+            };
             (status.health == Health::Up && status.detail.ends_with(&count)).then_some(())
         })
         .await;
@@ -175,7 +203,10 @@ async fn a_server_may_come_later() {
         status.detail.contains("refused").then_some(status.detail)
     })
     .await;
-    assert!(detail.starts_with(&format!("127.0.0.1:{}", server.server.port())), "{detail}");
+    assert!(
+        detail.starts_with(&format!("127.0.0.1:{}", server.server.port())),
+        "{detail}"
+    );
     let publisher = publisher(&broker, "imu", 0);
     assert_eq!(publisher.publish(&frame(1, 1, 10), None), PublishOutcome::Dropped);
     server.server.restart().unwrap();

@@ -18,13 +18,19 @@ fn owner(server: &Server) -> String {
 fn leases(server: &Server) -> Vec<(String, String)> {
     let text = server.cli(&["HGETALL", "blaze:flow:leases"]);
     let lines: Vec<&str> = text.lines().filter(|line| !line.is_empty()).collect();
-    let mut found: Vec<_> = lines.chunks(2).map(|pair| (pair[0].to_owned(), pair[1].to_owned())).collect();
+    let mut found: Vec<_> = lines
+        .chunks(2)
+        .map(|pair| (pair[0].to_owned(), pair[1].to_owned()))
+        .collect();
     found.sort();
     found
 }
 
 fn pairs(pairs: &[(&str, &str)]) -> Vec<(String, String)> {
-    pairs.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
+    pairs
+        .iter()
+        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
+        .collect()
 }
 
 /// The first flow has the scope; another neither reads nor writes until the first has gone.
@@ -36,7 +42,10 @@ async fn a_scope_has_one_flow() {
         wait_for(&first, Health::Up).await;
         assert_eq!(owner(&server), "edge/robot-1/7");
         let second = server.flow("edge/robot-2", 9);
-        assert_eq!(wait_for(&second, Health::InUse).await, "scope_in_use: edge/robot-1 holds it");
+        assert_eq!(
+            wait_for(&second, Health::InUse).await,
+            "scope_in_use: edge/robot-1 holds it"
+        );
         let waiting = publisher(&second, "imu", 0);
         assert_eq!(waiting.publish(&frame(2, 1, 10), None), PublishOutcome::Dropped);
         let refused = second.subscribe(&channel("imu"), SubscribeOptions::default()).await;
@@ -45,7 +54,10 @@ async fn a_scope_has_one_flow() {
         first.close().await;
         let closed = Instant::now();
         wait_for(&second, Health::Up).await;
-        assert!(closed.elapsed() < Duration::from_secs(3), "a closed flow leaves no key behind");
+        assert!(
+            closed.elapsed() < Duration::from_secs(3),
+            "a closed flow leaves no key behind"
+        );
         assert_eq!(owner(&server), "edge/robot-2/9");
         let mut reader = subscribe(&second, "imu").await;
         publish(waiting.as_ref(), 2, 2);
@@ -72,7 +84,10 @@ async fn a_newer_life_takes_over() {
     let new_publisher = publisher(&new, "imu", 0);
     publish(new_publisher.as_ref(), 2, 1);
     settled(new_publisher.as_ref()).await;
-    assert!(numbers_until_silence(&mut reader).await.is_empty(), "the old life reads nothing");
+    assert!(
+        numbers_until_silence(&mut reader).await.is_empty(),
+        "the old life reads nothing"
+    );
     new.close().await;
     wait_for(&old, Health::Up).await;
     publish(old_publisher.as_ref(), 1, 2);
@@ -91,7 +106,10 @@ async fn a_dead_flow_is_succeeded() {
     let died = Instant::now();
     wait_for(&second, Health::Up).await;
     let passed = died.elapsed();
-    assert!(passed > Duration::from_secs(3) && passed < Duration::from_secs(8), "{passed:?}");
+    assert!(
+        passed > Duration::from_secs(3) && passed < Duration::from_secs(8),
+        "{passed:?}"
+    );
 }
 
 /// A flow whose server is frozen stops before its key has run out, and is the owner again afterwards.
@@ -109,7 +127,10 @@ async fn a_frozen_server_costs_the_scope_only_for_the_time() {
     server.server.thaw().unwrap();
     wait_for(&flow, Health::Up).await;
     assert_eq!(owner(&server), "edge/robot-1/1");
-    eventually("the lease is written", || (leases(&server) == pairs(&[("while-frozen", "1")])).then_some(())).await;
+    eventually("the lease is written", || {
+        (leases(&server) == pairs(&[("while-frozen", "1")])).then_some(())
+    })
+    .await;
 }
 
 /// Leases are written in order, survive the flow, and come back after the server has lost everything.
@@ -136,7 +157,13 @@ async fn leases_survive_flow_and_server() {
         let side = second.flow_side().unwrap();
         let mut loaded = side.load_leases().await.unwrap();
         loaded.sort();
-        assert_eq!(loaded, [("a".to_owned(), Bytes::from_static(b"2")), ("c".to_owned(), Bytes::from_static(b"1"))]);
+        assert_eq!(
+            loaded,
+            [
+                ("a".to_owned(), Bytes::from_static(b"2")),
+                ("c".to_owned(), Bytes::from_static(b"1"))
+            ]
+        );
         server.cli(&["FLUSHALL"]);
         eventually("after a flush", || (leases(&server) == expected).then_some(())).await;
         server.server.kill().unwrap();
@@ -162,10 +189,16 @@ async fn what_is_kept_survives_a_flush() {
     }
     settled(publisher.as_ref()).await;
     server.cli(&["FLUSHALL"]);
-    eventually("the field is back", || (server.cli(&["HLEN", "blaze:last:map"]).trim() == "1").then_some(())).await;
+    eventually("the field is back", || {
+        (server.cli(&["HLEN", "blaze:last:map"]).trim() == "1").then_some(())
+    })
+    .await;
     let late = server.service().await;
     let mut reader = super::support::subscribe_with_kept(&late, "map").await;
-    assert_eq!((next_number(&mut reader).await, next_number(&mut reader).await), ((1, 2), (1, 3)));
+    assert_eq!(
+        (next_number(&mut reader).await, next_number(&mut reader).await),
+        ((1, 2), (1, 3))
+    );
 }
 
 /// A flow that is told to gives way and comes back.

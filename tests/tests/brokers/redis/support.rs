@@ -170,7 +170,10 @@ pub(super) fn publisher(broker: &dyn Broker, name: &str, depth: u32) -> Arc<dyn 
 
 /// Publishes and insists that it is taken.
 pub(super) fn publish(publisher: &dyn Publisher, number: u8, sequence: u64) {
-    assert_eq!(publisher.publish(&frame(number, sequence, 100), None), PublishOutcome::Taken);
+    assert_eq!(
+        publisher.publish(&frame(number, sequence, 100), None),
+        PublishOutcome::Taken
+    );
 }
 
 /// Waits until the server has all that was taken.
@@ -180,7 +183,10 @@ pub(super) async fn settled(publisher: &dyn Publisher) {
 }
 
 pub(super) async fn subscribe(broker: &dyn Broker, name: &str) -> Subscription {
-    broker.subscribe(&channel(name), SubscribeOptions::default()).await.unwrap()
+    broker
+        .subscribe(&channel(name), SubscribeOptions::default())
+        .await
+        .unwrap()
 }
 
 pub(super) async fn subscribe_with_kept(broker: &dyn Broker, name: &str) -> Subscription {
@@ -210,7 +216,10 @@ pub(super) async fn next_number(subscription: &mut Subscription) -> (u8, u64) {
 /// What comes until nothing comes any more.
 pub(super) async fn numbers_until_silence(subscription: &mut Subscription) -> Vec<u64> {
     let mut batch = Vec::new();
-    while tokio::time::timeout(SILENCE, subscription.receive(&mut batch, 1000)).await.is_ok_and(|count| count > 0) {}
+    while tokio::time::timeout(SILENCE, subscription.receive(&mut batch, 1000))
+        .await
+        .is_ok_and(|count| count > 0)
+    {}
     let number = |message: &Received| match &message.content {
         Content::Frame(frame) => frame.sequence(),
         other => panic!("{other:?}"),
