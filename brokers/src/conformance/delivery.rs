@@ -114,7 +114,11 @@ pub async fn framed_payloads_arrive_as_they_are(fixture: &dyn Fixture) -> Outcom
         // The age grows by what the message waited for its adapter.
         let waited = found.age_us().checked_sub(sent.age_us());
         if waited.is_none_or(|waited| u128::from(waited) > DEADLINE.as_micros()) {
-            return Err(format!("sent with an age of {} µs, it came with {} µs", sent.age_us(), found.age_us()));
+            return Err(format!(
+                "sent with an age of {} µs, it came with {} µs",
+                sent.age_us(),
+                found.age_us()
+            ));
         }
     }
     Ok(())

@@ -141,7 +141,7 @@ impl Mirror {
     /// Takes a frame in as the newest of its writer, and gives the field that is to be written before it is published.
     pub(super) fn keep(
         &mut self,
-        key: FieldKey,
+        key: &FieldKey,
         frame: KeptFrame,
         depth: usize,
         line: Line,
@@ -167,7 +167,7 @@ impl Mirror {
             let Some((_, field)) = self.fields.pop_lru() else { break };
             self.bytes -= field.bytes;
         }
-        self.fields.peek(&key)
+        self.fields.peek(key)
     }
 
     /// Forgets a writer.
@@ -236,7 +236,7 @@ mod tests {
 
     fn keep(mirror: &mut Mirror, writer: u8, sequence: u64, bytes: usize, depth: usize) {
         let frame = kept(&frame(writer, sequence, bytes), sequence);
-        mirror.keep(key(writer), frame, depth, Line::PublishSmall, Weak::new());
+        mirror.keep(&key(writer), frame, depth, Line::PublishSmall, Weak::new());
     }
 
     fn value(mirror: &Mirror, writer: u8) -> Option<Bytes> {
@@ -291,7 +291,7 @@ mod tests {
         let mut mirror = Mirror::default();
         for (sequence, written_ns) in [(1, 50), (2, 20), (3, 60)] {
             let frame = kept(&frame(1, sequence, 1), written_ns);
-            mirror.keep(key(1), frame, 3, Line::PublishSmall, Weak::new());
+            mirror.keep(&key(1), frame, 3, Line::PublishSmall, Weak::new());
         }
         let (frames, _) = read_field(value(&mirror, 1).unwrap(), WriterId([1; 16]));
         let found: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.sequence())).collect();

@@ -4,16 +4,16 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+use blaze_domain::WriterId;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use redis::Cmd;
 use tokio::sync::Notify;
 
-use super::publisher::{field_name, hset_command};
+use super::publisher::hset_command;
 use super::state::Scope;
 use super::{Shared, server};
 use crate::port::BrokerError;
-use blaze_domain::WriterId;
 
 /// Leases that are kept at most: a flow has 10,000, and some are on their way out.
 pub const MAX_LEASES: usize = 20_000;
@@ -49,6 +49,8 @@ pub(super) struct Ledger {
     forgotten: VecDeque<(Arc<str>, WriterId)>,
     refused: u64,
     forgotten_dropped: u64,
+    /// Changes that the server has not confirmed.
+    under_way: bool,
 }
 
 impl Ledger {
@@ -119,7 +121,12 @@ impl Ledger {
         {
             changes.push(Change::Forget(hash, writer));
         }
+        self.under_way = !changes.is_empty();
         changes
+    }
+
+    fn is_settled(&self) -> bool {
+        !self.under_way && !self.clear_first && self.pending.is_empty() && self.forgotten.is_empty()
     }
 
     /// Changes that may not have reached the server are to be made first.
@@ -152,6 +159,7 @@ impl Ledger {
 pub(super) struct Leases {
     pub(super) ledger: Mutex<Ledger>,
     changed: Notify,
+    settled: Notify,
 }
 
 impl Leases {
@@ -196,9 +204,10 @@ async fn write_on(shared: &Shared, leases: &Leases) {
     loop {
         // An owner's claim rings, too, so nothing stays unwritten after an outage.
         leases.changed.notified().await;
-        while shared.state.read(|conditions| conditions.scope == Scope::Owned) {
+        while is_owned(shared) {
             let changes = leases.ledger.lock().take(PER_BATCH);
             if changes.is_empty() {
+                leases.settled.notify_one();
                 break;
             }
             let mut connection = shared.commands().await;
@@ -213,6 +222,20 @@ async fn write_on(shared: &Shared, leases: &Leases) {
             }
         }
     }
+}
+
+fn is_owned(shared: &Shared) -> bool {
+    shared.state.read(|conditions| *conditions.scope() == Scope::Owned)
+}
+
+/// Waits until the server has all changes, if it takes any.
+pub(super) async fn drained(shared: &Shared, leases: &Leases, most: Duration) {
+    let settled = async {
+        while is_owned(shared) && !leases.ledger.lock().is_settled() {
+            leases.settled.notified().await;
+        }
+    };
+    let _ = tokio::time::timeout(most, settled).await;
 }
 
 /// Whether all was written; if the server refused, its words.
@@ -237,7 +260,7 @@ fn pipeline(changes: &[Change], hash: &str) -> redis::Pipeline {
             Change::Clear => command("DEL", &[hash]),
             Change::Put(key, value) => hset_command(hash, key, &value[..], value.len()),
             Change::Remove(key) => command("HDEL", &[hash, key]),
-            Change::Forget(hash, writer) => command("HDEL", &[hash, &field_name(*writer)]),
+            Change::Forget(hash, writer) => command("HDEL", &[hash, &writer.to_string()]),
         });
     }
     pipeline

@@ -93,7 +93,8 @@ struct Shared {
     subscriptions: [Arc<Subscriptions>; 2],
     connections: [watch::Sender<Option<MultiplexedConnection>>; 4],
     mirror: Mutex<Mirror>,
-    run_id: Mutex<Option<String>>,
+    /// Which start of the server was met last, if any was; `None` inside where it does not tell.
+    last_run: Mutex<Option<Option<String>>>,
     warned_of_limits: AtomicBool,
     stop: CancellationToken,
 }
@@ -112,7 +113,7 @@ impl Shared {
             subscriptions: [Subscriptions::new(Arc::clone(&channels)), Subscriptions::new(channels)],
             connections: std::array::from_fn(|_| watch::Sender::new(None)),
             mirror: Mutex::default(),
-            run_id: Mutex::default(),
+            last_run: Mutex::default(),
             warned_of_limits: AtomicBool::new(false),
             stop: CancellationToken::new(),
             settings,
@@ -157,11 +158,15 @@ impl Shared {
 
     /// The server has told who it is.
     fn met(&self, facts: ServerFacts, limits: Option<BufferLimits>) {
-        let before = std::mem::replace(&mut *self.run_id.lock(), facts.run_id.clone());
-        if before.is_some() && before != facts.run_id {
+        let before = self.last_run.lock().replace(facts.run_id.clone());
+        // Where the server does not tell, it may have been restarted.
+        let same = before
+            .as_ref()
+            .is_none_or(|before| before.is_some() && *before == facts.run_id);
+        if !same {
             tracing::info!(
                 server = facts.version,
-                "redis was restarted: what is kept for late joiners is written again"
+                "redis may have been restarted: what it kept is written again"
             );
             self.mirror.lock().rewrite_all();
         }
@@ -175,7 +180,12 @@ impl Shared {
                 }
             }
         }
-        self.state.change(|conditions| conditions.server = facts.version);
+        self.state.change(|conditions| {
+            conditions.server = facts.version;
+            if !same {
+                conditions.forget_owner();
+            }
+        });
     }
 
     /// Ends what can be ended without waiting.
@@ -322,7 +332,8 @@ impl Broker for RedisBroker {
         };
         let [small, large] = &self.shared.gates;
         tokio::join!(drained(small), drained(large));
-        if let Some(Flow { flow, epoch, .. }) = &self.flow {
+        if let Some(Flow { flow, epoch, leases }) = &self.flow {
+            leases::drained(&self.shared, leases, DRAIN).await;
             owner::release(&self.shared, &flow.to_string(), *epoch).await;
         }
         self.shared.end();

@@ -20,6 +20,8 @@ use super::state::Scope;
 
 /// Between two renewals.
 const RENEW: Duration = Duration::from_secs(1);
+/// Least time between two claims.
+const SOON: Duration = Duration::from_millis(50);
 /// How long the key lives without a renewal.
 const LIFE: Duration = Duration::from_secs(5);
 /// Without a renewal for this long the scope is given up.
@@ -126,8 +128,7 @@ impl Owner {
             let key = self.shared.settings.names.owner();
             let claim = self.or_give_up(claim(connection, key, flow, epoch)).await;
             self.claimed(claim, sent);
-            let pause = RENEW.saturating_sub(sent.elapsed());
-            self.or_give_up(tokio::time::sleep(pause)).await;
+            self.or_give_up(due(&shared, sent)).await;
         }
     }
 
@@ -149,19 +150,16 @@ impl Owner {
 
     fn claimed(&mut self, claim: RedisResult<Claim>, sent: Instant) {
         match claim {
-            // An answer that old says nothing of now; the next claim follows at once.
-            Ok(Claim::Ours | Claim::New) if sent.elapsed() >= GIVE_UP => {
-                if claim.is_ok_and(|claim| claim == Claim::New) {
-                    self.write_again();
-                }
-            }
             Ok(claim @ (Claim::Ours | Claim::New)) => {
                 if claim == Claim::New {
                     self.write_again();
                 }
-                self.renewed = Some(sent);
-                self.set(Scope::Owned);
-                self.leases.wake();
+                // An older answer says nothing of now; the next claim follows at once.
+                if sent.elapsed() < GIVE_UP {
+                    self.renewed = Some(sent);
+                    self.set(Scope::Owned);
+                    self.leases.wake();
+                }
             }
             Ok(Claim::Held(whom)) => {
                 self.renewed = None;
@@ -184,9 +182,30 @@ impl Owner {
     }
 
     fn set(&self, scope: Scope) {
-        if self.shared.state.read(|conditions| conditions.scope != scope) {
-            self.shared.state.change(|conditions| conditions.scope = scope);
+        if self.shared.state.read(|conditions| *conditions.scope() != scope) {
+            self.shared.state.change(|conditions| conditions.set_scope(scope));
         }
+    }
+}
+
+/// Waits until the scope is to be claimed again: soon where nobody knows whose it is, else in due time.
+async fn due(shared: &Shared, sent: Instant) {
+    let mut version = shared.state.version();
+    let urgent = async {
+        tokio::time::sleep(SOON).await;
+        loop {
+            version.mark_unchanged();
+            let unclaimed = shared.state.read(|conditions| *conditions.scope() == Scope::Unclaimed);
+            if unclaimed && shared.commands_now().is_some() {
+                return;
+            }
+            // The sender lives in `shared`.
+            let _ = version.changed().await;
+        }
+    };
+    tokio::select! {
+        () = tokio::time::sleep(RENEW.saturating_sub(sent.elapsed())) => {}
+        () = urgent => {}
     }
 }
 
@@ -203,7 +222,7 @@ async fn claim(mut connection: MultiplexedConnection, key: String, flow: String,
 
 /// Ends the ownership, if it is ours, so that the next owner need not wait.
 pub(super) async fn release(shared: &Shared, flow: &str, epoch: u64) {
-    if shared.state.read(|conditions| conditions.scope != Scope::Owned) {
+    if shared.state.read(|conditions| *conditions.scope() != Scope::Owned) {
         return;
     }
     let Some(mut connection) = shared.commands_now() else {

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_domain::names::ChannelName;
-use blaze_domain::{DropReason, MAX_PAYLOAD_BYTES, WriterId};
+use blaze_domain::{DropReason, MAX_PAYLOAD_BYTES};
 use blaze_proto::Frame;
 use bytes::Bytes;
 use redis::{Cmd, RedisWrite, ToRedisArgs};
@@ -167,7 +167,7 @@ impl Batch {
             payload: frame.payload().clone(),
         };
         let mut mirror = keeper.mirror.lock();
-        if let Some(field) = mirror.keep(key, newest, kept.depth, keeper.line, Arc::downgrade(to)) {
+        if let Some(field) = mirror.keep(&key, newest, kept.depth, keeper.line, Arc::downgrade(to)) {
             let size = field.size();
             self.add(hset_command(&kept.hash, &frame.writer().to_string(), field, size), size);
         }
@@ -180,7 +180,7 @@ impl Batch {
             return false;
         };
         let size = field.size();
-        self.add(hset_command(&hash, &field_name(writer), field, size), size);
+        self.add(hset_command(&hash, &writer.to_string(), field, size), size);
         true
     }
 
@@ -216,11 +216,6 @@ pub(super) struct Keeper<'a> {
     pub(super) line: Line,
 }
 
-/// Name of a writer's field.
-pub(super) fn field_name(writer: WriterId) -> String {
-    writer.to_string()
-}
-
 /// The clock of this host, which is that of all clients of a node's broker.
 pub(super) fn unix_time_ns() -> u64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
@@ -233,7 +228,7 @@ mod tests {
     use std::time::Duration;
 
     use crate::outbox::{Outbox, OutboxLimits};
-    use blaze_domain::Origin;
+    use blaze_domain::{Origin, WriterId};
     use blaze_proto::Header;
     use parking_lot::Mutex;
 

@@ -99,7 +99,7 @@ pub(super) enum Scope {
 #[derive(Debug)]
 pub(super) struct Conditions {
     lines: [LineState; 4],
-    pub(super) scope: Scope,
+    scope: Scope,
     /// A flow to which this one gives way.
     pub(super) stand_back: Option<String>,
     /// Program and version of the server.
@@ -109,6 +109,7 @@ pub(super) struct Conditions {
     interruptions: u64,
     place: String,
     was_up: bool,
+    was_owned: bool,
 }
 
 struct Verdict {
@@ -135,6 +136,7 @@ impl Conditions {
             interruptions: 0,
             place,
             was_up: false,
+            was_owned: false,
         }
     }
 
@@ -149,6 +151,22 @@ impl Conditions {
         }
         self.lines[line.index()] = state;
         self.was_up |= self.core_is_up();
+    }
+
+    pub(super) fn scope(&self) -> &Scope {
+        &self.scope
+    }
+
+    pub(super) fn set_scope(&mut self, scope: Scope) {
+        self.was_owned |= scope == Scope::Owned;
+        self.scope = scope;
+    }
+
+    /// The server may have lost whose scope it is: until the next claim it is nobody's.
+    pub(super) fn forget_owner(&mut self) {
+        if self.scope == Scope::Owned {
+            self.scope = Scope::Unclaimed;
+        }
     }
 
     fn core_is_up(&self) -> bool {
@@ -191,7 +209,14 @@ impl Conditions {
             return in_use(whom);
         }
         match &self.scope {
-            Scope::Unclaimed => (Health::Connecting, format!("claiming the scope at {}", self.place)),
+            Scope::Unclaimed => {
+                let health = if self.was_owned {
+                    Health::Down
+                } else {
+                    Health::Connecting
+                };
+                (health, format!("claiming the scope at {}", self.place))
+            }
             Scope::HeldBy(whom) => in_use(whom),
             Scope::Lost(why) => (Health::Down, why.clone()),
             Scope::Free | Scope::Owned => (Health::Up, self.server_detail()),
@@ -377,6 +402,10 @@ mod tests {
         }
         let mut c = up(Scope::Owned);
         assert_eq!(c.health().0, Health::Up);
+        c.set_scope(Scope::Owned);
+        c.forget_owner();
+        assert_eq!(c.health().0, Health::Down, "the server was restarted");
+        c.set_scope(Scope::Owned);
         c.stand_back = Some("fog/first".to_owned());
         assert_eq!(
             c.health(),

@@ -298,6 +298,8 @@ impl Subscriptions {
     pub(super) fn sweep(&self) {
         let mut channels = self.channels.lock();
         let channels = &mut *channels;
+        // All that have none are found anew.
+        channels.left.clear();
         for (name, channel) in &mut channels.by_name {
             channel.readers.retain(|reader| !reader.sender.is_closed());
             if channel.readers.is_empty() {

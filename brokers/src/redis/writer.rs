@@ -208,7 +208,7 @@ impl Writer {
         if now.duration_since(self.forgot) >= FORGET_EVERY {
             self.forgot = now;
             // A flow is told by the end of a lease; a service's publisher takes what it kept with it.
-            if self.shared.state.read(|conditions| conditions.scope == Scope::Free) {
+            if self.shared.state.read(|conditions| *conditions.scope() == Scope::Free) {
                 self.shared.mirror.lock().forget_orphans();
             }
         }

@@ -1,8 +1,7 @@
 //! Users, passwords, TLS, sockets and prefixes.
 
 use blaze_brokers::redis::RedisBroker;
-use blaze_brokers::{Broker, BrokerError, Health, OpenError, Role, SubscribeOptions, open_node};
-use blaze_domain::node_file::NodeBroker;
+use blaze_brokers::{Broker, BrokerError, Health, OpenError, Role, SubscribeOptions};
 use blaze_tests::servers::{RedisKind, RedisOptions};
 use serde_json::json;
 
@@ -78,6 +77,9 @@ async fn a_refused_login_is_told() {
 #[cfg(feature = "tls")]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn tls_is_spoken_and_checked() {
+    use blaze_brokers::open_node;
+    use blaze_domain::node_file::NodeBroker;
+
     let server = Server::with(
         RedisKind::Redis,
         RedisOptions {

@@ -1,5 +1,7 @@
 //! Servers, clients, frames and waits.
 
+#![allow(clippy::panic, reason = "helpers of tests")]
+
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
