@@ -154,6 +154,12 @@ impl Publisher {
         self.shared.next.lock().sequence
     }
 
+    /// Messages that were taken and have neither reached the broker nor been dropped yet.
+    #[must_use]
+    pub fn queued(&self) -> u64 {
+        self.shared.to.later().queued
+    }
+
     /// Messages that were taken and then dropped, because the broker was slow or away.
     #[must_use]
     pub fn dropped_later(&self) -> u64 {
