@@ -8,7 +8,7 @@ use rdkafka::ClientConfig;
 use rdkafka::admin::{AdminClient, AdminOptions};
 use rdkafka::client::DefaultClientContext;
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
-use rdkafka::message::{Headers as _, Message as _};
+use rdkafka::message::{Header, Headers as _, Message as _, OwnedHeaders};
 use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
 use rdkafka::topic_partition_list::{Offset, TopicPartitionList};
 
@@ -124,6 +124,25 @@ impl KafkaWriter {
     /// When it is not acknowledged in time.
     pub fn produce(&self, topic: &str, payload: &[u8]) -> anyhow::Result<()> {
         self.produce_later(topic, payload)?;
+        self.producer.flush(Duration::from_secs(10))?;
+        Ok(())
+    }
+
+    /// Produces a value with headers and waits until it is there.
+    ///
+    /// # Errors
+    /// As [`KafkaWriter::produce`].
+    pub fn produce_with(&self, topic: &str, payload: &[u8], headers: &[(&str, &[u8])]) -> anyhow::Result<()> {
+        let mut all = OwnedHeaders::new();
+        for (key, value) in headers {
+            all = all.insert(Header {
+                key,
+                value: Some(*value),
+            });
+        }
+        self.producer
+            .send(BaseRecord::<'_, (), [u8]>::to(topic).payload(payload).headers(all))
+            .map_err(|(error, _)| error)?;
         self.producer.flush(Duration::from_secs(10))?;
         Ok(())
     }

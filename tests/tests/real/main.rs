@@ -9,4 +9,5 @@ mod frozen;
 mod garbage;
 mod plain_clients;
 mod restarts;
+mod stream;
 mod support;
