@@ -91,10 +91,7 @@ impl BridgeState {
                 let outcome = if *bare {
                     publisher.publish_bare(frame.payload(), deadline)
                 } else {
-                    publisher.publish(
-                        &frame.clone().with_hops_and_age(frame.hops() + 1, message.age_us),
-                        deadline,
-                    )
+                    publisher.publish(&frame.clone().with_hops_and_age(frame.hops() + 1, message.age_us), deadline)
                 };
                 match outcome {
                     PublishOutcome::Taken => {
