@@ -8,12 +8,11 @@
 //! Without input or output of its own: brokers are writers that never wait, the link is a [`LaneLink`], time is given.
 //! Production holds it behind one lock that is taken once per batch; the simulated network drives the same code.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::num::NonZeroUsize;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Content, Publisher, Received};
+use blaze_brokers::{Content, Received};
 use blaze_domain::{DropReason, FlowId, Origin, Scope, TopicName, WriterId};
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
@@ -23,13 +22,16 @@ use super::measure::micros;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
 use super::stats::Drops;
 use super::window::DuplicateWindow;
+use super::writer::{NewWriter, Writer};
 use crate::link::{Engine, LaneId, Submit};
-use crate::plan::{Target, TopicPlan};
+use crate::plan::{Bridge, Target, TopicPlan};
 
 /// Writers whose duplicate window a flow keeps; the least recently used go first.
 pub const MAX_WRITERS: usize = 65_536;
-/// Topics that a flow carries.
+/// Topics that a flow carries at a time.
 pub const MAX_TOPICS: usize = 10_000;
+/// A topic, or a bridge, that nobody has used for this long is forgotten.
+pub const FORGET: Duration = Duration::from_secs(600);
 /// How long a bridge whose pair has vanished may empty its queue.
 pub const DRAIN: Duration = Duration::from_millis(500);
 
@@ -78,6 +80,12 @@ pub struct DataCore {
     by_name: HashMap<TopicName, TopicId>,
     windows: LruCache<(TopicId, WriterId), DuplicateWindow>,
     lanes: Vec<(TopicId, usize)>,
+    /// Places of topics that were forgotten.
+    vacant: Vec<TopicId>,
+    /// Lanes of topics that were forgotten.
+    free_lanes: Vec<LaneId>,
+    /// A bridge empties its queue.
+    draining: bool,
     /// What could not be attributed to a topic.
     pub unattributed: Drops,
     /// Windows that gave way to newer writers.
@@ -86,11 +94,27 @@ pub struct DataCore {
 
 /// Where a message stands when it reaches the bridges.
 pub(super) struct Admitted {
+    /// As a broker gets it: with the hop that writing it is, and its age.
     pub(super) frame: Frame,
+    /// Flows that wrote it so far, this one not among them.
+    pub(super) hops: u32,
     pub(super) born_here: bool,
     pub(super) age_us: u64,
     /// Since it came to this flow.
     pub(super) here_us: u64,
+}
+
+impl Admitted {
+    fn new(frame: Frame, born_here: bool, age_us: u64, here_us: u64) -> Self {
+        let hops = frame.hops();
+        Self {
+            frame: frame.with_hops_and_age(hops.saturating_add(1), age_us),
+            hops,
+            born_here,
+            age_us,
+            here_us,
+        }
+    }
 }
 
 impl DataCore {
@@ -104,20 +128,24 @@ impl DataCore {
             by_name: HashMap::new(),
             windows: LruCache::new(capacity),
             lanes: Vec::new(),
+            vacant: Vec::new(),
+            free_lanes: Vec::new(),
+            draining: false,
             unattributed: Drops::default(),
             evicted_writers: 0,
         }
     }
 
-    /// All topics, also those that nobody uses any more.
-    #[must_use]
-    pub fn topics(&self) -> &[TopicPath] {
-        &self.topics
+    /// All topics, also those that nobody has used for a while.
+    pub fn topics(&self) -> impl Iterator<Item = (TopicId, &TopicPath)> {
+        let all = self.topics.iter().enumerate().filter(|(_, path)| !path.vacant);
+        all.map(|(index, path)| (topic_id(index), path))
     }
 
     /// All topics, for what reads meters.
-    pub fn topics_mut(&mut self) -> &mut [TopicPath] {
-        &mut self.topics
+    pub fn topics_mut(&mut self) -> impl Iterator<Item = (TopicId, &mut TopicPath)> {
+        let all = self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant);
+        all.map(|(index, path)| (topic_id(index), path))
     }
 
     /// A topic by name.
@@ -132,10 +160,27 @@ impl DataCore {
         &self.topics[topic.0 as usize]
     }
 
-    /// Whether a payload of that size makes a topic `bulk`.
+    /// A topic's path, for what reads counters.
+    pub fn path_mut(&mut self, topic: TopicId) -> &mut TopicPath {
+        &mut self.topics[topic.0 as usize]
+    }
+
+    /// Whether a topic is large, as advertised or as seen.
     #[must_use]
-    pub fn is_large(&self, bytes: Option<u64>) -> bool {
-        bytes.is_some_and(|bytes| bytes > self.config.large_bytes)
+    pub fn is_large(&self, topic: &TopicName, advertised: Option<u64>) -> bool {
+        let seen = self.find(topic.as_str()).map_or(0, |id| self.path(id).largest_bytes);
+        seen.max(advertised.unwrap_or(0)) > self.config.large_bytes
+    }
+
+    /// The writer that a bridge to a local broker has, or had and has not emptied yet.
+    #[must_use]
+    pub fn writer_of(&self, topic: &TopicName, from: Scope, to: &Target) -> Option<&NewWriter> {
+        let path = self.path(self.find(topic.as_str())?);
+        let bridge = path.bridges.iter().find(|b| b.from == from && b.target == *to)?;
+        match &bridge.sink {
+            Sink::Publish { writer, .. } => writer.as_ref().map(Writer::made),
+            Sink::Lane { .. } => None,
+        }
     }
 
     /// Whether a bridge still empties its queue.
@@ -161,8 +206,39 @@ impl DataCore {
     /// Puts a mark into the counters of every bridge: what happened since the one before is "lately".
     pub fn mark(&mut self) {
         for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
+            bridge.settle();
             bridge.stats.mark();
         }
+    }
+
+    /// Forgets topics that nobody has used for [`FORGET`]; to be called every few seconds. Returns how many.
+    pub fn forget_unused(&mut self, now: Instant) -> usize {
+        let before = self.vacant.len();
+        for (index, path) in self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant) {
+            if !path.is_idle() {
+                path.idle = None;
+                continue;
+            }
+            let since = *path.idle.get_or_insert(now);
+            if now.saturating_duration_since(since) < FORGET {
+                continue;
+            }
+            self.by_name.remove(&path.name);
+            self.free_lanes.extend(path.bridges.iter().filter_map(BridgeState::lane_id));
+            path.bridges = Vec::new();
+            path.bare.clear();
+            path.vacant = true;
+            self.vacant.push(topic_id(index));
+        }
+        let forgotten: HashSet<TopicId> = self.vacant[before..].iter().copied().collect();
+        if !forgotten.is_empty() {
+            let windows = self.windows.iter().map(|(key, _)| *key);
+            let gone: Vec<_> = windows.filter(|(topic, _)| forgotten.contains(topic)).collect();
+            for key in gone {
+                self.windows.pop(&key);
+            }
+        }
+        forgotten.len()
     }
 
     /// Changes what counts as large, from the next message on.
@@ -175,65 +251,95 @@ impl DataCore {
         if let Some(id) = self.by_name.get(name) {
             return Some(*id);
         }
-        if self.topics.len() >= MAX_TOPICS {
-            return None;
-        }
-        let id = TopicId(u32::try_from(self.topics.len()).ok()?);
-        self.topics.push(TopicPath::new(name.clone(), now));
+        let path = TopicPath::new(name.clone(), now);
+        let id = match self.vacant.pop() {
+            Some(id) => {
+                self.topics[id.0 as usize] = path;
+                id
+            }
+            None if self.topics.len() >= MAX_TOPICS => return None,
+            None => {
+                self.topics.push(path);
+                topic_id(self.topics.len() - 1)
+            }
+        };
         self.by_name.insert(name.clone(), id);
         Some(id)
     }
 
-    /// Makes the bridges of a topic equal to its plan. `publisher` gives the writer for a local target, if there is one.
-    /// Bridges that are no longer planned drain.
+    /// Makes the bridges of a topic equal to its plan. `writer` gives what writes to a local target, for each bridge one of
+    /// its own, or says why it cannot be made: then the bridge has failed. Bridges that are no longer planned drain.
     pub fn apply(
         &mut self,
         now: Instant,
         topic: TopicId,
         info: TopicInfo,
         plan: &TopicPlan,
-        mut publisher: impl FnMut(&Target) -> Option<Arc<dyn Publisher>>,
+        mut writer: impl FnMut(&Bridge) -> Result<NewWriter, String>,
     ) {
-        let Self {
-            topics, lanes, config, ..
-        } = self;
-        let path = &mut topics[topic.0 as usize];
+        let path = &mut self.topics[topic.0 as usize];
         path.info = info;
         for bridge in &mut path.bridges {
             let planned = plan
                 .bridges
                 .iter()
                 .any(|p| p.from == bridge.from && p.to == bridge.target);
-            if !planned && matches!(bridge.phase, Phase::Up { .. }) {
-                bridge.phase = Phase::Draining { until: now + DRAIN };
+            match bridge.phase {
+                Phase::Up { .. } if !planned => {
+                    bridge.phase = Phase::Draining { until: now + DRAIN };
+                    self.draining = true;
+                }
+                Phase::Failed { .. } if !planned => bridge.end(now),
+                _ => {}
             }
         }
         for planned in &plan.bridges {
-            let class = path.class(&planned.lane, config.large_bytes);
-            let existing = path
-                .bridges
-                .iter_mut()
-                .find(|b| b.from == planned.from && b.target == planned.to);
-            if let Some(bridge) = existing {
-                bridge.renew(now, planned, &mut publisher);
-                continue;
+            let at = self.place_of(now, topic, planned);
+            let bridge = &mut self.topics[topic.0 as usize].bridges[at];
+            bridge.renew(now, planned);
+            if let Sink::Publish { .. } = bridge.sink {
+                bridge.set_writer(now, writer(planned));
             }
-            let sink = match &planned.to {
-                Target::Inter { .. } => {
-                    let lane = LaneId(u32::try_from(lanes.len()).unwrap_or(u32::MAX));
-                    lanes.push((topic, path.bridges.len()));
-                    Sink::Lane { lane, class }
-                }
-                target => match publisher(target) {
-                    Some(publisher) => Sink::Publish {
-                        publisher,
-                        bare: is_bare(target),
-                    },
-                    None => continue,
-                },
-            };
-            path.bridges.push(BridgeState::new(now, planned, sink));
         }
+    }
+
+    /// Where the bridge is in its topic; it is made where there is none yet.
+    fn place_of(&mut self, now: Instant, topic: TopicId, planned: &Bridge) -> usize {
+        let path = &mut self.topics[topic.0 as usize];
+        let same = |b: &BridgeState| b.from == planned.from && b.target == planned.to;
+        if let Some(at) = path.bridges.iter().position(same) {
+            return at;
+        }
+        let class = path.class(&planned.lane, self.config.large_bytes);
+        let old = path.bridges.iter().position(|bridge| bridge.is_forgotten(now));
+        let at = old.unwrap_or(path.bridges.len());
+        let old_lane = old.and_then(|at| path.bridges[at].lane_id());
+        let sink = match &planned.to {
+            Target::Inter { .. } => {
+                let lane = old_lane.or_else(|| self.free_lanes.pop()).unwrap_or_else(|| {
+                    self.lanes.push((topic, at));
+                    LaneId(u32::try_from(self.lanes.len() - 1).unwrap_or(u32::MAX))
+                });
+                if let Some(place) = self.lanes.get_mut(lane.0 as usize) {
+                    *place = (topic, at);
+                }
+                Sink::Lane { lane, class }
+            }
+            target => {
+                self.free_lanes.extend(old_lane);
+                Sink::Publish {
+                    writer: None,
+                    past: Vec::new(),
+                    bare: is_bare(target),
+                }
+            }
+        };
+        let bridge = BridgeState::new(now, planned, sink);
+        match path.bridges.get_mut(at) {
+            Some(place) => *place = bridge,
+            None => path.bridges.push(bridge),
+        }
+        at
     }
 
     /// Takes a batch that a local scope delivered. `wall_ns` is the clock since 1970 at `now`.
@@ -282,18 +388,8 @@ impl DataCore {
             return;
         }
         let age_us = frame.age_us();
-        self.fan_out(
-            now,
-            topic,
-            Scope::Inter,
-            &Admitted {
-                frame,
-                born_here: false,
-                age_us,
-                here_us: 0,
-            },
-            link,
-        );
+        let message = Admitted::new(frame, false, age_us, 0);
+        self.fan_out(now, topic, Scope::Inter, &message, link);
     }
 
     /// The link has sent the last byte of a message for the first time.
@@ -328,17 +424,21 @@ impl DataCore {
 
     /// Ends bridges that have drained. Returns when it wants to be called again.
     pub fn drain(&mut self, now: Instant, link: &mut dyn LaneLink) -> Option<Instant> {
+        if !self.draining {
+            return None;
+        }
         let mut next = None;
         for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
             let Phase::Draining { until } = bridge.phase else {
                 continue;
             };
-            let lane = match bridge.sink {
-                Sink::Lane { lane, .. } => Some(lane),
-                Sink::Publish { .. } => None,
+            let lane = bridge.lane_id();
+            let queued = match lane {
+                Some(lane) => link.queued(lane),
+                None => bridge.settle(),
             };
             // What a bridge from the inter scope has to empty is on its way to it: it stays until the end.
-            let empty = bridge.from != Scope::Inter && lane.is_none_or(|lane| link.queued(lane) == 0);
+            let empty = bridge.from != Scope::Inter && queued == 0;
             if empty || now >= until {
                 if let Some(lane) = lane {
                     bridge
@@ -346,11 +446,12 @@ impl DataCore {
                         .dropped
                         .add(DropReason::NoDestination, link.drop_lane(lane));
                 }
-                bridge.phase = Phase::Ended;
+                bridge.end(now);
             } else {
                 next = Some(next.map_or(until, |other: Instant| other.min(until)));
             }
         }
+        self.draining = next.is_some();
         next
     }
 
@@ -414,12 +515,7 @@ impl DataCore {
         path.largest_bytes = path.largest_bytes.max(bytes);
         path.in_rate.add(now, bytes);
         let here_us = micros(now.saturating_duration_since(at));
-        Ok(Admitted {
-            frame,
-            born_here,
-            age_us,
-            here_us,
-        })
+        Ok(Admitted::new(frame, born_here, age_us, here_us))
     }
 
     /// Gives a bare payload its header.
@@ -441,7 +537,7 @@ impl DataCore {
             *sequence += 1;
             (*writer, *sequence)
         });
-        let info = &path.info;
+        let info = path.info.bare(from);
         let node = if from == Scope::Node {
             config.me.node.to_string()
         } else {
@@ -489,6 +585,10 @@ impl DataCore {
             }
         }
     }
+}
+
+fn topic_id(index: usize) -> TopicId {
+    TopicId(u32::try_from(index).unwrap_or(u32::MAX))
 }
 
 fn is_bare(target: &Target) -> bool {

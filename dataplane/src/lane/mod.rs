@@ -6,3 +6,4 @@ pub mod measure;
 pub mod path;
 pub mod stats;
 pub mod window;
+pub mod writer;

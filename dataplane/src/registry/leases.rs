@@ -9,6 +9,8 @@ use blaze_domain::control::{
 };
 use blaze_domain::{FlowId, InstanceName, LayerName, NodeName, Scope, ServiceName, TopicName};
 
+use super::stored::{UnsavedLease, unsaved};
+
 /// Most lapsed leases that are remembered for people who ask why a topic stopped.
 const MAX_LAPSED: usize = 1024;
 
@@ -156,6 +158,27 @@ pub(super) struct LeaseTable {
     count: usize,
     limit: usize,
     lapsed: VecDeque<LapsedLease>,
+    /// Scopes whose broker keeps leases.
+    stores: BTreeSet<Scope>,
+    /// Leases that are to be written to or removed from the broker that keeps them.
+    unsaved: BTreeSet<(TopicName, LeaseKey)>,
+    /// Scopes whose kept leases are being read.
+    reading: BTreeSet<Scope>,
+    /// Leases that ended while those of their scope were being read: what is read of them is old.
+    ended: BTreeSet<(TopicName, LeaseKey)>,
+    /// Scopes whose broker is away.
+    not_renewable: BTreeSet<Scope>,
+}
+
+/// What became of a kept lease.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Taken {
+    /// It lives again.
+    Restored,
+    /// A service was faster.
+    Newer,
+    /// There is no room for it.
+    Refused,
 }
 
 /// What a message did to the table.
@@ -167,13 +190,107 @@ pub(super) struct Applied {
 }
 
 impl LeaseTable {
-    pub(super) fn new(limit: usize) -> Self {
+    /// A table without leases; those that the brokers of `stores` keep are still to be read.
+    pub(super) fn new(limit: usize, stores: BTreeSet<Scope>) -> Self {
         Self {
             topics: BTreeMap::new(),
             expiry: BTreeSet::new(),
             count: 0,
             limit,
             lapsed: VecDeque::new(),
+            unsaved: BTreeSet::new(),
+            reading: stores.clone(),
+            stores,
+            ended: BTreeSet::new(),
+            not_renewable: BTreeSet::new(),
+        }
+    }
+
+    pub(super) fn get<'a>(&'a self, topic: &'a TopicName, key: &'a LeaseKey) -> Option<LeaseView<'a>> {
+        let lease = self.topics.get(topic)?.get(key)?;
+        Some(view(topic, key, lease))
+    }
+
+    pub(super) fn take_unsaved(&mut self) -> Vec<UnsavedLease> {
+        let changed = std::mem::take(&mut self.unsaved);
+        unsaved(self, changed)
+    }
+
+    pub(super) fn set_reading(&mut self, scope: Scope, reading: bool) {
+        if reading && self.stores.contains(&scope) {
+            self.reading.insert(scope);
+        } else {
+            self.reading.remove(&scope);
+            self.ended.retain(|(_, key)| key.scope != scope);
+        }
+    }
+
+    pub(super) fn is_reading(&self, scope: Scope) -> bool {
+        self.reading.contains(&scope)
+    }
+
+    pub(super) fn set_renewable(&mut self, now: Instant, scope: Scope, renewable: bool) {
+        if !renewable {
+            self.not_renewable.insert(scope);
+        } else if self.not_renewable.remove(&scope) {
+            let finite = self.expiry.iter().filter(|(_, _, key)| key.scope == scope);
+            let finite: Vec<_> = finite.map(|(_, topic, key)| (topic.clone(), key.clone())).collect();
+            for (topic, key) in finite {
+                self.renew(now, &topic, &key);
+            }
+        }
+    }
+
+    /// Gives a finite lease its whole ttl.
+    fn renew(&mut self, now: Instant, topic: &TopicName, key: &LeaseKey) {
+        let Some(lease) = self.topics.get_mut(topic).and_then(|leases| leases.get_mut(key)) else {
+            return;
+        };
+        if let Some(at) = lease.expires_at {
+            let until = now + Duration::from_secs(lease.ttl_s.into());
+            lease.expires_at = Some(until);
+            self.expiry.remove(&(at, topic.clone(), key.clone()));
+            self.expiry.insert((until, topic.clone(), key.clone()));
+        }
+    }
+
+    /// Whether any lease of the topic is of that scope.
+    pub(super) fn has(&self, topic: &TopicName, scope: Scope) -> bool {
+        let leases = self.topics.get(topic);
+        leases.is_some_and(|leases| leases.keys().any(|key| key.scope == scope))
+    }
+
+    pub(super) fn topics(&self) -> impl Iterator<Item = &TopicName> {
+        self.topics.keys()
+    }
+
+    /// Takes a lease that a broker has kept, unless a service was faster.
+    pub(super) fn restore(&mut self, now: Instant, scope: Scope, me: &FlowId, message: &ControlMessage) -> Taken {
+        let Ok((topic, key, lease)) = lease_of(now, scope, me, message, "") else {
+            return Taken::Refused;
+        };
+        let entry = (topic.clone(), key);
+        if self.get(&entry.0, &entry.1).is_some() || self.ended.contains(&entry) {
+            return Taken::Newer;
+        }
+        match self.grant(topic, entry.1.clone(), lease, "") {
+            Ok(_) => {
+                // It is there as it was written.
+                self.unsaved.remove(&entry);
+                Taken::Restored
+            }
+            Err(_) => Taken::Refused,
+        }
+    }
+
+    /// A lease has ended: the broker that keeps it is to forget it.
+    fn note_end(&mut self, topic: &TopicName, key: &LeaseKey) {
+        if !self.stores.contains(&key.scope) {
+            return;
+        }
+        self.unsaved.insert((topic.clone(), key.clone()));
+        if self.reading.contains(&key.scope) && self.ended.len() < self.limit {
+            self.ended.insert((topic.clone(), key.clone()));
         }
     }
 
@@ -190,57 +307,26 @@ impl LeaseTable {
         message: &ControlMessage,
         pointer: &str,
     ) -> Result<Applied, ControlError> {
-        let common = message.common();
-        let (layer, node) = holder(scope, me, common, pointer)?;
-        let key = |kind| LeaseKey {
-            scope,
-            kind,
-            layer: layer.clone(),
-            node: node.clone(),
-            service: common.service.clone(),
-            instance: common.instance.clone(),
-        };
-        let (kind, ttl_s, terms) = match message {
-            ControlMessage::Advertise(message) => (
-                LeaseKind::Advertise,
-                message.ttl_s,
-                Terms::Advertise {
-                    rate_hz: message.rate_hz,
-                    max_bytes: message.max_bytes,
-                    quality: message.quality.clone(),
-                },
-            ),
-            ControlMessage::Request(message) => (
-                LeaseKind::Request,
-                message.ttl_s,
-                Terms::Request {
-                    max_rate_hz: message.max_rate_hz,
-                    bare: message.bare,
-                    from: message.from.clone(),
-                    quality: message.quality.clone(),
-                },
-            ),
-            ControlMessage::Withdraw(message) => {
-                let kinds = message.kind.as_ref().map_or(LeaseKind::ALL, std::slice::from_ref);
-                let keys: Vec<LeaseKey> = kinds.iter().copied().map(key).collect();
-                return self.withdraw(&common.topic, &keys, common.epoch, pointer);
-            }
-        };
-        let lease = Lease {
-            epoch: common.epoch,
-            ttl_s,
-            expires_at: (ttl_s > 0).then(|| now + Duration::from_secs(ttl_s.into())),
-            terms,
-        };
-        let changed = self.grant(&common.topic, key(kind), lease, pointer)?;
-        Ok(Applied {
-            lease_s: ttl_s,
-            changed,
-        })
+        if let ControlMessage::Withdraw(withdraw) = message {
+            let kinds = withdraw.kind.as_ref().map_or(LeaseKind::ALL, std::slice::from_ref);
+            let keys: Result<Vec<LeaseKey>, ControlError> = kinds
+                .iter()
+                .map(|kind| key_of(scope, me, *kind, &withdraw.common, pointer))
+                .collect();
+            return self.withdraw(&withdraw.common.topic, &keys?, withdraw.common.epoch, pointer);
+        }
+        let (topic, key, lease) = lease_of(now, scope, me, message, pointer)?;
+        let lease_s = lease.ttl_s;
+        let changed = self.grant(topic, key, lease, pointer)?;
+        Ok(Applied { lease_s, changed })
     }
 
     fn grant(&mut self, topic: &TopicName, key: LeaseKey, lease: Lease, pointer: &str) -> Result<bool, ControlError> {
         let held = self.topics.get(topic).and_then(|leases| leases.get(&key));
+        // A mere renewal changes nothing of what is kept.
+        let unsaved = held.is_none_or(|held| {
+            (held.epoch, held.ttl_s) != (lease.epoch, lease.ttl_s) || held.terms != lease.terms
+        });
         let changed = match held {
             Some(held) => {
                 check_epoch(held, lease.epoch, pointer)?;
@@ -264,6 +350,14 @@ impl LeaseTable {
         if let Some(at) = lease.expires_at {
             self.expiry.insert((at, topic.clone(), key.clone()));
         }
+        if self.stores.contains(&key.scope) {
+            let entry = (topic.clone(), key.clone());
+            self.ended.remove(&entry);
+            // While those of the broker are being read nobody knows what it keeps of this one.
+            if unsaved || self.reading.contains(&key.scope) {
+                self.unsaved.insert(entry);
+            }
+        }
         self.topics.entry(topic.clone()).or_default().insert(key, lease);
         Ok(changed)
     }
@@ -283,7 +377,12 @@ impl LeaseTable {
         }
         let mut changed = false;
         for key in keys {
-            changed |= self.remove(topic, key);
+            let removed = self.remove(topic, key);
+            // One that is not known here may be among those that are still being read.
+            if removed || self.reading.contains(&key.scope) {
+                self.note_end(topic, key);
+            }
+            changed |= removed;
         }
         Ok(Applied { lease_s: 0, changed })
     }
@@ -312,7 +411,12 @@ impl LeaseTable {
             let Some((at, topic, key)) = self.expiry.pop_first() else {
                 break;
             };
+            if self.not_renewable.contains(&key.scope) {
+                self.renew(now, &topic, &key);
+                continue;
+            }
             self.remove(&topic, &key);
+            self.note_end(&topic, &key);
             lapsed.push(LapsedLease { topic, key, at });
         }
         for lease in &lapsed {
@@ -375,8 +479,70 @@ fn check_epoch(held: &Lease, epoch: u64, pointer: &str) -> Result<(), ControlErr
     Ok(())
 }
 
+/// Who holds the lease that a message is about.
+fn key_of(
+    scope: Scope,
+    me: &FlowId,
+    kind: LeaseKind,
+    common: &Common,
+    pointer: &str,
+) -> Result<LeaseKey, ControlError> {
+    let (layer, node) = holder(scope, me, common, pointer)?;
+    Ok(LeaseKey {
+        scope,
+        kind,
+        layer,
+        node,
+        service: common.service.clone(),
+        instance: common.instance.clone(),
+    })
+}
+
+/// The lease that a message grants or renews; a withdrawal has none.
+fn lease_of<'m>(
+    now: Instant,
+    scope: Scope,
+    me: &FlowId,
+    message: &'m ControlMessage,
+    pointer: &str,
+) -> Result<(&'m TopicName, LeaseKey, Lease), ControlError> {
+    let (kind, ttl_s, terms) = match message {
+        ControlMessage::Advertise(message) => (
+            LeaseKind::Advertise,
+            message.ttl_s,
+            Terms::Advertise {
+                rate_hz: message.rate_hz,
+                max_bytes: message.max_bytes,
+                quality: message.quality.clone(),
+            },
+        ),
+        ControlMessage::Request(message) => (
+            LeaseKind::Request,
+            message.ttl_s,
+            Terms::Request {
+                max_rate_hz: message.max_rate_hz,
+                bare: message.bare,
+                from: message.from.clone(),
+                quality: message.quality.clone(),
+            },
+        ),
+        ControlMessage::Withdraw(_) => {
+            let error = ControlError::new(ErrorCode::UnknownOp, pointer, "a withdrawal grants nothing");
+            return Err(error);
+        }
+    };
+    let common = message.common();
+    let lease = Lease {
+        epoch: common.epoch,
+        ttl_s,
+        expires_at: (ttl_s > 0).then(|| now + Duration::from_secs(ttl_s.into())),
+        terms,
+    };
+    Ok((&common.topic, key_of(scope, me, kind, common, pointer)?, lease))
+}
+
 /// Layer and node of whoever speaks: where it was received, unless it says otherwise and may.
-fn holder(
+pub(super) fn holder(
     scope: Scope,
     me: &FlowId,
     common: &Common,

@@ -25,6 +25,7 @@ impl Setup {
         let broker = |name: &str, at_most_once| BrokerFacts {
             name: name.to_owned(),
             health: BrokerHealth::Up,
+            detail: String::new(),
             at_most_once,
         };
         let mut setup = Self {
@@ -265,7 +266,7 @@ fn the_answer_has_the_keys_of_the_contract_in_their_order() {
     let text = serde_json::to_string(&setup.why()).unwrap();
     let expected = concat!(
         r#"{"topic":"imu/data","to":"c/b","verdict":"not_flowing","code":"bridge_failed","remedy":"Read the step's "#,
-        r#"detail and the flow's log: the broker refused what the bridge needs.","steps":["#,
+        r#"detail: the broker refused what the bridge needs; it is tried again every 5 s.","steps":["#,
         r#"{"flow":"e/a","step":"advertise","ok":true,"code":"ok","detail":"driver on node scope"},"#,
         r#"{"flow":"c/b","step":"request","ok":true,"code":"ok","detail":"on node scope"},"#,
         r#"{"flow":"e/a","step":"plan","ok":true,"code":"ok","detail":"they match"},"#,

@@ -1,14 +1,15 @@
 //! The message path alone: a link that only takes notes, brokers that only collect.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use blaze_brokers::PublishOutcome;
+use blaze_brokers::{Later, PublishOutcome, Publisher, PublisherOptions};
 use blaze_domain::{LayerName, Priority};
 use parking_lot::Mutex;
 use proptest::prelude::*;
 
 use super::*;
-use crate::plan::Bridge;
+use crate::lane::path::BareInfo;
 
 #[derive(Default)]
 struct NotingLink {
@@ -114,7 +115,10 @@ impl Bench {
         };
         let out = Arc::clone(&self.out);
         self.core.apply(self.now, self.topic, info, &plan, |_| {
-            Some(Arc::clone(&out) as Arc<dyn Publisher>)
+            Ok(NewWriter {
+                publisher: Arc::clone(&out) as Arc<dyn Publisher>,
+                options: PublisherOptions::default(),
+            })
         });
     }
 
@@ -228,8 +232,15 @@ fn bare_payloads_get_an_identity_of_this_life_of_the_flow() {
         bridge(Scope::Node, Target::Node { bare: true }),
     ]);
     let info = TopicInfo {
-        encoding: "application/json".into(),
-        service: "imu".into(),
+        node: BareInfo {
+            encoding: "application/json".into(),
+            service: "imu".into(),
+            ..BareInfo::default()
+        },
+        layer: BareInfo {
+            service: "another".into(),
+            ..BareInfo::default()
+        },
         ..TopicInfo::default()
     };
     bench.apply(
@@ -372,7 +383,8 @@ proptest! {
             bench.take(Scope::Node, vec![Content::Frame(message)]);
             bench.now += Duration::from_millis(7);
         }
-        for bridge in &bench.core.path(bench.topic).bridges {
+        for bridge in &mut bench.core.path_mut(bench.topic).bridges {
+            bridge.settle();
             let stats = &bridge.stats;
             prop_assert_eq!(stats.taken.messages, stats.out.messages + stats.dropped.total() + stats.queued());
         }
