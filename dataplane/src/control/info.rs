@@ -23,7 +23,10 @@ pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
         node: bare_info(&of(Scope::Node)),
         layer: bare_info(&of(Scope::Layer)),
         max_bytes: offers().filter_map(|(_, bytes)| bytes).max(),
-        rate_hz: offers().map(|(rate, _)| rate).sum::<Option<f64>>().filter(|_| !all.is_empty()),
+        rate_hz: offers()
+            .map(|(rate, _)| rate)
+            .sum::<Option<f64>>()
+            .filter(|_| !all.is_empty()),
     }
 }
 

@@ -10,6 +10,7 @@
 //! brokers, the simulated network with plain calls.
 
 mod info;
+mod routes;
 mod scopes;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -17,16 +18,17 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::control::EventKind;
 use blaze_domain::names::ChannelName;
-use blaze_domain::{FlowId, LayerKind, Scope, TopicName, WhyCode};
-use blaze_proto::link::link_control::{Body, RouteState};
+use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
+use blaze_proto::link::link_control::Body;
 use bytes::Bytes;
 
 use crate::lane::path::TopicInfo;
 use crate::link::LinkEvent;
-use crate::plan::{Bridge, Destination, PlanRules, Target, TopicPlan, plan_topic};
+use crate::plan::{PlanRules, TopicPlan, plan_topic};
 use crate::registry::{EventDraft, LayerNames, Registry, RegistryConfig, UnsavedLease};
 use crate::world::{FlowState, LayerScopeId, Reach, World};
 use info::local_info;
+use routes::route_states;
 pub use scopes::ScopeHealth;
 use scopes::{LOCAL, Scopes};
 
@@ -38,9 +40,6 @@ pub const LATEST: Duration = Duration::from_millis(250);
 pub const LISTEN: Duration = Duration::from_millis(1500);
 /// All topics are planned anew that often, changed or not.
 pub const RECONCILE: Duration = Duration::from_secs(5);
-
-/// Routes of one topic that other flows are told of.
-const MAX_ROUTE_STATES: usize = 16;
 
 /// What the control core wants done.
 #[derive(Debug)]
@@ -439,58 +438,6 @@ fn draft(event: EventKind, topic: Option<TopicName>) -> EventDraft {
         topic,
         code: "",
         detail: String::new(),
-    }
-}
-
-/// What this flow does for a topic, as other flows are told for their `why`.
-fn route_states(me: &FlowId, plan: &TopicPlan, health: impl Fn(Scope) -> ScopeHealth) -> Vec<RouteState> {
-    let carried = plan.bridges.iter().map(|bridge| {
-        let (to_layer, receiver) = match &bridge.to {
-            Target::Inter { layer, receiver } => (layer.to_string(), receiver.to_string()),
-            Target::Node { .. } | Target::Layer => (me.layer.to_string(), me.to_string()),
-        };
-        let (step, code) = state_of(bridge, &health);
-        RouteState {
-            to_layer,
-            receiver,
-            step: step.to_owned(),
-            ok: code == WhyCode::Ok,
-            code: code.as_str().to_owned(),
-            next_offset: 0,
-        }
-    });
-    let blocked = plan.blocked.iter().map(|blocked| {
-        let (to_layer, receiver) = match &blocked.to {
-            Destination::Flow(flow) => (flow.layer.to_string(), flow.to_string()),
-            Destination::Layer(layer) => (layer.to_string(), String::new()),
-        };
-        RouteState {
-            to_layer,
-            receiver,
-            step: "plan".to_owned(),
-            ok: false,
-            code: blocked.code.as_str().to_owned(),
-            next_offset: 0,
-        }
-    });
-    let mut states: Vec<RouteState> = carried.chain(blocked).collect();
-    // Where there are too many, what fails is told first.
-    states.sort_by_key(|state| state.ok);
-    states.truncate(MAX_ROUTE_STATES);
-    states
-}
-
-/// The step that a bridge is at, and what is wrong with it.
-fn state_of(bridge: &Bridge, health: impl Fn(Scope) -> ScopeHealth) -> (&'static str, WhyCode) {
-    let (step, target) = match &bridge.to {
-        Target::Inter { .. } => ("bridge", Scope::Inter),
-        Target::Node { .. } => ("deliver", Scope::Node),
-        Target::Layer => ("deliver", Scope::Layer),
-    };
-    match (health(bridge.from).fault(), health(target).fault()) {
-        (Some(code), _) => ("bridge", code),
-        (None, Some(code)) => (step, code),
-        (None, None) => (step, WhyCode::Ok),
     }
 }
 

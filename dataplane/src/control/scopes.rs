@@ -109,7 +109,11 @@ impl ControlCore {
             }
             let leased = self.registry.channel_depth(topic, scope);
             let bridges = self.plans.get(topic).map_or(&[][..], |plan| &plan.bridges);
-            let written = bridges.iter().filter(|bridge| writes(bridge, scope)).map(depth_of).max();
+            let written = bridges
+                .iter()
+                .filter(|bridge| writes(bridge, scope))
+                .map(depth_of)
+                .max();
             let wanted = leased.max(written);
             let key = (scope, topic.clone());
             if self.scopes.prepared.get(&key).copied() == wanted {

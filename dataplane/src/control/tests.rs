@@ -4,6 +4,7 @@ use blaze_domain::LayerKind;
 use serde_json::{Value, json};
 
 use super::*;
+use crate::plan::Bridge;
 
 struct Bench {
     core: ControlCore,
@@ -105,9 +106,15 @@ fn a_flow_is_starting_until_all_kept_leases_are_read() {
     assert_eq!(bench.core.state(), FlowState::Ready);
     bench.step(300);
     assert_eq!(bench.bridges("imu/data"), ["node>Layer"]);
-    let told = bench.outputs.iter().filter(|output| matches!(output, Output::Publish { .. }));
+    let told = bench
+        .outputs
+        .iter()
+        .filter(|output| matches!(output, Output::Publish { .. }));
     let events: Vec<String> = told.map(|output| format!("{output:?}")).collect();
-    assert!(events.iter().all(|event| event.contains("route_up")), "no refusal, no answer: {events:?}");
+    assert!(
+        events.iter().all(|event| event.contains("route_up")),
+        "no refusal, no answer: {events:?}"
+    );
     assert_eq!(bench.channels(), ["+node imu/data 0", "+layer imu/data 0"]);
 }
 
@@ -118,7 +125,12 @@ fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
     bench.core.set_scope_health(bench.now, Scope::Layer, ScopeHealth::InUse);
     bench.step(0);
     assert_eq!(bench.core.state(), FlowState::Ready);
-    assert!(bench.outputs.iter().any(|output| matches!(output, Output::LayerScope { shared: false })));
+    assert!(
+        bench
+            .outputs
+            .iter()
+            .any(|output| matches!(output, Output::LayerScope { shared: false }))
+    );
     bench.send(Scope::Node, &lease("advertise", "t"));
     bench.send(Scope::Layer, &lease("request", "t"));
     bench.step(300);
@@ -127,9 +139,17 @@ fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
     bench.outputs.clear();
     bench.core.set_scope_health(bench.now, Scope::Layer, ScopeHealth::Up);
     bench.step(300);
-    assert!(bench.outputs.iter().any(|output| matches!(output, Output::LayerScope { shared: true })));
+    assert!(
+        bench
+            .outputs
+            .iter()
+            .any(|output| matches!(output, Output::LayerScope { shared: true }))
+    );
     assert_eq!(bench.bridges("t"), ["node>Layer"]);
-    assert!(bench.core.is_reading_leases(Scope::Layer), "what is kept there may have changed");
+    assert!(
+        bench.core.is_reading_leases(Scope::Layer),
+        "what is kept there may have changed"
+    );
     bench.core.set_scope_health(bench.now, Scope::Node, ScopeHealth::InUse);
     bench.step(300);
     assert_eq!(bench.bridges("t"), [""; 0]);
@@ -151,7 +171,11 @@ fn a_channel_is_made_before_the_answer_and_kept_while_it_is_used() {
         .filter_map(|output| match output {
             Output::Prepare { depth: 3, .. } => Some("prepare"),
             Output::SaveLease(lease) if lease.scope == Scope::Layer => Some("save"),
-            Output::Publish { scope: Scope::Layer, channel, .. } if *channel == ChannelName::shared_reply() => Some("answer"),
+            Output::Publish {
+                scope: Scope::Layer,
+                channel,
+                ..
+            } if *channel == ChannelName::shared_reply() => Some("answer"),
             _ => None,
         })
         .collect();
@@ -201,8 +225,20 @@ fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
         parts: 1,
         entries: vec![entry],
     };
-    bench.core.link_event(bench.now, LinkEvent::Hello { from: other.clone(), hello: Box::new(hello) });
-    bench.core.link_event(bench.now, LinkEvent::Control { from: other, body: Body::Delta(delta) });
+    bench.core.link_event(
+        bench.now,
+        LinkEvent::Hello {
+            from: other.clone(),
+            hello: Box::new(hello),
+        },
+    );
+    bench.core.link_event(
+        bench.now,
+        LinkEvent::Control {
+            from: other,
+            body: Body::Delta(delta),
+        },
+    );
     bench.send(Scope::Node, &lease("advertise", "imu_data"));
     bench.step(300);
     assert_eq!(bench.bridges("imu_data"), ["node>Layer"]);
@@ -212,7 +248,10 @@ fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
     bench.send(Scope::Node, &lease("advertise", "imu_data"));
     bench.step(300);
     assert_eq!(bench.bridges("imu_data"), [""; 0]);
-    assert_eq!(bench.routes("imu_data"), [("plan".to_owned(), "name_collision".to_owned())]);
+    assert_eq!(
+        bench.routes("imu_data"),
+        [("plan".to_owned(), "name_collision".to_owned())]
+    );
     let blocked = &bench.core.plans()[&"imu_data".parse::<TopicName>().unwrap()].blocked;
     assert!(blocked[0].detail.contains("imu/data"), "{blocked:?}");
     bench.send(Scope::Layer, &lease("withdraw", "imu/data"));

@@ -13,6 +13,7 @@
 mod admin;
 mod control_task;
 mod epochs;
+mod health;
 mod metrics;
 pub mod pacing;
 mod peers_task;
@@ -30,10 +31,10 @@ use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use blaze_brokers::{Broker, BrokerKind, Health};
+use blaze_brokers::{Broker, BrokerKind};
 use blaze_domain::{FlowId, LayerKind, Priority, Scope};
 use blaze_proto::link::link_control::{Egress as SaidEgress, LayerScope};
-use blaze_runtime::admin::{AdminServer, CheckStatus, Gate, Readiness};
+use blaze_runtime::admin::{AdminServer, Readiness};
 use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
@@ -47,6 +48,7 @@ use crate::link::{DownReason, Engine, EngineConfig, Limits, LinkEvent};
 use crate::registry::{LayerNames, peers_channel};
 use crate::world::LayerScopeId;
 pub use epochs::Epochs;
+use health::{readiness, watch_health};
 use pacing::Egress;
 use peers_task::PeersTask;
 use plane::{News, Plane, wall_ns};
@@ -170,10 +172,6 @@ pub struct RunningFlow {
 const DRAIN: Duration = Duration::from_millis(600);
 /// How long its good-bye may take to leave.
 const GOODBYE: Duration = Duration::from_millis(100);
-/// `why` looks at what happened during the last one to two of these.
-const MARK: Duration = Duration::from_secs(2);
-/// How often the health of brokers and link is looked at.
-const HEALTH: Duration = Duration::from_millis(200);
 
 /// How long brokers may take to deliver what they have taken when the flow ends.
 const CLOSE: Duration = Duration::from_millis(1500);
@@ -454,7 +452,8 @@ fn watch_brokers(shared: &Arc<Shared>, supervisor: &Supervisor, life: (LayerKind
         };
         let shares = scope == Scope::Layer && broker.kind() == BrokerKind::Kafka;
         let (tell, listened) = watch::channel(true);
-        if let (true, Some(side), Some(channel), Some(id)) = (shares, broker.flow_side(), peers_channel(), layer_scope) {
+        if let (true, Some(side), Some(channel), Some(id)) = (shares, broker.flow_side(), peers_channel(), layer_scope)
+        {
             tell.send_replace(false);
             let peers = PeersTask {
                 broker: Arc::clone(broker),
@@ -492,65 +491,6 @@ fn said_layer_scope(layer: Option<&LayerBroker>) -> (LayerScope, u64) {
         BrokerKind::Memory | BrokerKind::Redis => LayerScope::None,
     };
     (kind, layer.id.0)
-}
-
-fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {
-    let readiness = Readiness::new();
-    let there = [
-        ("node_broker", brokers.node.is_some()),
-        ("layer_broker", brokers.layer.is_some()),
-        ("inter", inter),
-    ];
-    for (check, _) in there.into_iter().filter(|(_, there)| *there) {
-        readiness.add(check, Gate::Decides, CheckStatus::Failed, "starting");
-    }
-    readiness.add("config", Gate::Shows, CheckStatus::Ok, "");
-    readiness
-}
-
-/// Keeps the checks of `/readyz` true to brokers and link, until the process ends.
-async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: CancellationToken) {
-    let mut listened = false;
-    let mut marked = Instant::now();
-    loop {
-        if marked.elapsed() >= MARK {
-            marked = Instant::now();
-            let forgotten = shared.plane.read(|state| {
-                state.core.mark();
-                state.core.forget_unused(marked)
-            });
-            if forgotten > 0 {
-                tracing::debug!(forgotten, "topics that nobody uses");
-            }
-            shared.tell_link();
-        }
-        for (check, scope) in [("node_broker", Scope::Node), ("layer_broker", Scope::Layer)] {
-            let Some(broker) = shared.brokers.of(scope) else { continue };
-            let status = broker.status().borrow().clone();
-            let (state, detail) = match status.health {
-                Health::Up if shared.control.lock().is_reading_leases(scope) => {
-                    (CheckStatus::Failed, format!("{}: reading leases", status.detail))
-                }
-                Health::Up => (CheckStatus::Ok, status.detail),
-                _ => (CheckStatus::Failed, status.detail),
-            };
-            shared.readiness.set(check, state, detail);
-        }
-        if let Some(transport) = &shared.transport {
-            let status = transport.status();
-            let (state, detail) = match (status.ready, listened) {
-                (true, true) => (CheckStatus::Ok, status.detail),
-                (true, false) => (CheckStatus::Failed, "listening for other flows".to_owned()),
-                (false, _) => (CheckStatus::Failed, status.detail),
-            };
-            shared.readiness.set("inter", state, detail);
-        }
-        tokio::select! {
-            () = stop.cancelled() => return,
-            () = tokio::time::sleep(HEALTH) => {}
-            () = ready.notified() => listened = true,
-        }
-    }
 }
 
 /// Classes in the order of [`Priority::ALL`], for labels.

@@ -129,7 +129,11 @@ impl PeersTask {
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
             if subscription.is_none() {
-                subscription = self.broker.subscribe(&self.channel, SubscribeOptions::default()).await.ok();
+                subscription = self
+                    .broker
+                    .subscribe(&self.channel, SubscribeOptions::default())
+                    .await
+                    .ok();
                 since = Instant::now();
             }
             if publisher.is_none() {
@@ -156,7 +160,9 @@ impl PeersTask {
             if first.is_some() != standing_back {
                 standing_back = first.is_some();
                 match first {
-                    Some(first) => tracing::warn!(%first, "another layer's flow uses this Kafka: give each layer a prefix"),
+                    Some(first) => {
+                        tracing::warn!(%first, "another layer's flow uses this Kafka: give each layer a prefix")
+                    }
                     None => tracing::info!("the Kafka of this layer is free again"),
                 }
                 self.side.stand_back(first.map(ToString::to_string));
@@ -235,9 +241,17 @@ mod tests {
         assert_eq!(first_of(&[("fog/a", 9)]).as_deref(), Some("fog/a"));
         assert_eq!(first_of(&[("fog/a", 11)]), None);
         assert_eq!(first_of(&[("fog/a", 9), ("edge/x", 8)]).as_deref(), Some("edge/x"));
-        assert_eq!(first_of(&[("a/z", 10)]).as_deref(), Some("a/z"), "of equal epochs the smaller name");
+        assert_eq!(
+            first_of(&[("a/z", 10)]).as_deref(),
+            Some("a/z"),
+            "of equal epochs the smaller name"
+        );
         assert_eq!(first_of(&[("fog/a", 10)]), None);
-        assert_eq!(first_of(&[("cloud/a", 1), ("cloud/b", 2)]), None, "the own layer shares it");
+        assert_eq!(
+            first_of(&[("cloud/a", 1), ("cloud/b", 2)]),
+            None,
+            "the own layer shares it"
+        );
     }
 
     #[test]
@@ -250,7 +264,10 @@ mod tests {
         assert!(claims.first(now + Duration::from_millis(4998)).is_some());
         assert!(claims.first(now + Duration::from_millis(4999)).is_none());
         claims.hear(now + Duration::from_secs(6), &hello("fog/a", 12));
-        assert!(claims.first(now + Duration::from_secs(6)).is_none(), "it began anew, after us");
+        assert!(
+            claims.first(now + Duration::from_secs(6)).is_none(),
+            "it began anew, after us"
+        );
     }
 
     #[test]

@@ -115,7 +115,9 @@ impl Routes {
         let applied = self.plane.with(|state| {
             let id = state.core.intern(topic, now)?;
             state.core.apply(now, id, info, plan, |bridge| {
-                let made = writers.iter().position(|(from, to, _)| (*from, *to) == (bridge.from, &bridge.to));
+                let made = writers
+                    .iter()
+                    .position(|(from, to, _)| (*from, *to) == (bridge.from, &bridge.to));
                 made.map_or_else(|| Err(String::new()), |at| writers.swap_remove(at).2)
             });
             let path = state.core.path(id);
@@ -268,7 +270,9 @@ impl SourceTask {
                         tracing::warn!(channel = %self.channel, scope = %self.scope, %error, "cannot subscribe, trying on");
                     }
                     *self.state.lock() = match error {
-                        BrokerError::Name { .. } | BrokerError::TooManyChannels(_) => SourceState::Failed(error.to_string()),
+                        BrokerError::Name { .. } | BrokerError::TooManyChannels(_) => {
+                            SourceState::Failed(error.to_string())
+                        }
                         BrokerError::Away(_) | BrokerError::Closed => SourceState::Starting,
                     };
                 }

@@ -35,7 +35,10 @@ impl ScopeTask {
                 control.set_scope_health(Instant::now(), self.scope, scope_health(health));
                 control.is_reading_leases(self.scope)
             };
-            let load = load(side.as_ref().filter(|_| reading && health == Health::Up), &mut self.listened);
+            let load = load(
+                side.as_ref().filter(|_| reading && health == Health::Up),
+                &mut self.listened,
+            );
             tokio::select! {
                 () = self.stop.cancelled() => return,
                 () = changed(&mut status) => {}

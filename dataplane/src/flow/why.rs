@@ -14,8 +14,8 @@ use serde_json::{Value, json};
 
 use super::Shared;
 use super::admin::{answer, query_text, refusal};
-use crate::control::ControlCore;
 use super::routes::SourceState;
+use crate::control::ControlCore;
 use crate::lane::path::{BridgeState as Bridge, Phase};
 use crate::plan::TopicPlan;
 use crate::why::{

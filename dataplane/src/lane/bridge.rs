@@ -5,7 +5,8 @@ use std::time::{Duration, Instant};
 use blaze_brokers::PublishOutcome;
 use blaze_domain::{DropReason, Priority};
 
-use super::core::{Admitted, LaneLink};
+use super::admit::Admitted;
+use super::core::LaneLink;
 use super::measure::RateMeter;
 use super::path::{BridgeState, Phase, Sink, TopicId};
 use super::stats::BridgeStats;

@@ -8,23 +8,24 @@
 //! Without input or output of its own: brokers are writers that never wait, the link is a [`LaneLink`], time is given.
 //! Production holds it behind one lock that is taken once per batch; the simulated network drives the same code.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::num::NonZeroUsize;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Content, Received};
-use blaze_domain::{DropReason, FlowId, Origin, Scope, TopicName, WriterId};
-use blaze_proto::{Frame, Header};
-use bytes::Bytes;
+use blaze_brokers::Received;
+use blaze_domain::{DropReason, FlowId, Scope, TopicName, WriterId};
+use blaze_proto::Frame;
 use lru::LruCache;
 
+use super::admit::Admitted;
 use super::measure::micros;
-use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
+use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
+use super::places::topic_id;
 use super::stats::Drops;
 use super::window::DuplicateWindow;
 use super::writer::{NewWriter, Writer};
 use crate::link::{Engine, LaneId, Submit};
-use crate::plan::{Bridge, Target, TopicPlan};
+use crate::plan::Target;
 
 /// Writers whose duplicate window a flow keeps; the least recently used go first.
 pub const MAX_WRITERS: usize = 65_536;
@@ -75,46 +76,21 @@ pub struct DataConfig {
 
 /// The data plane of one flow.
 pub struct DataCore {
-    config: DataConfig,
-    topics: Vec<TopicPath>,
-    by_name: HashMap<TopicName, TopicId>,
-    windows: LruCache<(TopicId, WriterId), DuplicateWindow>,
-    lanes: Vec<(TopicId, usize)>,
+    pub(super) config: DataConfig,
+    pub(super) topics: Vec<TopicPath>,
+    pub(super) by_name: HashMap<TopicName, TopicId>,
+    pub(super) windows: LruCache<(TopicId, WriterId), DuplicateWindow>,
+    pub(super) lanes: Vec<(TopicId, usize)>,
     /// Places of topics that were forgotten.
-    vacant: Vec<TopicId>,
+    pub(super) vacant: Vec<TopicId>,
     /// Lanes of topics that were forgotten.
-    free_lanes: Vec<LaneId>,
+    pub(super) free_lanes: Vec<LaneId>,
     /// A bridge empties its queue.
-    draining: bool,
+    pub(super) draining: bool,
     /// What could not be attributed to a topic.
     pub unattributed: Drops,
     /// Windows that gave way to newer writers.
     pub evicted_writers: u64,
-}
-
-/// Where a message stands when it reaches the bridges.
-pub(super) struct Admitted {
-    /// As a broker gets it: with the hop that writing it is, and its age.
-    pub(super) frame: Frame,
-    /// Flows that wrote it so far, this one not among them.
-    pub(super) hops: u32,
-    pub(super) born_here: bool,
-    pub(super) age_us: u64,
-    /// Since it came to this flow.
-    pub(super) here_us: u64,
-}
-
-impl Admitted {
-    fn new(frame: Frame, born_here: bool, age_us: u64, here_us: u64) -> Self {
-        let hops = frame.hops();
-        Self {
-            frame: frame.with_hops_and_age(hops.saturating_add(1), age_us),
-            hops,
-            born_here,
-            age_us,
-            here_us,
-        }
-    }
 }
 
 impl DataCore {
@@ -211,135 +187,9 @@ impl DataCore {
         }
     }
 
-    /// Forgets topics that nobody has used for [`FORGET`]; to be called every few seconds. Returns how many.
-    pub fn forget_unused(&mut self, now: Instant) -> usize {
-        let before = self.vacant.len();
-        for (index, path) in self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant) {
-            if !path.is_idle() {
-                path.idle = None;
-                continue;
-            }
-            let since = *path.idle.get_or_insert(now);
-            if now.saturating_duration_since(since) < FORGET {
-                continue;
-            }
-            self.by_name.remove(&path.name);
-            self.free_lanes.extend(path.bridges.iter().filter_map(BridgeState::lane_id));
-            path.bridges = Vec::new();
-            path.bare.clear();
-            path.vacant = true;
-            self.vacant.push(topic_id(index));
-        }
-        let forgotten: HashSet<TopicId> = self.vacant[before..].iter().copied().collect();
-        if !forgotten.is_empty() {
-            let windows = self.windows.iter().map(|(key, _)| *key);
-            let gone: Vec<_> = windows.filter(|(topic, _)| forgotten.contains(topic)).collect();
-            for key in gone {
-                self.windows.pop(&key);
-            }
-        }
-        forgotten.len()
-    }
-
     /// Changes what counts as large, from the next message on.
     pub fn set_large_bytes(&mut self, bytes: u64) {
         self.config.large_bytes = bytes;
-    }
-
-    /// The number of a topic, given at first use. `None` when there are [`MAX_TOPICS`] already.
-    pub fn intern(&mut self, name: &TopicName, now: Instant) -> Option<TopicId> {
-        if let Some(id) = self.by_name.get(name) {
-            return Some(*id);
-        }
-        let path = TopicPath::new(name.clone(), now);
-        let id = match self.vacant.pop() {
-            Some(id) => {
-                self.topics[id.0 as usize] = path;
-                id
-            }
-            None if self.topics.len() >= MAX_TOPICS => return None,
-            None => {
-                self.topics.push(path);
-                topic_id(self.topics.len() - 1)
-            }
-        };
-        self.by_name.insert(name.clone(), id);
-        Some(id)
-    }
-
-    /// Makes the bridges of a topic equal to its plan. `writer` gives what writes to a local target, for each bridge one of
-    /// its own, or says why it cannot be made: then the bridge has failed. Bridges that are no longer planned drain.
-    pub fn apply(
-        &mut self,
-        now: Instant,
-        topic: TopicId,
-        info: TopicInfo,
-        plan: &TopicPlan,
-        mut writer: impl FnMut(&Bridge) -> Result<NewWriter, String>,
-    ) {
-        let path = &mut self.topics[topic.0 as usize];
-        path.info = info;
-        for bridge in &mut path.bridges {
-            let planned = plan
-                .bridges
-                .iter()
-                .any(|p| p.from == bridge.from && p.to == bridge.target);
-            match bridge.phase {
-                Phase::Up { .. } if !planned => {
-                    bridge.phase = Phase::Draining { until: now + DRAIN };
-                    self.draining = true;
-                }
-                Phase::Failed { .. } if !planned => bridge.end(now),
-                _ => {}
-            }
-        }
-        for planned in &plan.bridges {
-            let at = self.place_of(now, topic, planned);
-            let bridge = &mut self.topics[topic.0 as usize].bridges[at];
-            bridge.renew(now, planned);
-            if let Sink::Publish { .. } = bridge.sink {
-                bridge.set_writer(now, writer(planned));
-            }
-        }
-    }
-
-    /// Where the bridge is in its topic; it is made where there is none yet.
-    fn place_of(&mut self, now: Instant, topic: TopicId, planned: &Bridge) -> usize {
-        let path = &mut self.topics[topic.0 as usize];
-        let same = |b: &BridgeState| b.from == planned.from && b.target == planned.to;
-        if let Some(at) = path.bridges.iter().position(same) {
-            return at;
-        }
-        let class = path.class(&planned.lane, self.config.large_bytes);
-        let old = path.bridges.iter().position(|bridge| bridge.is_forgotten(now));
-        let at = old.unwrap_or(path.bridges.len());
-        let old_lane = old.and_then(|at| path.bridges[at].lane_id());
-        let sink = match &planned.to {
-            Target::Inter { .. } => {
-                let lane = old_lane.or_else(|| self.free_lanes.pop()).unwrap_or_else(|| {
-                    self.lanes.push((topic, at));
-                    LaneId(u32::try_from(self.lanes.len() - 1).unwrap_or(u32::MAX))
-                });
-                if let Some(place) = self.lanes.get_mut(lane.0 as usize) {
-                    *place = (topic, at);
-                }
-                Sink::Lane { lane, class }
-            }
-            target => {
-                self.free_lanes.extend(old_lane);
-                Sink::Publish {
-                    writer: None,
-                    past: Vec::new(),
-                    bare: is_bare(target),
-                }
-            }
-        };
-        let bridge = BridgeState::new(now, planned, sink);
-        match path.bridges.get_mut(at) {
-            Some(place) => *place = bridge,
-            None => path.bridges.push(bridge),
-        }
-        at
     }
 
     /// Takes a batch that a local scope delivered. `wall_ns` is the clock since 1970 at `now`.
@@ -460,121 +310,6 @@ impl DataCore {
         self.topics.get_mut(topic.0 as usize)?.bridges.get_mut(bridge)
     }
 
-    fn check_local(
-        &mut self,
-        now: Instant,
-        wall_ns: u64,
-        topic: TopicId,
-        from: Scope,
-        received: Received,
-    ) -> Result<Admitted, DropReason> {
-        let at = received.at;
-        let waited_us = received.broker_age_us + micros(now.saturating_duration_since(at));
-        let (frame, bare) = match received.content {
-            Content::Malformed { .. } => return Err(DropReason::DecodeError),
-            Content::Frame(frame) => (frame, false),
-            Content::Bare { payload, identity } => (
-                self.wrap(wall_ns.saturating_sub(waited_us * 1000), topic, from, payload, identity)?,
-                true,
-            ),
-        };
-        if frame.topic() != self.path(topic).name.as_str() {
-            return Err(DropReason::DecodeError);
-        }
-        let born_here = frame.hops() == 0;
-        if from == Scope::Node && !born_here {
-            // Only this flow writes to its node scope, and what it writes carries hops.
-            return Err(DropReason::Echo);
-        }
-        let me = &self.config.me;
-        let own_layer = frame.origin_layer() == me.layer.as_str();
-        let own_node = frame.origin_node() == me.node.as_str();
-        let foreign = match from {
-            Scope::Node => !(own_layer && own_node),
-            Scope::Layer | Scope::Inter => born_here && !own_layer,
-        };
-        // Before the window takes the number: a foreign message must not silence the writer whose name it bears.
-        if foreign {
-            return Err(DropReason::ForeignOrigin);
-        }
-        if !self.is_new(topic, &frame) {
-            // What a flow has written carries hops; a publisher that repeats itself does not.
-            return Err(if born_here {
-                DropReason::Duplicate
-            } else {
-                DropReason::Echo
-            });
-        }
-        let mut age_us = frame.age_us().saturating_add(waited_us);
-        if from == Scope::Node && !bare {
-            // One host, one clock: the publisher's time tells what nobody could measure.
-            age_us = age_us.max(wall_ns.saturating_sub(frame.publish_time_ns()) / 1000);
-        }
-        let path = &mut self.topics[topic.0 as usize];
-        let bytes = frame.payload().len() as u64;
-        path.largest_bytes = path.largest_bytes.max(bytes);
-        path.in_rate.add(now, bytes);
-        let here_us = micros(now.saturating_duration_since(at));
-        Ok(Admitted::new(frame, born_here, age_us, here_us))
-    }
-
-    /// Gives a bare payload its header.
-    fn wrap(
-        &mut self,
-        publish_time_ns: u64,
-        topic: TopicId,
-        from: Scope,
-        payload: Bytes,
-        identity: Option<(WriterId, u64)>,
-    ) -> Result<Frame, DropReason> {
-        let config = &self.config;
-        let path = &mut self.topics[topic.0 as usize];
-        let (writer, sequence) = identity.unwrap_or_else(|| {
-            let (writer, sequence) = path
-                .bare
-                .entry(from)
-                .or_insert_with(|| (bare_writer(config, from, path.name.as_str()), 0));
-            *sequence += 1;
-            (*writer, *sequence)
-        });
-        let info = path.info.bare(from);
-        let node = if from == Scope::Node {
-            config.me.node.to_string()
-        } else {
-            String::new()
-        };
-        let origin = Origin {
-            layer: config.me.layer.to_string(),
-            node,
-            service: info.service.clone(),
-            instance: info.instance.clone(),
-            epoch: config.epoch,
-        };
-        let header = Header {
-            encoding: info.encoding.clone(),
-            lifespan_ms: info.lifespan_ms,
-            priority: info.priority,
-            reliable: info.reliable,
-            depth: info.depth,
-            ..Header::new(path.name.as_str(), origin, writer, sequence, publish_time_ns)
-        };
-        Frame::new(&header, payload).map_err(|_| DropReason::TooLarge)
-    }
-
-    fn is_new(&mut self, topic: TopicId, frame: &Frame) -> bool {
-        let key = (topic, frame.writer());
-        if let Some(window) = self.windows.get_mut(&key) {
-            return window.insert(frame.sequence());
-        }
-        if self.windows.len() == self.windows.cap().get() {
-            self.evicted_writers += 1;
-        }
-        let mut window = DuplicateWindow::default();
-        window.insert(frame.sequence());
-        self.windows.put(key, window);
-        true
-    }
-
     fn fan_out(&mut self, now: Instant, topic: TopicId, from: Scope, message: &Admitted, link: &mut dyn LaneLink) {
         let large_bytes = self.config.large_bytes;
         let path = &mut self.topics[topic.0 as usize];
@@ -585,27 +320,6 @@ impl DataCore {
             }
         }
     }
-}
-
-fn topic_id(index: usize) -> TopicId {
-    TopicId(u32::try_from(index).unwrap_or(u32::MAX))
-}
-
-fn is_bare(target: &Target) -> bool {
-    matches!(target, Target::Node { bare: true })
-}
-
-/// Writer of bare messages that this flow numbers: new at each start of the flow.
-fn bare_writer(config: &DataConfig, from: Scope, topic: &str) -> WriterId {
-    use sha2::{Digest, Sha256};
-    let text = format!(
-        "{from}|{}|{}|{topic}|{}|{}",
-        config.me.layer, config.me.node, config.epoch, config.salt
-    );
-    let digest = Sha256::digest(text.as_bytes());
-    let mut id = [0; 16];
-    id.copy_from_slice(&digest[..16]);
-    WriterId(id)
 }
 
 #[cfg(test)]

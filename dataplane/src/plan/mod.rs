@@ -54,8 +54,9 @@ impl TopicPlan {
             code,
             detail: detail.to_owned(),
         };
-        let (gone, kept): (Vec<Bridge>, Vec<Bridge>) =
-            std::mem::take(&mut self.bridges).into_iter().partition(Bridge::uses_layer);
+        let (gone, kept): (Vec<Bridge>, Vec<Bridge>) = std::mem::take(&mut self.bridges)
+            .into_iter()
+            .partition(Bridge::uses_layer);
         self.bridges = kept;
         if !gone.is_empty() {
             self.blocked.push(blocked(Destination::Layer(me.layer.clone())));
@@ -64,7 +65,8 @@ impl TopicPlan {
             self.blocked.push(blocked(Destination::Flow(me.clone())));
         }
         self.blocked.sort();
-        self.blocked.dedup_by(|next, kept| next.to == kept.to && next.code == kept.code);
+        self.blocked
+            .dedup_by(|next, kept| next.to == kept.to && next.code == kept.code);
     }
 }
 

@@ -9,7 +9,7 @@ use blaze_domain::control::{
 };
 use blaze_domain::{FlowId, InstanceName, LayerName, NodeName, Scope, ServiceName, TopicName};
 
-use super::stored::{UnsavedLease, unsaved};
+use super::holder::{key_of, lease_of};
 
 /// Most lapsed leases that are remembered for people who ask why a topic stopped.
 const MAX_LAPSED: usize = 1024;
@@ -153,32 +153,21 @@ pub struct LapsedLease {
 
 /// All leases of one flow, bounded.
 pub(super) struct LeaseTable {
-    topics: BTreeMap<TopicName, BTreeMap<LeaseKey, Lease>>,
-    expiry: BTreeSet<(Instant, TopicName, LeaseKey)>,
+    pub(super) topics: BTreeMap<TopicName, BTreeMap<LeaseKey, Lease>>,
+    pub(super) expiry: BTreeSet<(Instant, TopicName, LeaseKey)>,
     count: usize,
-    limit: usize,
+    pub(super) limit: usize,
     lapsed: VecDeque<LapsedLease>,
     /// Scopes whose broker keeps leases.
-    stores: BTreeSet<Scope>,
+    pub(super) stores: BTreeSet<Scope>,
     /// Leases that are to be written to or removed from the broker that keeps them.
-    unsaved: BTreeSet<(TopicName, LeaseKey)>,
+    pub(super) unsaved: BTreeSet<(TopicName, LeaseKey)>,
     /// Scopes whose kept leases are being read.
-    reading: BTreeSet<Scope>,
+    pub(super) reading: BTreeSet<Scope>,
     /// Leases that ended while those of their scope were being read: what is read of them is old.
-    ended: BTreeSet<(TopicName, LeaseKey)>,
+    pub(super) ended: BTreeSet<(TopicName, LeaseKey)>,
     /// Scopes whose broker is away.
-    not_renewable: BTreeSet<Scope>,
-}
-
-/// What became of a kept lease.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Taken {
-    /// It lives again.
-    Restored,
-    /// A service was faster.
-    Newer,
-    /// There is no room for it.
-    Refused,
+    pub(super) not_renewable: BTreeSet<Scope>,
 }
 
 /// What a message did to the table.
@@ -211,49 +200,6 @@ impl LeaseTable {
         Some(view(topic, key, lease))
     }
 
-    pub(super) fn take_unsaved(&mut self) -> Vec<UnsavedLease> {
-        let changed = std::mem::take(&mut self.unsaved);
-        unsaved(self, changed)
-    }
-
-    pub(super) fn set_reading(&mut self, scope: Scope, reading: bool) {
-        if reading && self.stores.contains(&scope) {
-            self.reading.insert(scope);
-        } else {
-            self.reading.remove(&scope);
-            self.ended.retain(|(_, key)| key.scope != scope);
-        }
-    }
-
-    pub(super) fn is_reading(&self, scope: Scope) -> bool {
-        self.reading.contains(&scope)
-    }
-
-    pub(super) fn set_renewable(&mut self, now: Instant, scope: Scope, renewable: bool) {
-        if !renewable {
-            self.not_renewable.insert(scope);
-        } else if self.not_renewable.remove(&scope) {
-            let finite = self.expiry.iter().filter(|(_, _, key)| key.scope == scope);
-            let finite: Vec<_> = finite.map(|(_, topic, key)| (topic.clone(), key.clone())).collect();
-            for (topic, key) in finite {
-                self.renew(now, &topic, &key);
-            }
-        }
-    }
-
-    /// Gives a finite lease its whole ttl.
-    fn renew(&mut self, now: Instant, topic: &TopicName, key: &LeaseKey) {
-        let Some(lease) = self.topics.get_mut(topic).and_then(|leases| leases.get_mut(key)) else {
-            return;
-        };
-        if let Some(at) = lease.expires_at {
-            let until = now + Duration::from_secs(lease.ttl_s.into());
-            lease.expires_at = Some(until);
-            self.expiry.remove(&(at, topic.clone(), key.clone()));
-            self.expiry.insert((until, topic.clone(), key.clone()));
-        }
-    }
-
     /// Whether any lease of the topic is of that scope.
     pub(super) fn has(&self, topic: &TopicName, scope: Scope) -> bool {
         let leases = self.topics.get(topic);
@@ -262,36 +208,6 @@ impl LeaseTable {
 
     pub(super) fn topics(&self) -> impl Iterator<Item = &TopicName> {
         self.topics.keys()
-    }
-
-    /// Takes a lease that a broker has kept, unless a service was faster.
-    pub(super) fn restore(&mut self, now: Instant, scope: Scope, me: &FlowId, message: &ControlMessage) -> Taken {
-        let Ok((topic, key, lease)) = lease_of(now, scope, me, message, "") else {
-            return Taken::Refused;
-        };
-        let entry = (topic.clone(), key);
-        if self.get(&entry.0, &entry.1).is_some() || self.ended.contains(&entry) {
-            return Taken::Newer;
-        }
-        match self.grant(topic, entry.1.clone(), lease, "") {
-            Ok(_) => {
-                // It is there as it was written.
-                self.unsaved.remove(&entry);
-                Taken::Restored
-            }
-            Err(_) => Taken::Refused,
-        }
-    }
-
-    /// A lease has ended: the broker that keeps it is to forget it.
-    fn note_end(&mut self, topic: &TopicName, key: &LeaseKey) {
-        if !self.stores.contains(&key.scope) {
-            return;
-        }
-        self.unsaved.insert((topic.clone(), key.clone()));
-        if self.reading.contains(&key.scope) && self.ended.len() < self.limit {
-            self.ended.insert((topic.clone(), key.clone()));
-        }
     }
 
     pub(super) fn len(&self) -> usize {
@@ -321,12 +237,17 @@ impl LeaseTable {
         Ok(Applied { lease_s, changed })
     }
 
-    fn grant(&mut self, topic: &TopicName, key: LeaseKey, lease: Lease, pointer: &str) -> Result<bool, ControlError> {
+    pub(super) fn grant(
+        &mut self,
+        topic: &TopicName,
+        key: LeaseKey,
+        lease: Lease,
+        pointer: &str,
+    ) -> Result<bool, ControlError> {
         let held = self.topics.get(topic).and_then(|leases| leases.get(&key));
         // A mere renewal changes nothing of what is kept.
-        let unsaved = held.is_none_or(|held| {
-            (held.epoch, held.ttl_s) != (lease.epoch, lease.ttl_s) || held.terms != lease.terms
-        });
+        let unsaved =
+            held.is_none_or(|held| (held.epoch, held.ttl_s) != (lease.epoch, lease.ttl_s) || held.terms != lease.terms);
         let changed = match held {
             Some(held) => {
                 check_epoch(held, lease.epoch, pointer)?;
@@ -477,91 +398,4 @@ fn check_epoch(held: &Lease, epoch: u64, pointer: &str) -> Result<(), ControlErr
         ));
     }
     Ok(())
-}
-
-/// Who holds the lease that a message is about.
-fn key_of(
-    scope: Scope,
-    me: &FlowId,
-    kind: LeaseKind,
-    common: &Common,
-    pointer: &str,
-) -> Result<LeaseKey, ControlError> {
-    let (layer, node) = holder(scope, me, common, pointer)?;
-    Ok(LeaseKey {
-        scope,
-        kind,
-        layer,
-        node,
-        service: common.service.clone(),
-        instance: common.instance.clone(),
-    })
-}
-
-/// The lease that a message grants or renews; a withdrawal has none.
-fn lease_of<'m>(
-    now: Instant,
-    scope: Scope,
-    me: &FlowId,
-    message: &'m ControlMessage,
-    pointer: &str,
-) -> Result<(&'m TopicName, LeaseKey, Lease), ControlError> {
-    let (kind, ttl_s, terms) = match message {
-        ControlMessage::Advertise(message) => (
-            LeaseKind::Advertise,
-            message.ttl_s,
-            Terms::Advertise {
-                rate_hz: message.rate_hz,
-                max_bytes: message.max_bytes,
-                quality: message.quality.clone(),
-            },
-        ),
-        ControlMessage::Request(message) => (
-            LeaseKind::Request,
-            message.ttl_s,
-            Terms::Request {
-                max_rate_hz: message.max_rate_hz,
-                bare: message.bare,
-                from: message.from.clone(),
-                quality: message.quality.clone(),
-            },
-        ),
-        ControlMessage::Withdraw(_) => {
-            let error = ControlError::new(ErrorCode::UnknownOp, pointer, "a withdrawal grants nothing");
-            return Err(error);
-        }
-    };
-    let common = message.common();
-    let lease = Lease {
-        epoch: common.epoch,
-        ttl_s,
-        expires_at: (ttl_s > 0).then(|| now + Duration::from_secs(ttl_s.into())),
-        terms,
-    };
-    Ok((&common.topic, key_of(scope, me, kind, common, pointer)?, lease))
-}
-
-/// Layer and node of whoever speaks: where it was received, unless it says otherwise and may.
-pub(super) fn holder(
-    scope: Scope,
-    me: &FlowId,
-    common: &Common,
-    pointer: &str,
-) -> Result<(LayerName, Option<NodeName>), ControlError> {
-    let mismatch = |field: &str, found: &str, here: &str| {
-        Err(ControlError::new(
-            ErrorCode::SourceMismatch,
-            format!("{pointer}/{field}"),
-            format!("{found} is not the {field} where the message was received, {here}"),
-        ))
-    };
-    match &common.layer {
-        Some(layer) if *layer != me.layer => return mismatch("layer", layer.as_str(), me.layer.as_str()),
-        _ => {}
-    }
-    match (scope, &common.node) {
-        (Scope::Node, Some(node)) if *node != me.node => mismatch("node", node.as_str(), me.node.as_str()),
-        (Scope::Node, _) => Ok((me.layer.clone(), Some(me.node.clone()))),
-        (Scope::Layer | Scope::Inter, node) => Ok((me.layer.clone(), node.clone())),
-    }
 }

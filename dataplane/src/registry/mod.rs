@@ -9,6 +9,8 @@
 //! that each call reports as changed. Poll after every message and at [`Registry::next_poll`].
 
 mod announce;
+mod holder;
+mod kept;
 mod leases;
 mod merge;
 mod names;
@@ -33,10 +35,10 @@ use blaze_proto::link::link_control::{Body, RouteState};
 use announce::{Announcer, MAX_LEASED_ENTRIES};
 use leases::LeaseTable;
 pub use leases::{LapsedLease, LeaseKey, LeaseView, Terms};
+use names::NameBook;
 pub use names::{LayerNames, NameFault, peers_channel};
 pub use peers::MAX_FLOWS;
 pub use pieces::MAX_LINK_CONTROL_BYTES;
-use names::NameBook;
 use remote::Remote;
 pub use stored::{Restored, UnsavedLease};
 pub use types::{AnswerOut, Changes, ControlOutcome, EventDraft, RegistryConfig, RemoteLease, SyncFaults};
@@ -226,8 +228,9 @@ impl Registry {
             return Ok(());
         }
         let (leases, on_layer) = (&self.leases, &self.on_layer);
-        self.names
-            .claim(topic, |other| on_layer.contains(other) || leases.has(other, Scope::Layer))
+        self.names.claim(topic, |other| {
+            on_layer.contains(other) || leases.has(other, Scope::Layer)
+        })
     }
 
     /// A bridge of this flow is to read or write a topic on the layer scope, whether or not anybody leases it there.
@@ -346,13 +349,13 @@ impl Registry {
         self.leases.next_expiry()
     }
 
-    /// Whether a lease of the topic is of that scope, and the most samples that one of them asks to be kept per writer for
-    /// late joiners (0 = none).
+    /// The most samples that an advertisement of the topic on that scope keeps per writer for late joiners, 0 = none; `None`
+    /// where nobody leases the topic there.
     #[must_use]
     pub fn channel_depth(&self, topic: &TopicName, scope: Scope) -> Option<u32> {
         let of_scope = self.leases.of_topic(topic).filter(|lease| lease.key.scope == scope);
-        let depth = |lease: LeaseView<'_>| match lease.quality() {
-            quality if quality.durability == Durability::TransientLocal => quality.depth,
+        let depth = |lease: LeaseView<'_>| match (lease.key.kind, lease.quality().durability) {
+            (LeaseKind::Advertise, Durability::TransientLocal) => lease.quality().depth,
             _ => 0,
         };
         of_scope.map(depth).max()

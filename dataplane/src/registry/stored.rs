@@ -16,7 +16,9 @@ use blaze_domain::{FlowId, NodeName, Scope, TopicName};
 use bytes::Bytes;
 
 use super::Registry;
-use super::leases::{LeaseKey, LeaseTable, Taken, holder};
+use super::holder::holder;
+use super::kept::Taken;
+use super::leases::{LeaseKey, LeaseTable};
 
 /// What a broker is to do to the leases that it keeps.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -269,16 +269,14 @@ impl<'w> Explainer<'_, 'w> {
     }
 
     /// Why a lease is missing: nobody is heard on a scope that is another flow's, it lapsed, or there never was one.
-    fn missing(
-        &self,
-        kind: StepKind,
-        code: WhyCode,
-        nobody: impl Fn() -> String,
-    ) -> (&FlowId, WhyCode, String) {
+    fn missing(&self, kind: StepKind, code: WhyCode, nobody: impl Fn() -> String) -> (&FlowId, WhyCode, String) {
         let me = self.view.me;
         let to = self.input.to.as_ref().filter(|_| kind == StepKind::Request);
         let brokers = [&self.input.node_broker, &self.input.layer_broker];
-        let mut in_use = brokers.into_iter().flatten().filter(|broker| broker.health == BrokerHealth::InUse);
+        let mut in_use = brokers
+            .into_iter()
+            .flatten()
+            .filter(|broker| broker.health == BrokerHealth::InUse);
         if to.is_none_or(|to| to.layer == me.layer)
             && let Some((code, detail)) = in_use.find_map(fault)
         {

@@ -5,7 +5,9 @@ use std::fmt::Write as _;
 use blaze_domain::{DropReason, FlowId, Reliability, Scope, WhyCode};
 
 use super::{BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, Step, StepKind, Verdict, WhyInput, absence, absent};
-use crate::plan::{Blocked, Destination, Pairing, Publisher, Requester, Target, TopicView, asks_too_much, meets_directly, type_detail};
+use crate::plan::{
+    Blocked, Destination, Pairing, Publisher, Requester, Target, TopicView, asks_too_much, meets_directly, type_detail,
+};
 use crate::world::{FlowState, Reach};
 
 /// The steps of one pair, in the order of a message's way.

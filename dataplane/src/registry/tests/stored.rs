@@ -43,7 +43,12 @@ fn restore_all(registry: &mut Registry, now: Instant, kept: &Kept) -> [Restored;
 
 /// What a lease is, without its time.
 fn terms(registry: &Registry) -> Vec<String> {
-    let text = |lease: LeaseView<'_>| format!("{:?} {:?} {} {} {:?}", lease.topic, lease.key, lease.epoch, lease.ttl_s, lease.terms);
+    let text = |lease: LeaseView<'_>| {
+        format!(
+            "{:?} {:?} {} {} {:?}",
+            lease.topic, lease.key, lease.epoch, lease.ttl_s, lease.terms
+        )
+    };
     registry.leases().map(text).collect()
 }
 
@@ -65,7 +70,12 @@ fn leases_survive_a_restart_of_the_flow_with_their_whole_ttl() {
              "from": {"layer": "fog", "service": "mapper"}},
         ]),
     );
-    send(&mut first, start, Scope::Layer, &json!({"op": "request", "topic": "imu/data", "service": "logger", "ttl_s": 60}));
+    send(
+        &mut first,
+        start,
+        Scope::Layer,
+        &json!({"op": "request", "topic": "imu/data", "service": "logger", "ttl_s": 60}),
+    );
     assert_eq!(save(&mut first, &mut kept), 3);
     assert_eq!(
         kept.keys().map(|(_, key)| key.as_str()).collect::<Vec<_>>(),
@@ -86,7 +96,10 @@ fn leases_survive_a_restart_of_the_flow_with_their_whole_ttl() {
     assert_eq!(terms(&second), terms(&first));
     assert_eq!(second.next_expiry(), Some(later + Duration::from_secs(15)));
     assert_eq!(save(&mut second, &mut kept), 0, "what was read is not written again");
-    assert_eq!(second.world().own().unwrap().topics, first.world().own().unwrap().topics);
+    assert_eq!(
+        second.world().own().unwrap().topics,
+        first.world().own().unwrap().topics
+    );
 }
 
 #[test]
@@ -99,16 +112,31 @@ fn only_what_changes_is_written() {
     send(&mut registry, now, Scope::Node, &with(1, 10));
     assert_eq!(save(&mut registry, &mut kept), 1);
     for second in 1..4 {
-        send(&mut registry, now + Duration::from_secs(second), Scope::Node, &with(1, 10));
+        send(
+            &mut registry,
+            now + Duration::from_secs(second),
+            Scope::Node,
+            &with(1, 10),
+        );
         assert_eq!(save(&mut registry, &mut kept), 0, "a renewal");
     }
     send(&mut registry, now, Scope::Node, &with(2, 10));
     assert_eq!(save(&mut registry, &mut kept), 1, "another life");
     send(&mut registry, now, Scope::Node, &with(2, 20));
     assert_eq!(save(&mut registry, &mut kept), 1, "other terms");
-    send(&mut registry, now, Scope::Node, &json!({"op": "withdraw", "topic": "t", "service": "a", "epoch": 2}));
+    send(
+        &mut registry,
+        now,
+        Scope::Node,
+        &json!({"op": "withdraw", "topic": "t", "service": "a", "epoch": 2}),
+    );
     assert_eq!((save(&mut registry, &mut kept), kept.len()), (1, 0));
-    send(&mut registry, now, Scope::Node, &json!({"op": "withdraw", "topic": "t", "service": "a", "epoch": 2}));
+    send(
+        &mut registry,
+        now,
+        Scope::Node,
+        &json!({"op": "withdraw", "topic": "t", "service": "a", "epoch": 2}),
+    );
     assert_eq!(save(&mut registry, &mut kept), 0, "nothing to withdraw");
     send(&mut registry, now, Scope::Node, &with(3, 1));
     assert_eq!((save(&mut registry, &mut kept), kept.len()), (1, 1));
@@ -123,15 +151,35 @@ fn what_services_say_while_leases_are_read_counts_for_more() {
     let mut first = keeping("edge/robot-1", now);
     restore_all(&mut first, now, &kept);
     for name in ["renewed", "ended", "lapsed", "quiet"] {
-        send(&mut first, now, Scope::Node, &json!({"op": "advertise", "topic": name, "service": "a", "rate_hz": 1}));
+        send(
+            &mut first,
+            now,
+            Scope::Node,
+            &json!({"op": "advertise", "topic": name, "service": "a", "rate_hz": 1}),
+        );
     }
     save(&mut first, &mut kept);
 
     let mut second = keeping("edge/robot-1", now);
     let was = of_scope(&kept, Scope::Node);
-    send(&mut second, now, Scope::Node, &json!({"op": "advertise", "topic": "renewed", "service": "a", "rate_hz": 2}));
-    send(&mut second, now, Scope::Node, &json!({"op": "withdraw", "topic": "ended", "service": "a"}));
-    send(&mut second, now, Scope::Node, &json!({"op": "advertise", "topic": "lapsed", "service": "a", "ttl_s": 1}));
+    send(
+        &mut second,
+        now,
+        Scope::Node,
+        &json!({"op": "advertise", "topic": "renewed", "service": "a", "rate_hz": 2}),
+    );
+    send(
+        &mut second,
+        now,
+        Scope::Node,
+        &json!({"op": "withdraw", "topic": "ended", "service": "a"}),
+    );
+    send(
+        &mut second,
+        now,
+        Scope::Node,
+        &json!({"op": "advertise", "topic": "lapsed", "service": "a", "ttl_s": 1}),
+    );
     second.expire(now + Duration::from_secs(1));
     save(&mut second, &mut kept);
     let restored = second.restore(now, Scope::Node, &was);
@@ -141,9 +189,17 @@ fn what_services_say_while_leases_are_read_counts_for_more() {
     save(&mut second, &mut kept);
     let names: Vec<_> = kept.keys().map(|(_, key)| key.split('|').nth(1).unwrap()).collect();
     assert_eq!(names, ["quiet", "renewed"]);
-    assert!(String::from_utf8_lossy(&kept[&(Scope::Node, "advertise|renewed|edge|robot-1|a|0".into())]).contains("\"rate_hz\":2"));
+    assert!(
+        String::from_utf8_lossy(&kept[&(Scope::Node, "advertise|renewed|edge|robot-1|a|0".into())])
+            .contains("\"rate_hz\":2")
+    );
     // Now that they are read, a withdrawn lease may come back.
-    send(&mut second, now, Scope::Node, &json!({"op": "advertise", "topic": "ended", "service": "a"}));
+    send(
+        &mut second,
+        now,
+        Scope::Node,
+        &json!({"op": "advertise", "topic": "ended", "service": "a"}),
+    );
     assert_eq!(second.lease_count(), 3);
 }
 
@@ -163,8 +219,14 @@ fn what_is_no_lease_of_this_flow_is_left_alone() {
             entry("a|b|c", good),
             entry("advertise|t|edge|robot-1|a|0", "{"),
             entry("advertise|t|edge|robot-1|a|0", "[]"),
-            entry("advertise|t|edge|robot-1|a|0", r#"{"op":"withdraw","topic":"t","service":"a"}"#),
-            entry("advertise|t|edge|robot-1|a|0", r#"{"op":"advertise","topic":"blaze/x","service":"a"}"#),
+            entry(
+                "advertise|t|edge|robot-1|a|0",
+                r#"{"op":"withdraw","topic":"t","service":"a"}"#,
+            ),
+            entry(
+                "advertise|t|edge|robot-1|a|0",
+                r#"{"op":"advertise","topic":"blaze/x","service":"a"}"#,
+            ),
             entry("advertise|other|edge|robot-1|a|0", good),
             entry("request|t|edge|robot-1|a|0", good),
             entry("advertise|t|edge|robot-1|a|0", good),
@@ -188,7 +250,10 @@ fn nothing_lapses_while_nobody_can_renew() {
     assert_eq!(registry.expire(later).lapsed.len(), 1, "that of the other scope");
     let back = start + Duration::from_secs(29);
     registry.set_renewable(back, Scope::Node, true);
-    assert_eq!(registry.expire(back + Duration::from_millis(14_999)), Changes::default());
+    assert_eq!(
+        registry.expire(back + Duration::from_millis(14_999)),
+        Changes::default()
+    );
     assert_eq!(registry.expire(back + Duration::from_secs(15)).lapsed.len(), 1);
 }
 
@@ -202,26 +267,55 @@ fn a_topic_that_kafka_cannot_tell_from_another_is_refused() {
     let refusal = |outcome: ControlOutcome| {
         let answer = outcome.answers.into_iter().next().unwrap();
         let error = &answer.body["error"];
-        (error["code"].as_str().unwrap_or("").to_owned(), error["pointer"].as_str().unwrap_or("").to_owned())
+        (
+            error["code"].as_str().unwrap_or("").to_owned(),
+            error["pointer"].as_str().unwrap_or("").to_owned(),
+        )
     };
     let object = |op: &str, topic: &str| json!({"op": op, "topic": topic, "service": "a", "id": "1", "reply_to": "blaze/reply/x"});
     let none = (String::new(), String::new());
     let collision = ("name_collision".to_owned(), "/topic".to_owned());
-    assert_eq!(refusal(send(&mut registry, now, Scope::Layer, &object("advertise", "imu/data"))), none);
-    assert_eq!(refusal(send(&mut registry, now, Scope::Layer, &object("request", "imu/data"))), none);
-    assert_eq!(refusal(send(&mut registry, now, Scope::Layer, &object("request", "imu_data"))), collision);
-    assert_eq!(refusal(send(&mut registry, now, Scope::Node, &object("request", "imu_data"))), none, "Redis has both");
+    assert_eq!(
+        refusal(send(&mut registry, now, Scope::Layer, &object("advertise", "imu/data"))),
+        none
+    );
+    assert_eq!(
+        refusal(send(&mut registry, now, Scope::Layer, &object("request", "imu/data"))),
+        none
+    );
+    assert_eq!(
+        refusal(send(&mut registry, now, Scope::Layer, &object("request", "imu_data"))),
+        collision
+    );
+    assert_eq!(
+        refusal(send(&mut registry, now, Scope::Node, &object("request", "imu_data"))),
+        none,
+        "Redis has both"
+    );
     let long = "t".repeat(190);
     let found = refusal(send(&mut registry, now, Scope::Layer, &object("advertise", &long)));
     assert_eq!(found, ("name_not_expressible".to_owned(), "/topic".to_owned()));
     // A topic that is only delivered there holds its name, too, until it is not any more.
     registry.put_on_layer(&topic("a/b")).unwrap();
-    assert_eq!(refusal(send(&mut registry, now, Scope::Layer, &object("advertise", "a_b"))), collision);
+    assert_eq!(
+        refusal(send(&mut registry, now, Scope::Layer, &object("advertise", "a_b"))),
+        collision
+    );
     registry.take_off_layer(&topic("a/b"));
-    assert_eq!(refusal(send(&mut registry, now, Scope::Layer, &object("advertise", "a_b"))), none);
+    assert_eq!(
+        refusal(send(&mut registry, now, Scope::Layer, &object("advertise", "a_b"))),
+        none
+    );
     assert!(registry.put_on_layer(&topic("a/b")).is_err());
-    assert_eq!(refusal(send(&mut registry, now, Scope::Layer, &object("withdraw", "imu/data"))), none);
-    assert_eq!(refusal(send(&mut registry, now, Scope::Layer, &object("request", "imu_data"))), none, "it is free now");
+    assert_eq!(
+        refusal(send(&mut registry, now, Scope::Layer, &object("withdraw", "imu/data"))),
+        none
+    );
+    assert_eq!(
+        refusal(send(&mut registry, now, Scope::Layer, &object("request", "imu_data"))),
+        none,
+        "it is free now"
+    );
 }
 
 #[test]
@@ -229,8 +323,18 @@ fn a_scope_of_another_flow_is_as_if_it_were_not_there() {
     let now = Instant::now();
     let mut registry = keeping("edge/robot-1", now);
     restore_all(&mut registry, now, &Kept::new());
-    send(&mut registry, now, Scope::Node, &json!({"op": "advertise", "topic": "t", "service": "a", "ttl_s": 0}));
-    send(&mut registry, now, Scope::Layer, &json!({"op": "request", "topic": "t", "service": "b", "ttl_s": 0}));
+    send(
+        &mut registry,
+        now,
+        Scope::Node,
+        &json!({"op": "advertise", "topic": "t", "service": "a", "ttl_s": 0}),
+    );
+    send(
+        &mut registry,
+        now,
+        Scope::Layer,
+        &json!({"op": "request", "topic": "t", "service": "b", "ttl_s": 0}),
+    );
     let before = registry.world().own().unwrap().clone();
     let changed = registry.set_in_use(now, Scope::Layer, true);
     assert_eq!(changed, BTreeSet::from([topic("t")]));
