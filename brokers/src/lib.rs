@@ -5,6 +5,8 @@
 #[cfg(feature = "conformance")]
 pub mod conformance;
 pub mod dds;
+#[cfg(feature = "kafka")]
+pub mod kafka;
 pub mod memory;
 mod open;
 #[allow(dead_code, reason = "each adapter uses its part, and a build may lack one")]

@@ -47,6 +47,7 @@ class Server:
         return HOME / "bin" / self.command()[0]
 
     def is_ready(self) -> bool:
+        """Asks the server, and makes sure that it is this one: another on the same port would answer as well."""
         raise NotImplementedError
 
     def set_up(self) -> bool:
@@ -166,7 +167,7 @@ class Redis(Server):
                 "--save", "", "--appendonly", "no", *limit, "--loglevel", "notice"]
 
     def is_ready(self) -> bool:
-        return wire.redis_answers(self.port)
+        return wire.redis_pid(self.port) == self.pid()
 
 
 class Kafka(Server):
@@ -193,7 +194,8 @@ class Kafka(Server):
                 "kafka.Kafka", "server.properties"]
 
     def is_ready(self) -> bool:
-        return wire.kafka_brokers(self.port) > 0
+        identity = wire.kafka_cluster(self.port)
+        return f"cluster.id={identity}" in (self.folder / "data" / "meta.properties").read_text().splitlines()
 
     def set_up(self) -> bool:
         return self.is_ready() and wire.kafka_warm(self.port)
@@ -213,10 +215,10 @@ class Mongo(Server):
         shutil.rmtree(self.folder / "data", ignore_errors=True)
 
     def set_up(self) -> bool:
-        return wire.mongo_initiate(self.port) and self.is_ready()
+        return wire.mongo_pid(self.port) == self.pid() and wire.mongo_initiate(self.port) and self.is_ready()
 
     def is_ready(self) -> bool:
-        return wire.mongo_writable(self.port)
+        return wire.mongo_pid(self.port) == self.pid() and wire.mongo_writable(self.port)
 
 
 SERVERS: list[Server] = [
@@ -277,7 +279,7 @@ def tried(ask) -> bool:
     """What a server says; False while it is not there or says what makes no sense."""
     try:
         return ask()
-    except (OSError, ValueError, IndexError, struct.error):
+    except (OSError, ValueError, IndexError, KeyError, struct.error):
         return False
 
 

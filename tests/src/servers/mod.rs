@@ -18,7 +18,7 @@ mod shared;
 
 pub use kafka::{KafkaOptions, KafkaServer};
 pub use redis::{RedisKind, RedisOptions, RedisServer};
-pub use shared::{shared_kafka, shared_kafka_cloud, shared_redis, shared_valkey};
+pub use shared::{address, shared_kafka, shared_kafka_cloud, shared_redis, shared_valkey};
 
 /// A name that no other test and no earlier run on the same server has: `stem-…`, of lower-case letters, digits and `-`.
 #[must_use]

@@ -117,7 +117,9 @@ impl RedisServer {
         let mut command = Command::new(self.kind.program()?);
         command.arg("redis.conf");
         self.process.spawn(command)?;
-        self.process.wait_ready(START, || self.ping())?;
+        // The log tells that it has the port: another server there would answer as well.
+        let ready = || self.process.has_logged("Ready to accept connections") && self.ping();
+        self.process.wait_ready(START, ready)?;
         Ok(())
     }
 

@@ -69,7 +69,9 @@ fn kafka_at(name: &str, own: &'static Once<KafkaServer>) -> anyhow::Result<Strin
     Ok(address)
 }
 
-fn address(name: &str) -> Option<String> {
+/// The address that a variable (`BLAZE_TEST_REDIS_URL`, …) or else `.services/env` names; nothing is asked or started.
+#[must_use]
+pub fn address(name: &str) -> Option<String> {
     std::env::var_os(name)
         .map(|value| value.to_string_lossy().into_owned())
         .filter(|value| !value.is_empty())

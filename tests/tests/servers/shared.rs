@@ -13,10 +13,10 @@ const VICTIM: &str = "BLAZE_TEST_ABORTS_WITH_A_SERVER";
 #[test]
 fn all_tests_get_the_same_server() {
     for (ask, name) in [
-        (shared_redis as fn() -> _, "redis"),
+        (shared_redis as fn() -> anyhow::Result<String>, "redis"),
         (shared_valkey as fn() -> _, "valkey"),
     ] {
-        let url: String = ask().unwrap();
+        let url = ask().unwrap();
         assert_eq!(ask().unwrap(), url);
         let client = ::redis::Client::open(url).unwrap();
         let mut connection = client.get_connection().unwrap();
