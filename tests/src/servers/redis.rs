@@ -71,6 +71,10 @@ impl RedisServer {
     ///
     /// # Errors
     /// When it is not installed, refuses its configuration, or does not answer in time.
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "options are written in place: `start(RedisOptions::default())`"
+    )]
     pub fn start(kind: RedisKind, options: RedisOptions) -> anyhow::Result<Self> {
         anyhow::ensure!(
             !(options.tls && kind == RedisKind::Valkey),
