@@ -61,7 +61,7 @@ impl fmt::Display for StoredKey<'_> {
 }
 
 enum Kept {
-    Ours(ControlMessage),
+    Ours(Box<ControlMessage>),
     Foreign,
     Unreadable,
 }
@@ -80,7 +80,7 @@ fn read(scope: Scope, me: &FlowId, key: &str, value: &[u8]) -> Kept {
         return Kept::Unreadable;
     };
     match &object.message {
-        Ok(message) if is_under(scope, me, message, key) => Kept::Ours(message.clone()),
+        Ok(message) if is_under(scope, me, message, key) => Kept::Ours(Box::new(message.clone())),
         _ => Kept::Unreadable,
     }
 }
