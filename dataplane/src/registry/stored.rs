@@ -151,11 +151,6 @@ impl Registry {
         outcome
     }
 
-    /// The leases that the broker of a scope keeps are to be read (again): what services say meanwhile counts for more.
-    pub fn begin_restore(&mut self, scope: Scope) {
-        self.leases.set_reading(scope, true);
-    }
-
     /// Nobody can renew leases of a scope while its broker is away, so none lapses; when it is back, each finite one has its
     /// whole ttl.
     pub fn set_renewable(&mut self, now: Instant, scope: Scope, renewable: bool) {
