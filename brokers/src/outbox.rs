@@ -197,6 +197,17 @@ impl<C> Queue<C> {
         self.counts.settle(Fate::Dropped(reason));
         size
     }
+
+    /// Drops the oldest as long as their time is over. Returns their bytes.
+    fn drop_overdue(&mut self, now: Instant) -> usize {
+        let mut bytes = 0;
+        while let Some((at, reason)) = self.entries.front().and_then(|entry| entry.expires)
+            && at <= now
+        {
+            bytes += self.drop_oldest(reason);
+        }
+        bytes
+    }
 }
 
 struct State<C> {
@@ -206,6 +217,19 @@ struct State<C> {
     bytes: usize,
     next: u64,
     closed: bool,
+}
+
+impl<C> State<C> {
+    /// A lane goes to the end of the list of turns, if it holds something.
+    fn end_turn(&mut self, id: u64) {
+        let Some(queue) = self.lanes.get_mut(&id) else { return };
+        queue.has_turn = !queue.entries.is_empty();
+        if queue.has_turn {
+            self.turns.push_back(id);
+        } else if queue.orphaned {
+            self.lanes.remove(&id);
+        }
+    }
 }
 
 /// The queues of one connection.
@@ -282,13 +306,33 @@ impl<C> Outbox<C> {
         bytes: usize,
         into: &mut Vec<Waiting<C>>,
     ) -> usize {
+        self.take_ready(now, messages, bytes, true, |_| true, into)
+    }
+
+    /// As [`take`](Self::take), only from lanes whose `to` is ready; what waits in the others is only dropped when its time
+    /// is over. With `one_always`, one message is taken even if it is larger than `bytes`.
+    pub(crate) fn take_ready(
+        &self,
+        now: Instant,
+        messages: usize,
+        bytes: usize,
+        one_always: bool,
+        is_ready: impl Fn(&C) -> bool,
+        into: &mut Vec<Waiting<C>>,
+    ) -> usize {
         let mut state = self.state.lock();
         let state = &mut *state;
         let mut taken = 0;
+        let mut not_ready = Vec::new();
         let first = into.len();
         while into.len() - first < messages {
             let Some(id) = state.turns.pop_front() else { break };
             let Some(queue) = state.lanes.get_mut(&id) else { continue };
+            if !is_ready(&queue.to) {
+                state.bytes -= queue.drop_overdue(now);
+                not_ready.push(id);
+                continue;
+            }
             let mut full = false;
             for _ in 0..TURN {
                 let Some(entry) = queue.entries.front() else { break };
@@ -299,7 +343,8 @@ impl<C> Outbox<C> {
                     continue;
                 }
                 let size = entry.body.size();
-                if into.len() > first && (taken + size > bytes || into.len() - first >= messages) {
+                let is_first = into.len() == first && one_always;
+                if !is_first && (taken + size > bytes || into.len() - first >= messages) {
                     full = true;
                     break;
                 }
@@ -314,15 +359,13 @@ impl<C> Outbox<C> {
                     counts: Some(Arc::clone(&queue.counts)),
                 });
             }
-            queue.has_turn = !queue.entries.is_empty();
-            if queue.has_turn {
-                state.turns.push_back(id);
-            } else if queue.orphaned {
-                state.lanes.remove(&id);
-            }
+            state.end_turn(id);
             if full {
                 break;
             }
+        }
+        for id in not_ready {
+            state.end_turn(id);
         }
         taken
     }
@@ -332,11 +375,7 @@ impl<C> Outbox<C> {
         let mut state = self.state.lock();
         let state = &mut *state;
         for queue in state.lanes.values_mut() {
-            while let Some((at, reason)) = queue.entries.front().and_then(|entry| entry.expires)
-                && at <= now
-            {
-                state.bytes -= queue.drop_oldest(reason);
-            }
+            state.bytes -= queue.drop_overdue(now);
         }
     }
 
@@ -481,6 +520,27 @@ mod tests {
         assert_eq!(seen[16], ("b", 7), "b has its turn after {TURN} of a");
         assert_eq!(take_all(&outbox, 100, 1), [("a", 17)], "one message is always taken");
         assert_eq!(take_all(&outbox, 100, 10_000), [("a", 18), ("a", 19)]);
+    }
+
+    #[test]
+    fn lanes_that_are_not_ready_wait_and_expire() {
+        let outbox = Outbox::new(SMALL);
+        let (a, b) = (outbox.lane("a", Some(Duration::from_secs(5))), outbox.lane("b", None));
+        let now = Instant::now();
+        a.push(bare(1, 10), None);
+        b.push(bare(2, 10), None);
+        let take = |at, ready: &'static str, bytes, one_always| {
+            let mut into = Vec::new();
+            outbox.take_ready(at, 100, bytes, one_always, |to| *to == ready, &mut into);
+            into.iter().map(number).collect::<Vec<_>>()
+        };
+        assert_eq!(take(now, "b", 1, false), [], "nothing that is larger than the room");
+        assert_eq!(take(now, "b", 1, true), [("b", 2)]);
+        assert_eq!(a.later().queued, 1);
+        assert_eq!(take(now + Duration::from_secs(6), "b", 10_000, true), []);
+        assert_eq!((a.later().queued, a.later().broker_error), (0, 1));
+        a.push(bare(3, 10), None);
+        assert_eq!(take(now, "a", 10_000, true), [("a", 3)]);
     }
 
     #[test]

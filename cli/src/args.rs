@@ -7,6 +7,7 @@ use blaze_domain::{LayerName, NodeName, ServiceName, TopicName};
 use clap::{Args, Parser, Subcommand};
 
 use crate::demo::options::DemoOptions;
+use crate::local::{EchoOptions, HzOptions, PublishOptions};
 use crate::output::Format;
 
 /// Joins robots, fog and cloud: see what flows, and why something does not.
@@ -38,6 +39,12 @@ pub enum Command {
     Peers(FlowTarget),
     /// Why a topic does or does not arrive; exits with 0 if it flows
     Why(WhyOptions),
+    /// Publish on a topic, as a service on the local broker
+    Pub(PublishOptions),
+    /// Print the messages of a topic, as a service on the local broker
+    Echo(EchoOptions),
+    /// The rate at which a topic arrives, once a second
+    Hz(HzOptions),
     /// Robot, fog and cloud in one process, with recorded data
     Demo(DemoOptions),
     /// Completions for a shell, on standard output
@@ -69,7 +76,7 @@ pub struct WhyOptions {
     pub target: FlowTarget,
 }
 
-fn parse_topic(text: &str) -> Result<TopicName, String> {
+pub(crate) fn parse_topic(text: &str) -> Result<TopicName, String> {
     text.parse().map_err(|error| {
         let trimmed = text.trim_matches('/');
         match trimmed.parse::<TopicName>() {

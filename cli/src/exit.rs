@@ -49,6 +49,19 @@ pub enum CliError {
         /// What the system or the deadline said.
         reason: String,
     },
+    /// The local broker, or the flow on it, does not answer.
+    #[error("the {kind} does not answer within {waited_s} s: {detail}")]
+    NoBroker {
+        /// What does not answer.
+        kind: String,
+        /// How long was waited.
+        waited_s: u64,
+        /// What it said last, or what to do.
+        detail: String,
+    },
+    /// What was given is refused as invalid: a node file, a name, a value.
+    #[error("{0}")]
+    Invalid(String),
     /// The server refused.
     #[error("{address} answered {status}{}", if detail.is_empty() { String::new() } else { format!(": {detail}") })]
     Refused {
@@ -78,7 +91,8 @@ impl CliError {
     pub fn exit(&self) -> Exit {
         match self {
             Self::Usage(_) => Exit::Usage,
-            Self::CannotConnect { .. } => Exit::CannotConnect,
+            Self::CannotConnect { .. } | Self::NoBroker { .. } => Exit::CannotConnect,
+            Self::Invalid(_) => Exit::Invalid,
             Self::Refused { status, .. } => match status {
                 404 => Exit::NotFound,
                 409 | 412 => Exit::Conflict,

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! args ──► admin: topics, bridges, peers, why ──► http ──► admin port of a flow ──► output
+//!      ├─► local: pub, echo, hz ──► ServiceManager ──► local broker of the node file
 //!      └─► demo: recordings ──► player ──► flows and services of one process ──► board ──► report
 //! ```
 
@@ -10,6 +11,7 @@ pub mod args;
 pub mod demo;
 pub mod exit;
 pub mod http;
+pub mod local;
 pub mod output;
 
 use std::process::ExitCode;
@@ -45,6 +47,9 @@ async fn dispatch(arguments: Arguments) -> Result<Exit, CliError> {
         Command::Bridges(target) => admin::bridges(&target.flow, format).await,
         Command::Peers(target) => admin::peers(&target.flow, format).await,
         Command::Why(why) => admin::why(&why, format).await,
+        Command::Pub(options) => local::publish(options, format).await,
+        Command::Echo(options) => local::echo(options, format).await,
+        Command::Hz(options) => local::hz(options, format).await,
         Command::Demo(options) => demo::run(options, format).await,
         Command::Completions { shell } => {
             let mut script = Vec::new();

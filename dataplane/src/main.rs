@@ -1,7 +1,5 @@
 //! The BlazeFlow process: parse, build, run.
 
-mod open;
-
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -9,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_brokers::memory::MemoryHub;
-use blaze_brokers::{Broker, Role};
+use blaze_brokers::{Broker, Role, open_layer, open_node};
 use blaze_domain::node_file::{LayerBroker as LayerSection, NodeBroker, NodeFile};
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, LayerBroker, RunningFlow};
@@ -20,7 +18,6 @@ use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
 use blaze_runtime::{logs, ready_line, say, state};
 use clap::Parser;
-use open::{open_layer, open_node};
 
 /// A shutdown takes at most this long.
 const SHUTDOWN: Duration = Duration::from_secs(5);

@@ -126,7 +126,14 @@ impl Publisher {
         header.sequence += 1;
         header.publish_time_ns = u64::try_from(since_epoch.as_nanos()).unwrap_or(u64::MAX);
         match Frame::new(&header, payload) {
-            Ok(frame) => self.shared.to.publish(&frame, deadline),
+            Ok(frame) => {
+                let outcome = self.shared.to.publish(&frame, deadline);
+                if outcome == PublishOutcome::TooLarge {
+                    // Nobody will ever see this number: subscribers must not take it for a loss.
+                    header.sequence -= 1;
+                }
+                outcome
+            }
             Err(error) => {
                 // The options were checked, so this is a fault of the SDK; the publisher goes on.
                 header.sequence -= 1;
@@ -152,6 +159,12 @@ impl Publisher {
     #[must_use]
     pub fn sequence(&self) -> u64 {
         self.shared.next.lock().sequence
+    }
+
+    /// Messages that were taken and have neither reached the broker nor been dropped yet.
+    #[must_use]
+    pub fn queued(&self) -> u64 {
+        self.shared.to.later().queued
     }
 
     /// Messages that were taken and then dropped, because the broker was slow or away.

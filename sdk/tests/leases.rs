@@ -65,7 +65,7 @@ impl FakeFlow {
     fn say(&self, channel: &str, value: &Value) {
         let channel: ChannelName = channel.parse().unwrap();
         let publisher = self.broker.publisher(&channel, PublisherOptions::default()).unwrap();
-        publisher.publish_bare(&Bytes::from(value.to_string()));
+        publisher.publish_bare(&Bytes::from(value.to_string()), None);
     }
 
     fn agree(&self, to: &Value) {

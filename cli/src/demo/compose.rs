@@ -1,24 +1,22 @@
 //! The nodes of the demo in one process: flows, their brokers, and the services on them.
 //!
 //! ```text
-//! robot-1: node hub ── flow ─┬─ edge layer hub ─┬─ flow ── node hub: edge-2
-//!                            │                  │
-//!                            └──── DDS on one interface ────┐
-//! fog-1:   node hub ── flow ── fog layer hub    ────────────┤
-//! cloud-1: node hub ── flow ── cloud layer hub  ────────────┘
+//! robot-1: node broker ─ flow ─┬─ edge layer broker ─┬─ flow ─ node broker: edge-2
+//!                              │                     │
+//!                              └── DDS on one interface ──┐
+//! fog-1:   node broker ─ flow ─ fog layer broker   ───────┤
+//! cloud-1: node broker ─ flow ─ cloud layer broker ───────┘
 //! ```
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use blaze_brokers::memory::MemoryHub;
 use blaze_domain::node_file::NodeFile;
-use blaze_domain::{Scope, ServiceName};
+use blaze_domain::ServiceName;
 use blaze_flow::flow::settings::FlowSettings;
-use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
-use blaze_flow::world::LayerScopeId;
+use blaze_flow::flow::{Beginning, Epochs, FlowOptions, RunningFlow};
 use blaze_runtime::Supervisor;
 use blaze_runtime::config::{Schema, Sources, load_typed};
 use blaze_sdk::{
@@ -31,6 +29,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::Mutex;
 
 use super::board::{Board, ConsumerCounts, ConsumerId};
+use super::brokers::{BrokerSource, NodeBrokers};
 use super::domain_id::{self, DEFAULT_DOMAIN, ReservedDomain};
 use super::options::{DemoNode, DemoOptions};
 use super::recording::{self, Recording};
@@ -130,8 +129,7 @@ fn tell_skipped(recordings: &[Recording]) {
 /// A node that runs.
 struct RunningNode {
     node: DemoNode,
-    node_hub: MemoryHub,
-    layer_hub: MemoryHub,
+    brokers: NodeBrokers,
     flow: RunningFlow,
 }
 
@@ -171,30 +169,28 @@ async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<N
         .into_iter()
         .map(|node| Ok((node, settings_of(node, options, listen, domain)?)))
         .collect::<Result<_, CliError>>()?;
-    let mut layers: BTreeMap<&str, (MemoryHub, LayerScopeId)> = BTreeMap::new();
+    let mut source = BrokerSource::new(options.brokers)?;
     let mut running = Vec::new();
     for (node, settings) in settings {
-        let (layer_hub, id) = layers
-            .entry(node.layer())
-            .or_insert_with(|| (MemoryHub::new(node.layer()), LayerScopeId::private()))
-            .clone();
-        let node_hub = MemoryHub::new(node.name());
+        let epochs = Epochs::begin(&settings.me, None)
+            .map_err(|error| CliError::Failed(format!("{} has no epoch: {error}", node.name())))?;
+        let brokers = source.of(node, &settings.me, epochs.first())?;
+        let beginning = Beginning {
+            epochs,
+            layer_prefix: brokers.layer_prefix.clone(),
+        };
         let flow_options = FlowOptions {
             settings,
-            node: Some(Arc::new(node_hub.broker())),
-            layer: Some(LayerBroker {
-                broker: Arc::new(layer_hub.broker()),
-                id,
-            }),
+            node: Some(Arc::clone(&brokers.flow_node)),
+            layer: Some(brokers.flow_layer.clone()),
             state_dir: None,
         };
-        let flow = blaze_flow::flow::start(flow_options, supervisor.child(node.name()))
+        let flow = blaze_flow::flow::start_with(flow_options, beginning, supervisor.child(node.name()))
             .await
             .map_err(|error| CliError::Failed(format!("{} does not start: {error:#}", node.name())))?;
         running.push(RunningNode {
             node,
-            node_hub,
-            layer_hub,
+            brokers,
             flow,
         });
     }
@@ -292,15 +288,12 @@ impl System {
         let running = self.nodes.running.iter().find(|running| running.node == node);
         let running = running.ok_or_else(|| format!("{} does not run here", node.name()))?;
         let scope = scope_of(name, node);
-        let hub = match scope {
-            Scope::Node => &running.node_hub,
-            Scope::Layer | Scope::Inter => &running.layer_hub,
-        };
+        let broker = Arc::clone(running.brokers.of_services(scope));
         let id = running.flow.id();
         let service_name: ServiceName = name.parse().map_err(|error| format!("{name} {error}"))?;
         let options = ServiceOptions {
             pool_threads: 2,
-            ..ServiceOptions::new(id.layer.clone(), service_name, Arc::new(hub.broker()), scope)
+            ..ServiceOptions::new(id.layer.clone(), service_name, broker, scope)
         };
         let service = ServiceManager::start(options.on_node(id.node.clone()))
             .await
@@ -366,7 +359,11 @@ impl System {
                 .map(ServiceManager::shutdown),
         )
         .await;
-        join_all(self.nodes.running.into_iter().map(|running| running.flow.shutdown())).await;
+        join_all(self.nodes.running.into_iter().map(|running| async {
+            running.flow.shutdown().await;
+            running.brokers.close().await;
+        }))
+        .await;
     }
 }
 

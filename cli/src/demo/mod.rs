@@ -6,6 +6,7 @@
 //! ```
 
 pub mod board;
+mod brokers;
 pub mod camera;
 pub mod compose;
 pub mod domain_id;

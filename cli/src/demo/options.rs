@@ -155,11 +155,6 @@ impl DemoOptions {
     /// [`CliError::Usage`] with a sentence for people.
     pub fn check(&self) -> Result<(), CliError> {
         let usage = |text: &str| Err(CliError::Usage(text.to_owned()));
-        if self.brokers == Brokers::Real {
-            return usage(
-                "--brokers real: this build carries no Redis and Kafka adapters. Leave it out to use brokers within the process.",
-            );
-        }
         if let Some(address) = self.listen.iter().chain(&self.peer).find(|address| address.is_ipv6()) {
             return Err(CliError::Usage(format!("{address}: DDS is carried over IPv4 only.")));
         }
@@ -266,8 +261,7 @@ mod tests {
     #[test]
     fn bad_combinations_are_refused_with_a_reason() {
         for (line, why) in [
-            (&["--brokers", "real"][..], "no Redis and Kafka"),
-            (&["--listen", "0.0.0.0"], "one interface"),
+            (&["--listen", "0.0.0.0"][..], "one interface"),
             (&["--peer", "::1"], "IPv4 only"),
         ] {
             let error = parse(line).unwrap().check().unwrap_err();

@@ -52,7 +52,7 @@ async fn drive(shared: &Shared, broker: &dyn Broker, own_reply: ChannelName) -> 
         };
         for payload in ControlMessage::to_payloads(&messages) {
             // Refused while the broker is away: the book sends again until there is an answer.
-            control.publish_bare(&Bytes::from(payload));
+            control.publish_bare(&Bytes::from(payload), None);
         }
         shared.changed.notify_waiters();
         tokio::select! {

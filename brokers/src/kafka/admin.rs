@@ -1,0 +1,127 @@
+//! Makes topics.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use rdkafka::ClientContext;
+use rdkafka::admin::{
+    AdminClient, AdminOptions, AlterConfig, ConfigSource, NewTopic, ResourceSpecifier, TopicReplication,
+};
+use rdkafka::config::RDKafkaLogLevel;
+use rdkafka::error::{KafkaError, RDKafkaErrorCode};
+
+use super::bell::block_on;
+use super::context::{self, LastError};
+use super::settings::Settings;
+
+/// How long the server has for an answer. While it takes, nobody looks whether it still lives.
+const TIMEOUT: Duration = Duration::from_millis(1500);
+
+/// What a topic is made for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Purpose {
+    /// Messages that are of use for a while.
+    Messages,
+    /// The last value of each key.
+    LastValues,
+}
+
+impl Purpose {
+    fn settings(self) -> Vec<(&'static str, &'static str)> {
+        let mut settings = vec![
+            ("segment.bytes", "67108864"),
+            ("max.message.bytes", "17825792"),
+            ("message.timestamp.type", "LogAppendTime"),
+        ];
+        settings.extend(match self {
+            Self::Messages => [("retention.ms", "600000"), ("retention.bytes", "268435456")],
+            Self::LastValues => [("cleanup.policy", "compact"), ("min.cleanable.dirty.ratio", "0.1")],
+        });
+        settings
+    }
+}
+
+struct AdminContext(Arc<LastError>);
+
+impl ClientContext for AdminContext {
+    fn log(&self, level: RDKafkaLogLevel, facility: &str, line: &str) {
+        context::log(level, facility, line);
+    }
+
+    fn error(&self, error: KafkaError, reason: &str) {
+        self.0.note(format!("{error}: {reason}"));
+    }
+}
+
+/// The client that makes topics.
+pub(super) struct Admin(AdminClient<AdminContext>);
+
+impl Admin {
+    pub(super) fn new(settings: &Settings, last_error: &Arc<LastError>) -> Result<Self, KafkaError> {
+        let context = AdminContext(Arc::clone(last_error));
+        settings.admin().create_with_context(context).map(Self)
+    }
+
+    fn options() -> AdminOptions {
+        AdminOptions::new()
+            .request_timeout(Some(TIMEOUT))
+            .operation_timeout(Some(TIMEOUT))
+    }
+
+    /// Makes topics, and waits for it. Returns those that could not be made; one that is there already is none of them.
+    pub(super) fn make(
+        &self,
+        topics: &[(Arc<str>, Purpose)],
+    ) -> Result<Vec<(Arc<str>, RDKafkaErrorCode)>, KafkaError> {
+        let new: Vec<NewTopic<'_>> = topics
+            .iter()
+            .map(|(name, purpose)| {
+                // As many copies as the server makes by default.
+                let topic = NewTopic::new(name, 1, TopicReplication::Fixed(-1));
+                purpose
+                    .settings()
+                    .into_iter()
+                    .fold(topic, |topic, (key, value)| topic.set(key, value))
+            })
+            .collect();
+        let results = block_on(self.0.create_topics(&new, &Self::options()))?;
+        Ok(results
+            .into_iter()
+            .filter_map(Result::err)
+            .filter(|(_, code)| *code != RDKafkaErrorCode::TopicAlreadyExists)
+            .map(|(name, code)| (Arc::from(name), code))
+            .collect())
+    }
+
+    /// Lets a topic that is there keep the last value of each key; its other settings stay.
+    pub(super) fn keep_last_values(&self, topic: &str) -> Result<(), KafkaError> {
+        let resource = ResourceSpecifier::Topic(topic);
+        let found = block_on(self.0.describe_configs([&resource], &Self::options()))?;
+        let Some(Ok(config)) = found.into_iter().next() else {
+            return Err(KafkaError::NoMessageReceived);
+        };
+        let policy = config.get("cleanup.policy").and_then(|entry| entry.value.as_deref());
+        if policy.is_some_and(|policy| policy.contains("compact")) {
+            return Ok(());
+        }
+        // What is not named goes back to its default.
+        let set_before = config
+            .entries
+            .iter()
+            .filter(|entry| entry.source == ConfigSource::DynamicTopic && entry.name != "cleanup.policy")
+            .filter_map(|entry| Some((entry.name.as_str(), entry.value.as_deref()?)));
+        let change = set_before.fold(
+            AlterConfig::new(resource).set("cleanup.policy", "compact"),
+            |change, (key, value)| change.set(key, value),
+        );
+        let done = block_on(self.0.alter_configs([&change], &Self::options()))?;
+        match done.into_iter().next() {
+            Some(Ok(_)) => {
+                tracing::info!(topic, "the topic now keeps the last messages of each writer");
+                Ok(())
+            }
+            Some(Err((_, code))) => Err(KafkaError::AdminOp(code)),
+            None => Err(KafkaError::NoMessageReceived),
+        }
+    }
+}

@@ -1,0 +1,522 @@
+//! Reading: one client reads the partitions of all its topics, and one thread hands the records to the readers.
+//!
+//! ```text
+//! server ─► librdkafka (bounded queue) ─► thread: position, identity, header ─► rings of the topic's readers
+//! ```
+//!
+//! The position of each partition is ours: librdkafka is told where to begin and never decides by itself. A reader gets
+//! what lies at or behind the end that it saw when it subscribed. A topic that was made anew has another identity, which
+//! this client learns before it gets a record of it: it is then read from its beginning, for all its readers.
+
+use std::collections::HashMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use blaze_domain::WriterId;
+use blaze_domain::names::ChannelName;
+use blaze_proto::FrameError;
+use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
+use bytes::Bytes;
+use parking_lot::Mutex;
+use rdkafka::consumer::{BaseConsumer, Consumer as _};
+use rdkafka::error::{KafkaError, RDKafkaErrorCode};
+use rdkafka::message::{BorrowedMessage, Headers as _, Message as _, Timestamp};
+use rdkafka::{Offset, TopicPartitionList};
+use tokio_util::sync::CancellationToken;
+
+use super::clock::BrokerClock;
+use super::context::{LastError, ReadContext};
+use super::directory::{Marks, TopicInfo};
+use super::identity::{Identities, TopicUuid};
+use super::record;
+use super::settings::Settings;
+use crate::port::{Content, Received, SubscriptionSender};
+
+/// How long the thread may sleep: closing waits for that.
+const POLL: Duration = Duration::from_millis(100);
+
+type Client = BaseConsumer<ReadContext>;
+
+/// A topic that is to be read.
+#[derive(Debug, Clone)]
+pub(super) struct Source {
+    pub(super) channel: ChannelName,
+    pub(super) topic: Arc<str>,
+    /// Read also while the scope belongs to another flow.
+    pub(super) stays_open: bool,
+}
+
+/// A reader could not be taken in.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Refused {
+    /// The topic's other readers are beyond where this one would begin: it must first read up to here by itself.
+    Behind(Vec<i64>),
+    /// The client did not take it.
+    Failed(String),
+    /// The broker was closed.
+    Closed,
+}
+
+struct Partition {
+    /// Offset of the next record.
+    next: i64,
+    /// Writer of its bare records, where the topic has an identity.
+    bare_writer: Option<WriterId>,
+}
+
+struct Reader {
+    sender: SubscriptionSender,
+    /// Where it begins, per partition; partitions that came later from their beginning.
+    starts: Vec<i64>,
+}
+
+struct TopicState {
+    source: Source,
+    uuid: Option<TopicUuid>,
+    partitions: Vec<Partition>,
+    readers: Vec<Reader>,
+    /// Whether the client reads it now.
+    assigned: bool,
+}
+
+#[derive(Default)]
+struct State {
+    topics: HashMap<Arc<str>, TopicState>,
+    /// Number of identity changes that were looked at.
+    identities_seen: u64,
+    closed: bool,
+}
+
+/// One client that reads.
+pub(super) struct Consumer {
+    layer: String,
+    client: Mutex<Option<Arc<Client>>>,
+    identities: Arc<Identities>,
+    state: Mutex<State>,
+    clock: Arc<Mutex<BrokerClock>>,
+    last_error: Arc<LastError>,
+    /// A position was not on the server: someone has to look.
+    lost_position: AtomicBool,
+}
+
+impl Consumer {
+    /// Makes the client and its thread.
+    pub(super) fn start(
+        large: bool,
+        layer: &str,
+        settings: &Settings,
+        clock: &Arc<Mutex<BrokerClock>>,
+        last_error: &Arc<LastError>,
+        supervisor: &Supervisor,
+        stop: &CancellationToken,
+    ) -> Result<Arc<Self>, String> {
+        let context = ReadContext::new(last_error);
+        let identities = Arc::clone(&context.identities);
+        let client: Client = settings
+            .consumer(large)
+            .create_with_context(context)
+            .map_err(|error| error.to_string())?;
+        let consumer = Arc::new(Self {
+            layer: layer.to_owned(),
+            client: Mutex::new(Some(Arc::new(client))),
+            identities,
+            state: Mutex::default(),
+            clock: Arc::clone(clock),
+            last_error: Arc::clone(last_error),
+            lost_position: AtomicBool::new(false),
+        });
+        let name = if large { "kafka-read-l" } else { "kafka-read" };
+        let run = {
+            let (consumer, stop) = (Arc::clone(&consumer), stop.clone());
+            move || consumer.run(&stop)
+        };
+        supervisor
+            .spawn_thread(name, TaskPolicy::MayEnd, run)
+            .map_err(|error| error.to_string())?;
+        Ok(consumer)
+    }
+
+    fn run(&self, stop: &CancellationToken) {
+        while !stop.is_cancelled() {
+            let Some(client) = self.client.lock().clone() else { break };
+            let next = client.poll(POLL);
+            let mut state = self.state.lock();
+            let reset = self.follow_identities(&mut state, &client);
+            match next {
+                None => {}
+                // It was read at a position of the topic that was before, and comes again.
+                Some(Ok(message)) if reset.iter().any(|topic| &**topic == message.topic()) => {}
+                Some(Ok(message)) => self.deliver(&mut state, &client, &message),
+                Some(Err(error)) => self.note_error(&error),
+            }
+        }
+        self.close();
+        let client = self.client.lock().take();
+        drop(client);
+    }
+
+    fn note_error(&self, error: &KafkaError) {
+        if matches!(
+            error.rdkafka_error_code(),
+            Some(RDKafkaErrorCode::AutoOffsetReset | RDKafkaErrorCode::OffsetOutOfRange)
+        ) {
+            self.lost_position.store(true, Ordering::Release);
+        }
+        self.last_error.note(error.to_string());
+        tracing::debug!(%error, "reading");
+    }
+
+    /// Topics that were made anew are read from their beginning. Returns which.
+    fn follow_identities(&self, state: &mut State, client: &Client) -> Vec<Arc<str>> {
+        let changes = self.identities.changes();
+        if changes == state.identities_seen {
+            return Vec::new();
+        }
+        state.identities_seen = changes;
+        let mut reset = Vec::new();
+        for topic in state.topics.values_mut() {
+            let Some(uuid) = self.identities.of(&topic.source.topic) else { continue };
+            match &topic.uuid {
+                Some(before) if *before == uuid => {}
+                None => topic.identify(Some(uuid), &self.layer),
+                Some(before) => {
+                    tracing::info!(topic = %topic.source.topic, ?before, now = ?uuid, "the topic was made anew");
+                    topic.made_anew(uuid, &self.layer);
+                    if topic.assigned {
+                        topic.reassign(client);
+                    }
+                    reset.push(Arc::clone(&topic.source.topic));
+                }
+            }
+        }
+        reset
+    }
+
+    fn deliver(&self, state: &mut State, client: &Client, message: &BorrowedMessage<'_>) {
+        let Some(topic) = state.topics.get_mut(message.topic()) else { return };
+        let Ok(number) = usize::try_from(message.partition()) else { return };
+        let Some(partition) = topic.partitions.get_mut(number) else { return };
+        let offset = message.offset();
+        if offset < partition.next {
+            return;
+        }
+        partition.next = offset + 1;
+        let identity = partition.bare_writer.zip(u64::try_from(offset + 1).ok());
+        // A tombstone takes away; there is nothing to deliver.
+        let Some(payload) = message.payload() else { return };
+        let wanted = |reader: &Reader| reader.starts.get(number).is_none_or(|start| offset >= *start);
+        if topic.readers.iter().any(wanted) {
+            let received = receive(&topic.source.channel, message, payload, identity, &self.clock);
+            topic
+                .readers
+                .retain(|reader| !wanted(reader) || reader.sender.send(received.clone()));
+        }
+        if topic.readers.is_empty() {
+            let name = Arc::clone(&topic.source.topic);
+            forget(state, client, &name);
+        }
+    }
+
+    /// Takes a reader in that begins at the given offsets. `info` is what the server said of the topic just before. With
+    /// `kept` it gets those first, and is refused if records between them and the next ones have been read already.
+    pub(super) fn add(
+        &self,
+        source: &Source,
+        info: &TopicInfo,
+        starts: Vec<i64>,
+        sender: SubscriptionSender,
+        kept: Option<&mut dyn FnMut() -> Vec<Received>>,
+    ) -> Result<(), Refused> {
+        let Some(client) = self.client.lock().clone() else { return Err(Refused::Closed) };
+        let mut state = self.state.lock();
+        if state.closed {
+            return Err(Refused::Closed);
+        }
+        if let Some(topic) = state.topics.get_mut(&source.topic) {
+            if let (Some(known), Some(found)) = (&topic.uuid, &info.uuid)
+                && known != found
+            {
+                topic.made_anew(found.clone(), &self.layer);
+                topic.grow(info.partitions, &self.layer);
+                topic.reassign(&client);
+            } else if kept.is_some() && topic.partitions.iter().zip(&starts).any(|(at, start)| at.next > *start) {
+                return Err(Refused::Behind(topic.partitions.iter().map(|at| at.next).collect()));
+            }
+            topic.take_in(sender, starts, kept);
+            return Ok(());
+        }
+        let mut topic = TopicState {
+            source: source.clone(),
+            uuid: None,
+            partitions: starts
+                .iter()
+                .map(|start| Partition {
+                    next: *start,
+                    bare_writer: None,
+                })
+                .collect(),
+            readers: Vec::new(),
+            assigned: false,
+        };
+        topic.identify(info.uuid.clone(), &self.layer);
+        topic
+            .assign(&client)
+            .map_err(|error| Refused::Failed(error.to_string()))?;
+        topic.take_in(sender, starts, kept);
+        state.topics.insert(Arc::clone(&source.topic), topic);
+        Ok(())
+    }
+
+    /// The topics that are read or are to be read.
+    pub(super) fn topics(&self) -> Vec<Arc<str>> {
+        self.state.lock().topics.keys().cloned().collect()
+    }
+
+    /// Whether a topic is to be read and is not.
+    pub(super) fn is_idle(&self, topic: &str) -> bool {
+        self.state.lock().topics.get(topic).is_some_and(|topic| !topic.assigned)
+    }
+
+    /// Whether a position was not on the server, since the last call.
+    pub(super) fn take_lost_position(&self) -> bool {
+        self.lost_position.swap(false, Ordering::AcqRel)
+    }
+
+    /// What could not be looked into is to be looked into again.
+    pub(super) fn look_again(&self) {
+        self.lost_position.store(true, Ordering::Release);
+    }
+
+    /// Forgets readers that have gone, and topics without any.
+    pub(super) fn sweep(&self) {
+        let Some(client) = self.client.lock().clone() else { return };
+        let mut state = self.state.lock();
+        let mut empty = Vec::new();
+        for (name, topic) in &mut state.topics {
+            topic.readers.retain(|reader| !reader.sender.is_closed());
+            if topic.readers.is_empty() {
+                empty.push(Arc::clone(name));
+            }
+        }
+        for name in empty {
+            forget(&mut state, &client, &name);
+        }
+    }
+
+    /// A topic has so many partitions: those that are new are read from their beginning.
+    pub(super) fn note_partitions(&self, topic: &str, partitions: usize) {
+        let Some(client) = self.client.lock().clone() else { return };
+        let mut state = self.state.lock();
+        let Some(topic) = state.topics.get_mut(topic) else { return };
+        if topic.assigned && partitions > topic.partitions.len() {
+            topic.grow(partitions, &self.layer);
+            topic.reassign(&client);
+        }
+    }
+
+    /// Looks whether the positions of a topic are on the server, and moves those that are not to what is nearest.
+    pub(super) fn check_positions(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
+        let Some(client) = self.client.lock().clone() else { return };
+        let mut state = self.state.lock();
+        let Some(topic) = state.topics.get_mut(topic) else { return };
+        if !topic.assigned || topic.uuid != info.uuid {
+            return;
+        }
+        for (number, (partition, mark)) in topic.partitions.iter_mut().zip(marks).enumerate() {
+            let at = partition.next.clamp(mark.low, mark.high.max(mark.low));
+            if at != partition.next {
+                tracing::warn!(
+                    topic = %topic.source.topic, partition = number, position = partition.next, moved_to = at,
+                    "the server no longer has what was to be read next"
+                );
+                partition.next = at;
+            }
+        }
+        // Also where nothing moved: the client stops reading a partition whose position it could not find for a moment.
+        topic.reassign(&client);
+    }
+
+    /// Stops reading, but for what stays open.
+    pub(super) fn stand_back(&self) {
+        let Some(client) = self.client.lock().clone() else { return };
+        let mut state = self.state.lock();
+        for topic in state.topics.values_mut().filter(|topic| !topic.source.stays_open) {
+            topic.unassign(&client);
+        }
+    }
+
+    /// Reads a topic again, from its end: what was written meanwhile was another's.
+    pub(super) fn resume(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
+        let Some(client) = self.client.lock().clone() else { return };
+        let mut state = self.state.lock();
+        let Some(topic) = state.topics.get_mut(topic) else { return };
+        if topic.assigned {
+            return;
+        }
+        topic.identify(info.uuid.clone(), &self.layer);
+        topic.grow(info.partitions, &self.layer);
+        for (number, mark) in marks.iter().enumerate() {
+            if let Some(partition) = topic.partitions.get_mut(number) {
+                partition.next = mark.high;
+            }
+        }
+        for reader in &mut topic.readers {
+            reader.starts = marks.iter().map(|mark| mark.high).collect();
+        }
+        if let Err(error) = topic.assign(&client) {
+            tracing::debug!(topic = %topic.source.topic, %error, "could not be read again yet");
+        }
+    }
+
+    /// Ends all readers.
+    pub(super) fn close(&self) {
+        let topics = {
+            let mut state = self.state.lock();
+            state.closed = true;
+            std::mem::take(&mut state.topics)
+        };
+        for reader in topics.values().flat_map(|topic| &topic.readers) {
+            reader.sender.close();
+        }
+    }
+}
+
+impl TopicState {
+    fn take_in(
+        &mut self,
+        sender: SubscriptionSender,
+        starts: Vec<i64>,
+        kept: Option<&mut dyn FnMut() -> Vec<Received>>,
+    ) {
+        for received in kept.into_iter().flat_map(|kept| kept()) {
+            sender.send(received);
+        }
+        self.readers.push(Reader { sender, starts });
+    }
+
+    fn identify(&mut self, uuid: Option<TopicUuid>, layer: &str) {
+        for (number, partition) in self.partitions.iter_mut().enumerate() {
+            partition.bare_writer = uuid.as_ref().map(|uuid| uuid.bare_writer(layer, number));
+        }
+        self.uuid = uuid;
+    }
+
+    /// Another topic has this name now: nothing of it was seen.
+    fn made_anew(&mut self, uuid: TopicUuid, layer: &str) {
+        for partition in &mut self.partitions {
+            partition.next = 0;
+        }
+        for reader in &mut self.readers {
+            reader.starts.clear();
+        }
+        self.identify(Some(uuid), layer);
+    }
+
+    fn grow(&mut self, partitions: usize, layer: &str) {
+        for number in self.partitions.len()..partitions {
+            self.partitions.push(Partition {
+                next: 0,
+                bare_writer: self.uuid.as_ref().map(|uuid| uuid.bare_writer(layer, number)),
+            });
+        }
+    }
+
+    fn list(&self) -> Result<TopicPartitionList, KafkaError> {
+        let mut list = TopicPartitionList::new();
+        for (number, partition) in (0..).zip(&self.partitions) {
+            list.add_partition_offset(&self.source.topic, number, Offset::Offset(partition.next))?;
+        }
+        Ok(list)
+    }
+
+    fn assign(&mut self, client: &Client) -> Result<(), KafkaError> {
+        client.incremental_assign(&self.list()?)?;
+        self.assigned = true;
+        Ok(())
+    }
+
+    fn unassign(&mut self, client: &Client) {
+        if !std::mem::take(&mut self.assigned) {
+            return;
+        }
+        // Not the list of now: the partitions may have become more since.
+        let assigned = client.assignment().map(|assigned| {
+            let mut list = TopicPartitionList::new();
+            for element in assigned.elements_for_topic(&self.source.topic) {
+                list.add_partition(&self.source.topic, element.partition());
+            }
+            list
+        });
+        if let Err(error) = assigned.and_then(|list| client.incremental_unassign(&list)) {
+            tracing::debug!(topic = %self.source.topic, %error, "could not be left");
+        }
+    }
+
+    /// Reads on at the positions of now.
+    fn reassign(&mut self, client: &Client) {
+        self.unassign(client);
+        if let Err(error) = self.assign(client) {
+            tracing::warn!(topic = %self.source.topic, %error, "the topic cannot be read");
+        }
+    }
+}
+
+fn forget(state: &mut State, client: &Client, topic: &str) {
+    if let Some(mut topic) = state.topics.remove(topic) {
+        topic.unassign(client);
+    }
+}
+
+/// A record as it goes to readers.
+pub(super) fn receive(
+    channel: &ChannelName,
+    message: &BorrowedMessage<'_>,
+    payload: &[u8],
+    identity: Option<(WriterId, u64)>,
+    clock: &Mutex<BrokerClock>,
+) -> Received {
+    let at = Instant::now();
+    let broker_age_us = match message.timestamp() {
+        Timestamp::LogAppendTime(appended) => clock.lock().age_us(appended, at),
+        Timestamp::CreateTime(_) | Timestamp::NotAvailable => 0,
+    };
+    let payload = Bytes::copy_from_slice(payload);
+    let content = if channel.is_reserved() {
+        Content::Bare { payload, identity }
+    } else {
+        content_of(channel, message, payload, identity)
+    };
+    Received {
+        content,
+        at,
+        broker_age_us,
+    }
+}
+
+fn content_of(
+    channel: &ChannelName,
+    message: &BorrowedMessage<'_>,
+    payload: Bytes,
+    identity: Option<(WriterId, u64)>,
+) -> Content {
+    let Some(headers) = message.headers() else {
+        return Content::Bare { payload, identity };
+    };
+    let bytes = payload.len();
+    let read = || {
+        let headers = (0..headers.count())
+            .filter_map(|at| headers.try_get(at))
+            .map(|header| (header.key, header.value));
+        record::read(channel, headers, payload, identity)
+    };
+    // The client library panics over a header's name that is not UTF-8.
+    catch_unwind(AssertUnwindSafe(read)).unwrap_or(Content::Malformed {
+        error: FrameError::Field {
+            field: "headers",
+            reason: "have a name that is not UTF-8",
+        },
+        bytes,
+    })
+}

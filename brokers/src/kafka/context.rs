@@ -1,0 +1,71 @@
+//! What the clients of librdkafka call back.
+
+use std::sync::Arc;
+
+use parking_lot::Mutex;
+use rdkafka::ClientContext;
+use rdkafka::config::RDKafkaLogLevel;
+use rdkafka::consumer::ConsumerContext;
+use rdkafka::error::KafkaError;
+
+use super::identity::Identities;
+
+/// The last error of any client of one broker, for people.
+#[derive(Debug, Default)]
+pub(super) struct LastError(Mutex<Option<String>>);
+
+impl LastError {
+    pub(super) fn note(&self, text: String) {
+        *self.0.lock() = Some(text);
+    }
+
+    pub(super) fn take(&self) -> Option<String> {
+        self.0.lock().take()
+    }
+}
+
+/// Routes the log of a client into ours. librdkafka repeats itself at each attempt to connect, so all but what makes it
+/// useless is for those who debug: what matters is told once, as the broker's status.
+pub(super) fn log(level: RDKafkaLogLevel, facility: &str, line: &str) {
+    match level {
+        RDKafkaLogLevel::Emerg | RDKafkaLogLevel::Alert | RDKafkaLogLevel::Critical => {
+            tracing::warn!(target: "librdkafka", facility, "{line}");
+        }
+        RDKafkaLogLevel::Error | RDKafkaLogLevel::Warning => tracing::debug!(target: "librdkafka", facility, "{line}"),
+        RDKafkaLogLevel::Notice | RDKafkaLogLevel::Info | RDKafkaLogLevel::Debug => {
+            tracing::trace!(target: "librdkafka", facility, "{line}");
+        }
+    }
+}
+
+/// For clients that read and ask.
+pub(super) struct ReadContext {
+    /// What this client knows of its topics' identities.
+    pub(super) identities: Arc<Identities>,
+    /// Where errors are noted.
+    pub(super) last_error: Arc<LastError>,
+}
+
+impl ReadContext {
+    pub(super) fn new(last_error: &Arc<LastError>) -> Self {
+        Self {
+            identities: Arc::default(),
+            last_error: Arc::clone(last_error),
+        }
+    }
+}
+
+impl ClientContext for ReadContext {
+    fn log(&self, level: RDKafkaLogLevel, facility: &str, line: &str) {
+        if matches!(level, RDKafkaLogLevel::Debug) && facility == "METADATA" {
+            self.identities.read_log(line);
+        }
+        log(level, facility, line);
+    }
+
+    fn error(&self, error: KafkaError, reason: &str) {
+        self.last_error.note(format!("{error}: {reason}"));
+    }
+}
+
+impl ConsumerContext for ReadContext {}

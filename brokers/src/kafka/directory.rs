@@ -1,0 +1,174 @@
+//! What the server says of itself and its topics.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use parking_lot::Mutex;
+use rdkafka::consumer::{BaseConsumer, Consumer as _};
+use rdkafka::error::{KafkaError, RDKafkaErrorCode};
+use rdkafka::metadata::{Metadata, MetadataTopic};
+
+use super::context::{LastError, ReadContext};
+use super::identity::{Identities, TopicUuid};
+use super::settings::Settings;
+
+/// How long the log is read for an identity that is not there yet.
+const IDENTITY_TURN: Duration = Duration::from_millis(1);
+const IDENTITY_TURNS: usize = 10;
+
+/// A topic as the server has it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct TopicInfo {
+    /// Its identity, where the server gives one.
+    pub(super) uuid: Option<TopicUuid>,
+    /// How many partitions it has.
+    pub(super) partitions: usize,
+}
+
+/// Where a partition begins and ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Marks {
+    /// Offset of the first record that is still there.
+    pub(super) low: i64,
+    /// Offset of the next record.
+    pub(super) high: i64,
+}
+
+/// Why there is no answer about a topic.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(super) enum LookupError {
+    /// There is no such topic.
+    #[error("there is no topic {0}")]
+    Missing(String),
+    /// The server did not answer, or not yet.
+    #[error("{0}")]
+    Away(String),
+    /// The broker was closed by us.
+    #[error("closed")]
+    Closed,
+}
+
+impl From<KafkaError> for LookupError {
+    fn from(error: KafkaError) -> Self {
+        Self::Away(error.to_string())
+    }
+}
+
+/// The server and all its topics, as one answer has them.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Listing {
+    /// Brokers of the cluster.
+    pub(super) brokers: usize,
+    /// Topics and their partitions; those that are asked for alone if not all were.
+    pub(super) topics: Vec<(String, usize)>,
+}
+
+type Client = BaseConsumer<ReadContext>;
+
+/// A client that only asks, so that its answers never wait behind records.
+pub(super) struct Directory {
+    client: Mutex<Option<Arc<Client>>>,
+    identities: Arc<Identities>,
+    /// One look-up at a time: the log that holds the identity is read by one.
+    turn: Mutex<()>,
+}
+
+impl Directory {
+    pub(super) fn new(settings: &Settings, last_error: &Arc<LastError>) -> Result<Self, KafkaError> {
+        let context = ReadContext::new(last_error);
+        let identities = Arc::clone(&context.identities);
+        let client = settings.questions().create_with_context(context)?;
+        Ok(Self {
+            client: Mutex::new(Some(Arc::new(client))),
+            identities,
+            turn: Mutex::default(),
+        })
+    }
+
+    fn client(&self) -> Result<Arc<Client>, LookupError> {
+        self.client.lock().clone().ok_or(LookupError::Closed)
+    }
+
+    /// Asks for all topics, or for one. Waits for the answer.
+    pub(super) fn list(&self, topic: Option<&str>, timeout: Duration) -> Result<Listing, LookupError> {
+        let client = self.client()?;
+        let metadata = client.fetch_metadata(topic, timeout);
+        // Serves the client's log and errors.
+        client.poll(Duration::ZERO);
+        let metadata = metadata?;
+        let good = |topic: &&MetadataTopic| topic.error().is_none() && !topic.partitions().is_empty();
+        let topics = metadata.topics().iter().filter(good);
+        Ok(Listing {
+            brokers: metadata.brokers().len(),
+            topics: topics
+                .map(|topic| (topic.name().to_owned(), topic.partitions().len()))
+                .collect(),
+        })
+    }
+
+    /// The identity of the cluster, if it is known soon.
+    pub(super) fn cluster(&self) -> Option<String> {
+        self.client().ok()?.client().fetch_cluster_id(Duration::from_millis(200))
+    }
+
+    /// Looks a topic up. Waits for the answer.
+    pub(super) fn topic(&self, topic: &str, timeout: Duration) -> Result<TopicInfo, LookupError> {
+        let client = self.client()?;
+        let _turn = self
+            .turn
+            .try_lock_for(timeout)
+            .ok_or_else(|| LookupError::Away("too many questions at once".to_owned()))?;
+        let metadata = client.fetch_metadata(Some(topic), timeout)?;
+        let partitions = partitions_of(&metadata, topic)?;
+        // What the log says of the identity was queued before the answer.
+        let mut turns = 0;
+        loop {
+            client.poll(IDENTITY_TURN);
+            turns += 1;
+            if self.identities.of(topic).is_some() || turns == IDENTITY_TURNS {
+                break;
+            }
+        }
+        Ok(TopicInfo {
+            uuid: self.identities.of(topic),
+            partitions,
+        })
+    }
+
+    /// What is known of a topic's identity without asking.
+    pub(super) fn known_identity(&self, topic: &str) -> Option<TopicUuid> {
+        self.identities.of(topic)
+    }
+
+    /// Where the partitions of a topic begin and end now. Waits for the answers.
+    pub(super) fn marks(&self, topic: &str, partitions: usize, deadline: Instant) -> Result<Vec<Marks>, LookupError> {
+        let client = self.client()?;
+        let mark = |partition: usize| {
+            let left = deadline.saturating_duration_since(Instant::now()).max(IDENTITY_TURN);
+            let number = i32::try_from(partition).unwrap_or(i32::MAX);
+            let (low, high) = client.fetch_watermarks(topic, number, left)?;
+            Ok(Marks { low, high })
+        };
+        (0..partitions).map(mark).collect()
+    }
+
+    /// Ends it. Blocks while the client ends.
+    pub(super) fn close(&self) {
+        let client = self.client.lock().take();
+        drop(client);
+    }
+}
+
+fn partitions_of(metadata: &Metadata, name: &str) -> Result<usize, LookupError> {
+    let Some(topic) = metadata.topics().iter().find(|topic| topic.name() == name) else {
+        return Err(LookupError::Missing(name.to_owned()));
+    };
+    match topic.error().map(RDKafkaErrorCode::from) {
+        None if topic.partitions().is_empty() => Err(LookupError::Missing(name.to_owned())),
+        None => Ok(topic.partitions().len()),
+        Some(RDKafkaErrorCode::UnknownTopicOrPartition | RDKafkaErrorCode::UnknownTopic) => {
+            Err(LookupError::Missing(name.to_owned()))
+        }
+        Some(error) => Err(LookupError::Away(format!("topic {name}: {error}"))),
+    }
+}

@@ -1,0 +1,314 @@
+//! What the flow of a layer does on its Kafka, beside messages: topics, leases, what is kept of writers.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use async_trait::async_trait;
+use blaze_domain::WriterId;
+use blaze_domain::names::ChannelName;
+use bytes::Bytes;
+use parking_lot::Mutex;
+use rdkafka::error::RDKafkaErrorCode;
+
+use super::Inner;
+use super::admin::{Admin, Purpose};
+use super::directory::Listing;
+use super::identity::TopicUuid;
+use super::keyed::KeyedWriter;
+use super::names::{RESERVED, collide};
+use super::read_to_end::ReaderToEnd;
+use super::record;
+use super::topics::Topic;
+use crate::port::{BrokerError, FlowSide};
+
+/// How long reading all leases may take.
+const LOAD: Duration = Duration::from_secs(10);
+/// Leases that are remembered at most, to write them again.
+const MAX_LEASES: usize = 65_536;
+/// Places of a writer that are taken away at most.
+const MAX_DEPTH: u32 = 10_000;
+
+/// A topic that is to be there.
+struct Prepared {
+    topic: Arc<Topic>,
+    depth: u32,
+    /// Whether it is known to keep what it shall.
+    keeps: bool,
+}
+
+/// The flow's part of a broker.
+pub(super) struct FlowState {
+    reserved: Vec<Arc<str>>,
+    leases: Arc<Topic>,
+    leases_identity: Mutex<Option<TopicUuid>>,
+    prepared: Mutex<BTreeMap<Arc<str>, Prepared>>,
+    mirror: Mutex<HashMap<String, Bytes>>,
+    pub(super) keyed: KeyedWriter,
+    pub(super) stood_back: Mutex<Option<String>>,
+    /// Names of the server's topics, as they were last listed.
+    listed: Mutex<HashSet<Arc<str>>>,
+    /// Topics that could not be made, told once.
+    refused: Mutex<HashMap<Arc<str>, RDKafkaErrorCode>>,
+    admin: Mutex<Option<Arc<Admin>>>,
+}
+
+impl FlowState {
+    pub(super) fn new(names: &super::names::Names, topics: &super::topics::Topics) -> Self {
+        Self {
+            reserved: RESERVED.iter().map(|channel| names.reserved(channel)).collect(),
+            leases: topics.of(&names.leases(), false).0,
+            leases_identity: Mutex::default(),
+            prepared: Mutex::default(),
+            mirror: Mutex::default(),
+            keyed: KeyedWriter::default(),
+            stood_back: Mutex::default(),
+            listed: Mutex::default(),
+            refused: Mutex::default(),
+            admin: Mutex::default(),
+        }
+    }
+
+    /// Ends the client that makes topics. Blocks meanwhile.
+    pub(super) fn close(&self) {
+        let admin = self.admin.lock().take();
+        drop(admin);
+    }
+
+    fn admin(&self, inner: &Inner) -> Result<Arc<Admin>, String> {
+        let mut admin = self.admin.lock();
+        if let Some(admin) = &*admin {
+            return Ok(Arc::clone(admin));
+        }
+        let made = Admin::new(&inner.settings, &inner.last_error).map_err(|error| error.to_string())?;
+        Ok(Arc::clone(admin.insert(Arc::new(made))))
+    }
+
+    /// Makes what is missing. Returns whether something was made, or why what is needed first could not be made.
+    pub(super) fn keep_topics(&self, inner: &Inner, listing: &Listing) -> Result<bool, String> {
+        let there: HashSet<Arc<str>> = listing.topics.iter().map(|(name, _)| Arc::from(name.as_str())).collect();
+        let missing = self.missing(&there);
+        *self.listed.lock() = there;
+        if !missing.is_empty() {
+            let refused = self.admin(inner)?.make(&missing).map_err(|error| error.to_string())?;
+            self.note_refused(&missing, &refused)?;
+            if missing.iter().any(|(name, _)| *name == self.leases.name) {
+                self.write_all_leases();
+            }
+        }
+        self.keep_last_values(inner);
+        self.follow_leases_topic(inner);
+        Ok(!missing.is_empty())
+    }
+
+    fn missing(&self, there: &HashSet<Arc<str>>) -> Vec<(Arc<str>, Purpose)> {
+        let refused = self.refused.lock();
+        let prepared = self.prepared.lock();
+        let wanted = prepared.iter().map(|(name, prepared)| {
+            let purpose = if prepared.depth > 0 {
+                Purpose::LastValues
+            } else {
+                Purpose::Messages
+            };
+            (name, purpose)
+        });
+        let reserved = self.reserved.iter().map(|name| (name, Purpose::Messages));
+        let leases = (&self.leases.name, Purpose::LastValues);
+        std::iter::once(leases)
+            .chain(reserved)
+            .chain(wanted)
+            .filter(|(name, _)| !there.contains(*name))
+            // An impossible name stays one.
+            .filter(|(name, _)| refused.get(*name) != Some(&RDKafkaErrorCode::InvalidTopic))
+            .map(|(name, purpose)| (Arc::clone(name), purpose))
+            .collect()
+    }
+
+    fn note_refused(
+        &self,
+        asked: &[(Arc<str>, Purpose)],
+        refused: &[(Arc<str>, RDKafkaErrorCode)],
+    ) -> Result<(), String> {
+        let mut known = self.refused.lock();
+        for (name, _) in asked {
+            if !refused.iter().any(|(refused, _)| refused == name) {
+                known.remove(name);
+            }
+        }
+        let mut needed = Ok(());
+        for (name, code) in refused {
+            if known.insert(Arc::clone(name), *code) != Some(*code) {
+                tracing::warn!(topic = %name, %code, "the topic could not be made");
+            }
+            if *name == self.leases.name || self.reserved.contains(name) {
+                needed = Err(format!("topic {name} could not be made: {code}"));
+            }
+        }
+        needed
+    }
+
+    /// Topics that were there before, for something else, shall keep the last messages of each writer.
+    fn keep_last_values(&self, inner: &Inner) {
+        let to_check: Vec<Arc<str>> = {
+            let prepared = self.prepared.lock();
+            let open = prepared.iter().filter(|(_, prepared)| prepared.depth > 0 && !prepared.keeps);
+            open.filter(|(_, prepared)| prepared.topic.partitions().is_some())
+                .map(|(name, _)| Arc::clone(name))
+                .collect()
+        };
+        for name in to_check {
+            let done = self
+                .admin(inner)
+                .and_then(|admin| admin.keep_last_values(&name).map_err(|error| error.to_string()));
+            match done {
+                Ok(()) => {
+                    if let Some(prepared) = self.prepared.lock().get_mut(&name) {
+                        prepared.keeps = true;
+                    }
+                }
+                Err(error) => tracing::debug!(topic = %name, error, "could not be made to keep the last messages"),
+            }
+        }
+    }
+
+    /// If someone else made the topic of leases anew, it is empty.
+    fn follow_leases_topic(&self, inner: &Inner) {
+        let name = &self.leases.name;
+        let found = inner.directory.known_identity(name);
+        let Some(found) = found.or_else(|| inner.directory.topic(name, Duration::from_secs(1)).ok()?.uuid) else {
+            return;
+        };
+        let before = self.leases_identity.lock().replace(found.clone());
+        if before.is_some_and(|before| before != found) {
+            self.write_all_leases();
+        }
+    }
+
+    fn write_all_leases(&self) {
+        let mirror = self.mirror.lock().clone();
+        if !mirror.is_empty() {
+            tracing::info!(leases = mirror.len(), "the topic of leases was made anew: all are written again");
+        }
+        for (key, value) in mirror {
+            self.keyed.put(&self.leases, None, key, Some(value));
+        }
+    }
+
+    fn load(&self, inner: &Inner) -> Result<Vec<(String, Bytes)>, BrokerError> {
+        let deadline = Instant::now() + LOAD;
+        let name = &self.leases.name;
+        let info = inner.directory.topic(name, LOAD).map_err(away)?;
+        let marks = inner.directory.marks(name, info.partitions, deadline).map_err(away)?;
+        let mut reader = ReaderToEnd::open(&inner.settings, &inner.last_error, name, &marks).map_err(away)?;
+        let ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
+        reader
+            .read(&ends, deadline, &|| inner.is_closed(), |_, payload| {
+                Some(Bytes::copy_from_slice(payload))
+            })
+            .map_err(away)?;
+        let leases: Vec<(String, Bytes)> = reader
+            .take_latest()
+            .into_iter()
+            .filter_map(|(key, value)| Some((String::from_utf8(key).ok()?, value)))
+            .collect();
+        let mut mirror = self.mirror.lock();
+        for (key, value) in &leases {
+            if mirror.len() < MAX_LEASES && !mirror.contains_key(key) {
+                mirror.insert(key.clone(), value.clone());
+            }
+        }
+        Ok(leases)
+    }
+}
+
+fn away(error: super::directory::LookupError) -> BrokerError {
+    match error {
+        super::directory::LookupError::Closed => BrokerError::Closed,
+        other => BrokerError::Away(other.to_string()),
+    }
+}
+
+/// What the flow is given.
+pub(super) struct KafkaFlowSide {
+    pub(super) inner: Arc<Inner>,
+    pub(super) state: Arc<FlowState>,
+}
+
+#[async_trait]
+impl FlowSide for KafkaFlowSide {
+    fn prepare(&self, channel: &ChannelName, depth: u32) -> Result<(), BrokerError> {
+        let name = self.inner.names.topic(channel)?;
+        let state = &self.state;
+        let mut prepared = state.prepared.lock();
+        if let Some(prepared) = prepared.get_mut(&name) {
+            prepared.keeps &= prepared.depth > 0 || depth == 0;
+            prepared.depth = prepared.depth.max(depth);
+        } else {
+            let listed = state.listed.lock();
+            let other = prepared.keys().chain(listed.iter()).find(|other| collide(&name, other));
+            if let Some(other) = other {
+                return Err(BrokerError::Name {
+                    channel: channel.to_string(),
+                    reason: format!("its topic {name} and the topic {other} collide on Kafka"),
+                });
+            }
+            let new = Prepared {
+                topic: self.inner.topics.of(&name, false).0,
+                depth,
+                keeps: false,
+            };
+            prepared.insert(Arc::clone(&name), new);
+        }
+        drop(prepared);
+        state.refused.lock().remove(&name);
+        self.inner.bell.ring();
+        Ok(())
+    }
+
+    fn release(&self, channel: &ChannelName) {
+        if let Ok(name) = self.inner.names.topic(channel) {
+            self.state.prepared.lock().remove(&name);
+        }
+    }
+
+    async fn load_leases(&self) -> Result<Vec<(String, Bytes)>, BrokerError> {
+        let (inner, state) = (Arc::clone(&self.inner), Arc::clone(&self.state));
+        let load = tokio::task::spawn_blocking(move || state.load(&inner));
+        load.await.unwrap_or_else(|_| Err(BrokerError::Closed))
+    }
+
+    fn put_lease(&self, key: &str, value: Bytes) {
+        let mut mirror = self.state.mirror.lock();
+        if mirror.len() < MAX_LEASES || mirror.contains_key(key) {
+            mirror.insert(key.to_owned(), value.clone());
+        }
+        self.state.keyed.put(&self.state.leases, None, key.to_owned(), Some(value));
+    }
+
+    fn remove_lease(&self, key: &str) {
+        let mut mirror = self.state.mirror.lock();
+        mirror.remove(key);
+        self.state.keyed.put(&self.state.leases, None, key.to_owned(), None);
+    }
+
+    fn forget_writer(&self, channel: &ChannelName, writer: WriterId) {
+        let Ok(name) = self.inner.names.topic(channel) else { return };
+        let prepared = self.state.prepared.lock();
+        let Some(Prepared { topic, depth, .. }) = prepared.get(&name) else { return };
+        // A topic that is not there keeps nothing.
+        let Some(partitions) = topic.partitions() else { return };
+        let partition = Some(record::partition_of(writer, partitions));
+        for slot in 0..(*depth).min(MAX_DEPTH) {
+            let key = record::kept_key(writer, u64::from(slot));
+            self.state.keyed.put(topic, partition, key, None);
+        }
+    }
+
+    fn stand_back(&self, for_whom: Option<String>) {
+        let back = for_whom.is_some();
+        if std::mem::replace(&mut *self.state.stood_back.lock(), for_whom).is_some() == back && !back {
+            return;
+        }
+        self.inner.stand_back(back);
+    }
+}

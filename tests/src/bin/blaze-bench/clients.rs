@@ -1,0 +1,202 @@
+//! Plain clients, as any service has them.
+
+use std::time::Duration;
+
+use anyhow::Context;
+use rdkafka::ClientConfig;
+use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, TopicReplication};
+use rdkafka::consumer::{BaseConsumer, Consumer as _};
+use rdkafka::message::Message as _;
+use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
+use rdkafka::topic_partition_list::{Offset, TopicPartitionList};
+use rdkafka::util::Timeout;
+
+/// Sends.
+pub(crate) trait Source {
+    fn send(&mut self, payload: &[u8]) -> anyhow::Result<()>;
+    fn flush(&mut self) -> anyhow::Result<()>;
+}
+
+/// Receives.
+pub(crate) trait Sink: Send {
+    /// Gives what is there; waits some milliseconds for it.
+    fn poll(&mut self, found: &mut dyn FnMut(&[u8])) -> anyhow::Result<()>;
+}
+
+/// Pipelined PUBLISH.
+pub(crate) struct RedisSource {
+    connection: redis::Connection,
+    channel: String,
+    pipeline: redis::Pipeline,
+    waiting: usize,
+}
+
+impl RedisSource {
+    pub(crate) fn new(url: &str, channel: &str) -> anyhow::Result<Self> {
+        Ok(Self {
+            connection: redis::Client::open(url)?.get_connection()?,
+            channel: channel.to_owned(),
+            pipeline: redis::pipe(),
+            waiting: 0,
+        })
+    }
+}
+
+impl Source for RedisSource {
+    fn send(&mut self, payload: &[u8]) -> anyhow::Result<()> {
+        self.pipeline.cmd("PUBLISH").arg(&self.channel).arg(payload).ignore();
+        self.waiting += 1;
+        if self.waiting >= 64 { self.flush() } else { Ok(()) }
+    }
+
+    fn flush(&mut self) -> anyhow::Result<()> {
+        if self.waiting > 0 {
+            self.pipeline.exec(&mut self.connection)?;
+            self.pipeline.clear();
+            self.waiting = 0;
+        }
+        Ok(())
+    }
+}
+
+/// SUBSCRIBE.
+pub(crate) struct RedisSink {
+    connection: redis::Connection,
+}
+
+impl RedisSink {
+    pub(crate) fn new(url: &str, channel: &str) -> anyhow::Result<Self> {
+        let mut connection = redis::Client::open(url)?.get_connection()?;
+        {
+            let mut subscription = connection.as_pubsub();
+            subscription.subscribe(channel)?;
+            subscription.set_read_timeout(Some(Duration::from_millis(50)))?;
+            // Dropping the borrow would unsubscribe.
+            std::mem::forget(subscription);
+        }
+        Ok(Self { connection })
+    }
+}
+
+impl Sink for RedisSink {
+    fn poll(&mut self, found: &mut dyn FnMut(&[u8])) -> anyhow::Result<()> {
+        for _ in 0..256 {
+            match self.connection.recv_response() {
+                Ok(redis::Value::Array(parts)) => {
+                    if let Some(redis::Value::BulkString(payload)) = parts.into_iter().nth(2) {
+                        found(&payload);
+                    }
+                }
+                Ok(_) => {}
+                Err(error) if error.is_timeout() => return Ok(()),
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(())
+    }
+}
+
+/// An idempotent producer.
+pub(crate) struct KafkaSource {
+    producer: BaseProducer,
+    topic: String,
+}
+
+impl KafkaSource {
+    pub(crate) fn new(bootstrap: &str, topic: &str) -> anyhow::Result<Self> {
+        let producer = ClientConfig::new()
+            .set("bootstrap.servers", bootstrap)
+            .set("enable.idempotence", "true")
+            .set("linger.ms", "0")
+            .set("message.max.bytes", "17825792")
+            .set("socket.nagle.disable", "true")
+            .create()?;
+        Ok(Self {
+            producer,
+            topic: topic.to_owned(),
+        })
+    }
+}
+
+impl Source for KafkaSource {
+    fn send(&mut self, payload: &[u8]) -> anyhow::Result<()> {
+        let mut record: BaseRecord<'_, (), [u8]> = BaseRecord::to(&self.topic).payload(payload);
+        loop {
+            match self.producer.send(record) {
+                Ok(()) => break,
+                Err((error, back)) if error.rdkafka_error_code() == Some(rdkafka::types::RDKafkaErrorCode::QueueFull) => {
+                    record = back;
+                    self.producer.poll(Duration::from_millis(1));
+                }
+                Err((error, _)) => return Err(error.into()),
+            }
+        }
+        self.producer.poll(Duration::ZERO);
+        Ok(())
+    }
+
+    fn flush(&mut self) -> anyhow::Result<()> {
+        self.producer.poll(Duration::ZERO);
+        Ok(())
+    }
+}
+
+impl Drop for KafkaSource {
+    fn drop(&mut self) {
+        let _ = self.producer.flush(Timeout::After(Duration::from_secs(5)));
+    }
+}
+
+/// A consumer without a group, from the end.
+pub(crate) struct KafkaSink {
+    consumer: BaseConsumer,
+}
+
+impl KafkaSink {
+    pub(crate) fn new(bootstrap: &str, topic: &str) -> anyhow::Result<Self> {
+        let consumer: BaseConsumer = ClientConfig::new()
+            .set("bootstrap.servers", bootstrap)
+            .set("group.id", "blaze-bench")
+            .set("enable.auto.commit", "false")
+            .set("fetch.wait.max.ms", "100")
+            .set("fetch.message.max.bytes", "17825792")
+            .set("socket.nagle.disable", "true")
+            .create()?;
+        let (_, end) = consumer.fetch_watermarks(topic, 0, Duration::from_secs(10))?;
+        let mut partitions = TopicPartitionList::new();
+        partitions.add_partition_offset(topic, 0, Offset::Offset(end))?;
+        consumer.assign(&partitions)?;
+        Ok(Self { consumer })
+    }
+}
+
+impl Sink for KafkaSink {
+    fn poll(&mut self, found: &mut dyn FnMut(&[u8])) -> anyhow::Result<()> {
+        match self.consumer.poll(Duration::from_millis(50)) {
+            Some(message) => found(message?.payload().unwrap_or_default()),
+            None => return Ok(()),
+        }
+        for _ in 0..1_000 {
+            match self.consumer.poll(Duration::ZERO) {
+                Some(message) => found(message?.payload().unwrap_or_default()),
+                None => break,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Makes a topic as the flow does.
+pub(crate) fn make_topic(bootstrap: &str, topic: &str) -> anyhow::Result<()> {
+    let admin: AdminClient<_> = ClientConfig::new().set("bootstrap.servers", bootstrap).create()?;
+    let new = NewTopic::new(topic, 1, TopicReplication::Fixed(1))
+        .set("max.message.bytes", "17825792")
+        .set("retention.bytes", "268435456")
+        .set("segment.bytes", "67108864");
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let made = runtime.block_on(admin.create_topics(&[new], &AdminOptions::new()))?;
+    match made.into_iter().next().context("no answer")? {
+        Ok(_) | Err((_, rdkafka::types::RDKafkaErrorCode::TopicAlreadyExists)) => Ok(()),
+        Err((topic, code)) => anyhow::bail!("topic {topic}: {code}"),
+    }
+}

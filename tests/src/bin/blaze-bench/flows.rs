@@ -1,0 +1,89 @@
+//! The flows on the way, as processes of their own.
+
+use std::time::Duration;
+
+use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
+use blaze_tests::plain::KafkaWriter;
+
+/// From where to where.
+pub(crate) struct Route<'a> {
+    pub(crate) two: bool,
+    pub(crate) redis: &'a str,
+    pub(crate) redis_prefix: &'a str,
+    pub(crate) kafka: &'a str,
+    pub(crate) kafka_prefix: &'a str,
+    pub(crate) topic: &'a str,
+    pub(crate) rate_hz: Option<f64>,
+    pub(crate) bytes: usize,
+}
+
+/// Running flows; they end with this.
+pub(crate) struct Flows {
+    running: Vec<FlowProcess>,
+}
+
+impl Flows {
+    /// Starts the flows, advertises and requests as plain clients do, and waits until the bridges are up.
+    pub(crate) fn start(route: &Route<'_>) -> anyhow::Result<Self> {
+        let specs = if route.two {
+            let domain = free_domain()?;
+            vec![
+                FlowSpec::new("edge", "bench-robot")
+                    .on_redis(route.redis, route.redis_prefix)
+                    .joined(domain),
+                FlowSpec::new("cloud", "bench-cloud")
+                    .on_kafka(route.kafka, route.kafka_prefix)
+                    .joined(domain),
+            ]
+        } else {
+            vec![
+                FlowSpec::new("cloud", "bench-cloud")
+                    .on_redis(route.redis, route.redis_prefix)
+                    .on_kafka(route.kafka, route.kafka_prefix),
+            ]
+        };
+        let unlimited = |spec| FlowSpec {
+            limit_mbps: 20_000.0,
+            extra: "log: { level: warn }\n".to_owned(),
+            ..spec
+        };
+        let mut running = Vec::new();
+        for spec in specs {
+            running.push(FlowProcess::launch(unlimited(spec))?);
+        }
+        for flow in &mut running {
+            flow.wait_ready()?;
+        }
+        let flows = Self { running };
+        flows.connect(route)?;
+        Ok(flows)
+    }
+
+    fn connect(&self, route: &Route<'_>) -> anyhow::Result<()> {
+        let rate = route.rate_hz.map_or(String::new(), |rate| format!("\"rate_hz\":{rate},"));
+        let advertise = format!(
+            "{{\"op\":\"advertise\",\"topic\":\"{}\",\"service\":\"bench-source\",{rate}\"max_bytes\":{},\"reliability\":\"reliable\",\"ttl_s\":0}}",
+            route.topic, route.bytes
+        );
+        let mut redis = redis::Client::open(route.redis)?.get_connection()?;
+        redis::cmd("PUBLISH")
+            .arg(format!("{}blaze/flow/control", route.redis_prefix))
+            .arg(advertise)
+            .exec(&mut redis)?;
+        let request = format!(
+            "{{\"op\":\"request\",\"topic\":\"{}\",\"service\":\"bench-sink\",\"reliability\":\"reliable\",\"ttl_s\":0}}",
+            route.topic
+        );
+        let control = format!("{}blaze.flow.control", route.kafka_prefix);
+        KafkaWriter::new(route.kafka)?.produce(&control, request.as_bytes())?;
+        for flow in &self.running {
+            flow.wait_bridge(route.topic, Duration::from_secs(20))?;
+        }
+        Ok(())
+    }
+
+    /// CPU time that the flows have used, all of them together.
+    pub(crate) fn cpu(&self) -> anyhow::Result<Duration> {
+        self.running.iter().map(FlowProcess::cpu).sum()
+    }
+}

@@ -1,0 +1,159 @@
+//! What a hop costs: Redis alone, Kafka alone, Redis to Kafka on one flow, Redis over DDS to Kafka on two flows, all in one
+//! run on one machine.
+//!
+//! ```text
+//! source (plain client) ─► server ─► blaze-flow … ─► server ─► sink (plain client): latency, loss, rate
+//!                                        └─ CPU time of the flow's process, from /proc
+//! ```
+//!
+//! Needs `scripts/services start` (or `--redis` and `--kafka`), and is meant for release builds:
+//! `cargo build --release --workspace && target/release/blaze-bench`.
+
+mod clients;
+mod flows;
+mod load;
+
+use std::time::Duration;
+
+use anyhow::Context;
+use blaze_tests::servers;
+use clap::Parser;
+
+use clients::{KafkaSink, KafkaSource, RedisSink, RedisSource, Sink, Source};
+use flows::{Flows, Route};
+use load::{Figures, Load};
+
+/// Measures what a hop costs.
+#[derive(Parser)]
+#[command(name = "blaze-bench", version)]
+struct Arguments {
+    /// Redis server; else BLAZE_TEST_REDIS_URL of .services/env
+    #[arg(long, value_name = "URL")]
+    redis: Option<String>,
+    /// Kafka broker; else BLAZE_TEST_KAFKA_CLOUD of .services/env
+    #[arg(long, value_name = "HOST:PORT")]
+    kafka: Option<String>,
+    /// Seconds per measurement
+    #[arg(long, default_value_t = 5.0)]
+    seconds: f64,
+    /// Only paths whose name contains this
+    #[arg(long, default_value = "")]
+    only: String,
+    /// Only loads whose name contains this
+    #[arg(long, default_value = "")]
+    load: String,
+}
+
+/// What is measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum PathKind {
+    RedisAlone,
+    KafkaAlone,
+    OneFlow,
+    TwoFlows,
+}
+
+impl PathKind {
+    const ALL: [Self; 4] = [Self::RedisAlone, Self::KafkaAlone, Self::OneFlow, Self::TwoFlows];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::RedisAlone => "redis",
+            Self::KafkaAlone => "kafka",
+            Self::OneFlow => "redis>flow>kafka",
+            Self::TwoFlows => "redis>flow>dds>flow>kafka",
+        }
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    let arguments = Arguments::parse();
+    let redis = match arguments.redis {
+        Some(url) => url,
+        None => servers::address("BLAZE_TEST_REDIS_URL").context("no --redis")?,
+    };
+    let kafka = match arguments.kafka {
+        Some(address) => address,
+        None => servers::address("BLAZE_TEST_KAFKA_CLOUD").context("no --kafka")?,
+    };
+    let run = format!("bench-{}", std::process::id());
+    let duration = Duration::from_secs_f64(arguments.seconds);
+    println!(
+        "{:<27} {:<22} {:>9} {:>8} {:>9} {:>9} {:>9} {:>13}",
+        "PATH", "LOAD", "SENT", "LOST", "MSG/S", "p50/ms", "p99/ms", "FLOW us/MSG"
+    );
+    for kind in PathKind::ALL
+        .into_iter()
+        .filter(|kind| kind.name().contains(&arguments.only))
+    {
+        for load in Load::all()
+            .into_iter()
+            .filter(|load| load.name().contains(&arguments.load))
+        {
+            let name = format!("{run}-{}", kind.name().replace('>', "-"));
+            let figures = measure(kind, &name, load, duration, &redis, &kafka)?;
+            print_row(kind, load, &figures);
+        }
+    }
+    Ok(())
+}
+
+fn measure(
+    kind: PathKind,
+    run: &str,
+    load: Load,
+    duration: Duration,
+    redis: &str,
+    kafka: &str,
+) -> anyhow::Result<Figures> {
+    let topic = format!("bench/{}", load.name().replace([' ', '/', ','], "-"));
+    let (redis_prefix, kafka_prefix) = (format!("{run}:"), format!("{run}."));
+    let redis_channel = format!("{redis_prefix}{topic}");
+    let kafka_topic = format!("{kafka_prefix}{}", topic.replace('/', "."));
+    let flows = match kind {
+        PathKind::RedisAlone => None,
+        PathKind::KafkaAlone => {
+            clients::make_topic(kafka, &kafka_topic)?;
+            None
+        }
+        PathKind::OneFlow | PathKind::TwoFlows => Some(Flows::start(&Route {
+            two: kind == PathKind::TwoFlows,
+            redis,
+            redis_prefix: &redis_prefix,
+            kafka,
+            kafka_prefix: &kafka_prefix,
+            topic: &topic,
+            rate_hz: load.rate_hz(),
+            bytes: load.bytes(),
+        })?),
+    };
+    let mut source: Box<dyn Source> = match kind {
+        PathKind::KafkaAlone => Box::new(KafkaSource::new(kafka, &kafka_topic)?),
+        _ => Box::new(RedisSource::new(redis, &redis_channel)?),
+    };
+    let sink: Box<dyn Sink> = match kind {
+        PathKind::RedisAlone => Box::new(RedisSink::new(redis, &redis_channel)?),
+        _ => Box::new(KafkaSink::new(kafka, &kafka_topic)?),
+    };
+    let cpu = || flows.as_ref().map_or(Ok(Duration::ZERO), Flows::cpu);
+    load::run(load, duration, source.as_mut(), sink, &cpu)
+}
+
+fn print_row(kind: PathKind, load: Load, figures: &Figures) {
+    let cpu = if matches!(kind, PathKind::OneFlow | PathKind::TwoFlows) {
+        format!("{:.1}", figures.flow_cpu_us_per_message)
+    } else {
+        "-".to_owned()
+    };
+    println!(
+        "{:<27} {:<22} {:>9} {:>8} {:>9.0} {:>9.3} {:>9.3} {:>13}",
+        kind.name(),
+        load.name(),
+        figures.sent,
+        figures.lost,
+        figures.rate_hz,
+        figures.p50_ms,
+        figures.p99_ms,
+        cpu
+    );
+}

@@ -1,0 +1,311 @@
+//! `blaze-flow` as a process of its own, on real brokers.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::Context;
+use serde_json::Value;
+
+use crate::admin::Admin;
+use crate::process::Process;
+use crate::wait;
+
+/// Where a flow must say `ready`, on a busy machine.
+const START: Duration = Duration::from_secs(30);
+
+/// The node file of a flow.
+#[derive(Debug, Clone)]
+pub struct FlowSpec {
+    /// Layer; its kind has the same word unless `kind` says otherwise.
+    pub layer: String,
+    /// edge, fog or cloud; empty = as the layer is named.
+    pub kind: String,
+    /// Node.
+    pub node: String,
+    /// URL and prefix of the node scope's Redis.
+    pub redis: Option<(String, String)>,
+    /// Address and prefix of the layer scope's Kafka.
+    pub kafka: Option<(String, String)>,
+    /// DDS domain of the inter scope, on loopback.
+    pub domain: Option<u16>,
+    /// `flow.bandwidth.limit_mbps`.
+    pub limit_mbps: f64,
+    /// Further lines of the node file.
+    pub extra: String,
+}
+
+impl FlowSpec {
+    /// A flow without brokers.
+    #[must_use]
+    pub fn new(layer: &str, node: &str) -> Self {
+        Self {
+            layer: layer.to_owned(),
+            kind: String::new(),
+            node: node.to_owned(),
+            redis: None,
+            kafka: None,
+            domain: None,
+            limit_mbps: 160.0,
+            extra: String::new(),
+        }
+    }
+
+    /// With Redis as node scope.
+    #[must_use]
+    pub fn on_redis(mut self, url: &str, prefix: &str) -> Self {
+        self.redis = Some((url.to_owned(), prefix.to_owned()));
+        self
+    }
+
+    /// With Kafka as layer scope.
+    #[must_use]
+    pub fn on_kafka(mut self, bootstrap: &str, prefix: &str) -> Self {
+        self.kafka = Some((bootstrap.to_owned(), prefix.to_owned()));
+        self
+    }
+
+    /// With an inter scope on loopback.
+    #[must_use]
+    pub fn joined(mut self, domain: u16) -> Self {
+        self.domain = Some(domain);
+        self
+    }
+
+    /// The node file.
+    #[must_use]
+    pub fn to_yaml(&self, state: &Path) -> String {
+        let kind = if self.kind.is_empty() { &self.layer } else { &self.kind };
+        let mut text = format!(
+            "layer: {{ name: {}, kind: {kind} }}\nnode: {{ name: {} }}\nbrokers:\n",
+            self.layer, self.node
+        );
+        if let Some((url, prefix)) = &self.redis {
+            let _ = writeln!(text, "  node: {{ redis: {{ url: \"{url}\", prefix: \"{prefix}\" }} }}");
+        }
+        if let Some((bootstrap, prefix)) = &self.kafka {
+            let _ = writeln!(
+                text,
+                "  layer: {{ kafka: {{ bootstrap: [\"{bootstrap}\"], prefix: \"{prefix}\" }} }}"
+            );
+        }
+        if let Some(domain) = self.domain {
+            let _ = writeln!(
+                text,
+                "  inter: {{ dds: {{ domain: {domain}, listen: \"127.0.0.1\", peers: [\"127.0.0.1\"] }} }}"
+            );
+        }
+        let _ = write!(
+            text,
+            "admin: {{ flow: \"127.0.0.1:0\" }}\nflow: {{ bandwidth: {{ limit_mbps: {} }} }}\nstate_dir: {}\n{}",
+            self.limit_mbps,
+            state.display(),
+            self.extra
+        );
+        text
+    }
+}
+
+/// A running `blaze-flow`; it is killed when dropped.
+pub struct FlowProcess {
+    /// What it was started with.
+    pub spec: FlowSpec,
+    file: PathBuf,
+    process: Process,
+    admin: Option<Admin>,
+    _folder: tempfile::TempDir,
+}
+
+impl FlowProcess {
+    /// Starts it and does not wait.
+    ///
+    /// # Errors
+    /// When it is not built or the node file cannot be written.
+    pub fn launch(spec: FlowSpec) -> anyhow::Result<Self> {
+        let folder = tempfile::tempdir()?;
+        let file = folder.path().join("blaze.yaml");
+        std::fs::write(&file, spec.to_yaml(folder.path()))?;
+        let process = run(&file)?;
+        Ok(Self {
+            spec,
+            file,
+            process,
+            admin: None,
+            _folder: folder,
+        })
+    }
+
+    /// Starts it and waits until it is ready.
+    ///
+    /// # Errors
+    /// As [`FlowProcess::launch`], and when it is not ready in time.
+    pub fn start(spec: FlowSpec) -> anyhow::Result<Self> {
+        let mut flow = Self::launch(spec)?;
+        flow.wait_ready()?;
+        Ok(flow)
+    }
+
+    /// Waits until it is ready.
+    ///
+    /// # Errors
+    /// When it is not in time, with its last words.
+    pub fn wait_ready(&mut self) -> anyhow::Result<()> {
+        let admin = self.listening()?;
+        let asked = admin.clone();
+        wait::until("/readyz says 200", START, || asked.ready(), || self.process.tail())?;
+        Ok(())
+    }
+
+    /// Waits until its admin port listens, which it does before it is ready.
+    ///
+    /// # Errors
+    /// When it does not in time, with its last words.
+    pub fn listening(&mut self) -> anyhow::Result<Admin> {
+        const SAID: &str = "admin listening on ";
+        if let Some(admin) = &self.admin {
+            return Ok(admin.clone());
+        }
+        let line = wait::until_some(
+            "the admin port listens",
+            START,
+            || self.process.stderr().into_iter().find(|line| line.contains(SAID)),
+            || self.process.tail(),
+        )?;
+        let address = line.split(SAID).nth(1).and_then(|rest| rest.split_whitespace().next());
+        let admin = Admin {
+            address: address.context("no address")?.parse()?,
+            namespace: None,
+        };
+        self.admin = Some(admin.clone());
+        Ok(admin)
+    }
+
+    /// Its admin port.
+    ///
+    /// # Panics
+    /// Before it was listening.
+    #[must_use]
+    #[allow(clippy::expect_used, reason = "a helper of tests")]
+    pub fn admin(&self) -> &Admin {
+        self.admin.as_ref().expect("asked before it listens")
+    }
+
+    /// Its process id.
+    #[must_use]
+    pub fn id(&self) -> u32 {
+        self.process.id()
+    }
+
+    /// The last lines that it printed.
+    #[must_use]
+    pub fn tail(&self) -> String {
+        self.process.tail()
+    }
+
+    /// Kills it with -9 and waits for its end.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn kill(&mut self) -> anyhow::Result<()> {
+        self.process.kill()
+    }
+
+    /// Starts it again with the same node file and does not wait.
+    ///
+    /// # Errors
+    /// As [`FlowProcess::launch`].
+    pub fn relaunch(&mut self) -> anyhow::Result<()> {
+        self.process = run(&self.file)?;
+        self.admin = None;
+        Ok(())
+    }
+
+    /// Bridges as `GET /v1/bridges` shows them.
+    #[must_use]
+    pub fn bridges(&self) -> Vec<Value> {
+        let answer = self.admin().json("/v1/bridges").unwrap_or_default();
+        answer["bridges"].as_array().cloned().unwrap_or_default()
+    }
+
+    /// Ids of the bridges that are up, sorted.
+    #[must_use]
+    pub fn bridges_up(&self) -> Vec<String> {
+        let up = |bridge: &Value| {
+            (bridge["state"] == "up").then(|| bridge["id"].as_str().unwrap_or_default().to_owned())
+        };
+        let mut ids: Vec<String> = self.bridges().iter().filter_map(up).collect();
+        ids.sort();
+        ids
+    }
+
+    /// Waits until a bridge of a topic is up.
+    ///
+    /// # Errors
+    /// When none is in time.
+    pub fn wait_bridge(&self, topic: &str, deadline: Duration) -> anyhow::Result<()> {
+        let start = format!("{topic}|");
+        wait::until(
+            &format!("a bridge of {topic} on {} is up", self.spec.node),
+            deadline,
+            || self.bridges_up().iter().any(|id| id.starts_with(&start)),
+            || format!("{:?} {}", self.bridges(), self.tail()),
+        )?;
+        Ok(())
+    }
+
+    /// What `GET /v1/why` says.
+    ///
+    /// # Errors
+    /// When nothing answers.
+    pub fn why(&self, topic: &str, to: Option<&str>) -> anyhow::Result<Value> {
+        let to = to.map(|to| format!("&to={to}")).unwrap_or_default();
+        self.admin().json(&format!("/v1/why?topic={topic}{to}"))
+    }
+
+    /// Resident memory in KiB.
+    ///
+    /// # Errors
+    /// When the process has gone.
+    pub fn rss_kib(&self) -> anyhow::Result<u64> {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.id()))?;
+        let line = status.lines().find(|line| line.starts_with("VmRSS:")).context("no VmRSS")?;
+        Ok(line.split_whitespace().nth(1).context("no number")?.parse()?)
+    }
+
+    /// CPU time that it has used.
+    ///
+    /// # Errors
+    /// When the process has gone.
+    pub fn cpu(&self) -> anyhow::Result<Duration> {
+        // CLK_TCK is 100 on every Linux that Rust runs on.
+        const TICKS_PER_S: f64 = 100.0;
+        let text = std::fs::read_to_string(format!("/proc/{}/stat", self.id()))?;
+        let after_name = text.rsplit_once(')').context("no name in /proc/PID/stat")?.1;
+        let fields: Vec<&str> = after_name.split_whitespace().collect();
+        let ticks = |index: usize| -> anyhow::Result<f64> {
+            Ok(fields.get(index).context("a short line")?.parse::<u64>()? as f64)
+        };
+        Ok(Duration::from_secs_f64((ticks(11)? + ticks(12)?) / TICKS_PER_S))
+    }
+}
+
+fn run(file: &Path) -> anyhow::Result<Process> {
+    Process::start("blaze-flow", &["--config", &file.to_string_lossy()], None)
+}
+
+/// A DDS domain that nobody uses on loopback now, so that another run of these tests is no neighbour.
+///
+/// # Errors
+/// When there is none between 40 and 99.
+pub fn free_domain() -> anyhow::Result<u16> {
+    use std::net::{Ipv4Addr, UdpSocket};
+    use std::sync::atomic::{AtomicU16, Ordering};
+    static NEXT: AtomicU16 = AtomicU16::new(0);
+    let first = (std::process::id() % 60) as u16 + NEXT.fetch_add(1, Ordering::Relaxed);
+    let mut domains = (0..60).map(|step| 40 + (first + step) % 60);
+    // SPDP and user traffic of the first three participants.
+    let free = |domain: &u16| {
+        (10..16).all(|offset| UdpSocket::bind((Ipv4Addr::LOCALHOST, 7_400 + 250 * domain + offset)).is_ok())
+    };
+    domains.find(free).context("no free DDS domain between 40 and 99")
+}

@@ -1,0 +1,233 @@
+//! A Kafka broker of one test.
+
+use std::path::Path;
+use std::process::Command;
+use std::time::Duration;
+
+use anyhow::Context as _;
+
+use super::process::ServerProcess;
+use super::{installed, kafka_wire, ports};
+
+/// Measured: 3 s, some seconds more after a kill. The rest is for a machine that does much else.
+const START: Duration = Duration::from_secs(60);
+/// Another process may take a port between our choice and the broker's start.
+const PORT_ATTEMPTS: usize = 3;
+
+const PROPERTIES: &str = include_str!(concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../scripts/services.d/kafka.properties"
+));
+const LOGGING: &str = include_str!(concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../scripts/services.d/kafka.log4j2.properties"
+));
+
+/// How a broker of one test is set up.
+#[derive(Debug, Clone)]
+pub struct KafkaOptions {
+    /// Largest heap of the Java machine, MiB.
+    pub heap_mib: u32,
+    /// Lines of `server.properties`; they win over those of `scripts/services.d/kafka.properties`.
+    pub extra: Vec<String>,
+}
+
+impl Default for KafkaOptions {
+    fn default() -> Self {
+        Self {
+            heap_mib: 512,
+            extra: Vec::new(),
+        }
+    }
+}
+
+/// A running broker, which is its own controller; killed when dropped. The first consumer group takes some seconds more,
+/// because its offsets' topic is made then.
+pub struct KafkaServer {
+    process: ServerProcess,
+    options: KafkaOptions,
+    port: u16,
+    cluster: String,
+}
+
+impl KafkaServer {
+    /// Starts a broker with a cluster identity of its own and waits until it can be used.
+    ///
+    /// # Errors
+    /// When it is not installed, refuses its configuration, or does not answer in time.
+    pub fn start(options: KafkaOptions) -> anyhow::Result<Self> {
+        let mut attempt = 1;
+        loop {
+            let server = Self::prepare(options.clone())?;
+            match server.spawn() {
+                Ok(()) => return Ok(server),
+                Err(error) => {
+                    let taken = server.process.log_tail().contains("already in use");
+                    if !taken || attempt == PORT_ATTEMPTS {
+                        return Err(error);
+                    }
+                    attempt += 1;
+                }
+            }
+        }
+    }
+
+    fn prepare(options: KafkaOptions) -> anyhow::Result<Self> {
+        let process = ServerProcess::new("kafka")?;
+        let folder = process.folder();
+        let port = ports::free()?;
+        let data = folder.join("data");
+        let cluster = new_cluster_id();
+        copy_formatted(&installed::path("kafka/formatted")?, &data, &cluster)?;
+        let mut text = PROPERTIES
+            .replace("@PORT@", &port.to_string())
+            .replace("@CONTROLLER_PORT@", &ports::free()?.to_string())
+            .replace("@DATA@", &data.display().to_string());
+        for line in &options.extra {
+            text.push_str(line);
+            text.push('\n');
+        }
+        std::fs::write(folder.join("server.properties"), text)?;
+        std::fs::write(folder.join("log4j2.properties"), LOGGING)?;
+        Ok(Self {
+            process,
+            options,
+            port,
+            cluster,
+        })
+    }
+
+    fn spawn(&self) -> anyhow::Result<()> {
+        let mut command = Command::new(installed::path("jre/bin/java")?);
+        // Java itself expands the asterisk.
+        let libraries = installed::path("kafka/libs")?.join("*");
+        command
+            .args([
+                "-XX:+UseSerialGC",
+                "-XX:TieredStopAtLevel=1",
+                "-XX:-UsePerfData",
+                "-Xms128m",
+            ])
+            .arg(format!("-Xmx{}m", self.options.heap_mib))
+            .arg("-Dlog4j2.configurationFile=log4j2.properties")
+            .arg("-cp")
+            .arg(libraries)
+            .args(["kafka.Kafka", "server.properties"]);
+        self.process.spawn(command)?;
+        self.wait_ready()
+    }
+
+    /// `127.0.0.1:PORT`.
+    #[must_use]
+    pub fn bootstrap(&self) -> String {
+        format!("127.0.0.1:{}", self.port)
+    }
+
+    /// Waits until the broker lists itself and every partition has a leader.
+    ///
+    /// # Errors
+    /// When it ends, or is not ready within a minute; with the last lines of its log.
+    pub fn wait_ready(&self) -> anyhow::Result<()> {
+        // The cluster tells that it has the port: another broker there would answer as well.
+        let ready = || {
+            kafka_wire::metadata(self.port)
+                .is_ok_and(|metadata| metadata.cluster == self.cluster && metadata.is_ready())
+        };
+        self.process.wait_ready(START, ready)?;
+        Ok(())
+    }
+
+    /// SIGKILL; its end has been waited for.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn kill(&self) -> anyhow::Result<()> {
+        self.process.kill()
+    }
+
+    /// Kills it if it runs, starts it with the same ports and data, and waits until it can be used.
+    ///
+    /// # Errors
+    /// As [`KafkaServer::start`].
+    pub fn restart(&self) -> anyhow::Result<()> {
+        self.kill()?;
+        self.spawn()
+    }
+
+    /// SIGSTOP: connections stay, answers do not come.
+    ///
+    /// # Errors
+    /// When it does not run.
+    pub fn freeze(&self) -> anyhow::Result<()> {
+        self.process.freeze()
+    }
+
+    /// SIGCONT after [`KafkaServer::freeze`]. The broker may need seconds to take itself for alive again: then
+    /// [`KafkaServer::wait_ready`].
+    ///
+    /// # Errors
+    /// When it does not run.
+    pub fn thaw(&self) -> anyhow::Result<()> {
+        self.process.thaw()
+    }
+
+    /// Resident memory in KiB.
+    ///
+    /// # Errors
+    /// When it does not run.
+    pub fn rss_kib(&self) -> anyhow::Result<u64> {
+        self.process.rss_kib()
+    }
+}
+
+/// Copies the empty data folder that `scripts/services install` formatted, which saves a start of Java, and gives it a
+/// cluster identity of its own.
+fn copy_formatted(from: &Path, to: &Path, cluster: &str) -> anyhow::Result<()> {
+    std::fs::create_dir(to)?;
+    for entry in std::fs::read_dir(from)? {
+        let entry = entry?;
+        std::fs::copy(entry.path(), to.join(entry.file_name()))?;
+    }
+    let path = to.join("meta.properties");
+    let text = std::fs::read_to_string(&path).context("kafka/formatted is not a formatted data folder")?;
+    std::fs::write(path, with_cluster_id(&text, cluster))?;
+    Ok(())
+}
+
+fn with_cluster_id(properties: &str, id: &str) -> String {
+    let lines = properties.lines().map(|line| match line.starts_with("cluster.id=") {
+        true => format!("cluster.id={id}\n"),
+        false => format!("{line}\n"),
+    });
+    lines.collect()
+}
+
+/// 22 characters, the form of Kafka's own identities.
+fn new_cluster_id() -> String {
+    let name: String = super::unique_name("test").replace('-', "_");
+    let start = name.len().saturating_sub(22);
+    format!("{:0>22}", &name[start..])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cluster_identities_differ_and_have_the_length_of_kafkas() {
+        let (one, other) = (new_cluster_id(), new_cluster_id());
+        assert_ne!(one, other);
+        assert_eq!((one.len(), other.len()), (22, 22));
+        assert_eq!(
+            with_cluster_id("version=1\ncluster.id=x\nnode.id=1\n", "y"),
+            "version=1\ncluster.id=y\nnode.id=1\n"
+        );
+    }
+
+    #[test]
+    fn the_template_has_a_place_for_all_that_is_filled_in() {
+        for word in ["@PORT@", "@CONTROLLER_PORT@", "@DATA@"] {
+            assert!(PROPERTIES.contains(word), "{word}");
+        }
+    }
+}

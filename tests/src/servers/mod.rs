@@ -1,0 +1,33 @@
+//! Real servers for tests: Redis, Valkey and Kafka from the files that `scripts/services install` unpacked.
+//!
+//! Most tests share the servers that `scripts/services start` runs ([`shared_redis`], [`shared_kafka`]) and keep apart by
+//! [`unique_name`]. A test that kills, freezes or configures a server starts one of its own: [`RedisServer`],
+//! [`KafkaServer`]. Those listen on loopback only, on a free port, and end with the value, or with the test's process.
+//!
+//! All calls block the thread. In an asynchronous test they need a runtime with several threads.
+
+mod certificates;
+mod guard;
+mod installed;
+mod kafka;
+mod kafka_wire;
+mod ports;
+mod process;
+mod redis;
+mod shared;
+
+pub use kafka::{KafkaOptions, KafkaServer};
+pub use redis::{RedisKind, RedisOptions, RedisServer};
+pub use shared::{address, shared_kafka, shared_kafka_cloud, shared_redis, shared_valkey};
+
+/// A name that no other test and no earlier run on the same server has: `stem-…`, of lower-case letters, digits and `-`.
+#[must_use]
+pub fn unique_name(stem: &str) -> String {
+    use std::sync::atomic::{AtomicU32, Ordering};
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    let micros = std::time::SystemTime::now()
+        .duration_since(std::time::UNIX_EPOCH)
+        .map_or(0, |since| since.as_micros());
+    format!("{stem}-{:x}-{micros:x}-{number:x}", std::process::id())
+}

@@ -1,0 +1,96 @@
+//! Clients that know nothing of BlazeAIoT.
+
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
+use std::time::Duration;
+
+use blaze_tests::servers::KafkaServer;
+use rdkafka::ClientConfig;
+use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, TopicReplication};
+use rdkafka::client::DefaultClientContext;
+use rdkafka::message::{Header, OwnedHeaders};
+use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
+
+const TIMEOUT: Duration = Duration::from_secs(20);
+
+fn config(server: &KafkaServer) -> ClientConfig {
+    let mut config = ClientConfig::new();
+    config.set("bootstrap.servers", server.bootstrap());
+    config
+}
+
+fn admin(server: &KafkaServer) -> AdminClient<DefaultClientContext> {
+    config(server).create().unwrap()
+}
+
+pub(crate) async fn make_topic(server: &KafkaServer, name: &str, partitions: i32, settings: &[(&str, &str)]) {
+    let topic = NewTopic::new(name, partitions, TopicReplication::Fixed(1));
+    let topic = settings.iter().fold(topic, |topic, (key, value)| topic.set(key, value));
+    let made = admin(server).create_topics([&topic], &AdminOptions::new()).await.unwrap();
+    assert_eq!(made, [Ok(name.to_owned())]);
+}
+
+pub(crate) async fn delete_topic(server: &KafkaServer, name: &str) {
+    let deleted = admin(server).delete_topics(&[name], &AdminOptions::new()).await.unwrap();
+    assert_eq!(deleted, [Ok(name.to_owned())]);
+}
+
+/// Writes records and waits until the server has them.
+pub(crate) struct PlainProducer(BaseProducer);
+
+impl PlainProducer {
+    pub(crate) fn new(server: &KafkaServer) -> Self {
+        Self(config(server).create().unwrap())
+    }
+
+    pub(crate) fn write(&self, topic: &str, partition: i32, values: &[&str]) {
+        for value in values {
+            let record = BaseRecord::<str, str>::to(topic).partition(partition).payload(value);
+            self.0.send(record).map_err(|(error, _)| error).unwrap();
+        }
+        self.0.flush(TIMEOUT).unwrap();
+    }
+
+    pub(crate) fn write_with_headers(&self, topic: &str, headers: &[(&str, &[u8])], value: &str) {
+        let headers = headers.iter().fold(OwnedHeaders::new(), |headers, (key, value)| {
+            headers.insert(Header {
+                key,
+                value: Some(*value),
+            })
+        });
+        let record = BaseRecord::<str, str>::to(topic).partition(0).headers(headers).payload(value);
+        self.0.send(record).map_err(|(error, _)| error).unwrap();
+        self.0.flush(TIMEOUT).unwrap();
+    }
+}
+
+/// The server's identity of a topic in Kafka's text form, asked of the server itself (metadata, version 12).
+pub(crate) fn topic_uuid(server: &KafkaServer, topic: &str) -> String {
+    let mut body = vec![0, 3, 0, 12, 0, 0, 0, 9, 0xFF, 0xFF, 0];
+    body.extend([2]); // one topic: without its identity, by name
+    body.extend([0; 16]);
+    body.push(u8::try_from(topic.len() + 1).unwrap());
+    body.extend(topic.as_bytes());
+    body.extend([0, 0, 0, 0]);
+    let mut stream = TcpStream::connect(server.bootstrap()).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
+    stream.write_all(&u32::try_from(body.len()).unwrap().to_be_bytes()).unwrap();
+    stream.write_all(&body).unwrap();
+    let mut length = [0; 4];
+    stream.read_exact(&mut length).unwrap();
+    let mut answer = vec![0; u32::from_be_bytes(length) as usize];
+    stream.read_exact(&mut answer).unwrap();
+    // The identity follows the topic's name.
+    let name = answer.windows(topic.len()).position(|window| window == topic.as_bytes()).unwrap();
+    base64(&answer[name + topic.len()..][..16])
+}
+
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_";
+    let digit = |at: usize| {
+        let bit = |position: usize| bytes.get(position / 8).map_or(0, |byte| byte >> (7 - position % 8) & 1);
+        let value = (at * 6..at * 6 + 6).fold(0, |value, position| value << 1 | bit(position));
+        char::from(DIGITS[usize::from(value)])
+    };
+    (0..(bytes.len() * 8).div_ceil(6)).map(digit).collect()
+}

@@ -1,0 +1,13 @@
+//! Whole paths over real Redis and Kafka servers, with plain clients at both ends.
+
+#![cfg(feature = "kafka")]
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
+
+mod contract;
+mod demo;
+mod frozen;
+mod garbage;
+mod plain_clients;
+mod restarts;
+mod stream;
+mod support;
