@@ -63,11 +63,8 @@ impl ControlCore {
         self.registry.set_renewable(now, scope, health != ScopeHealth::Away);
         if (before == ScopeHealth::InUse) != (health == ScopeHealth::InUse) {
             let in_use = health == ScopeHealth::InUse;
-            if in_use {
-                // Whoever had the scope meanwhile may have changed what is kept.
-                self.registry.begin_restore(scope);
-            }
             let changed = self.registry.set_in_use(now, scope, in_use);
+            self.update_channels_of(&changed);
             self.touch(now, changed);
             if scope == Scope::Layer {
                 self.outputs.push_back(Output::LayerScope { shared: !in_use });

@@ -132,7 +132,6 @@ fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
             .any(|output| matches!(output, Output::LayerScope { shared: false }))
     );
     bench.send(Scope::Node, &lease("advertise", "t"));
-    bench.send(Scope::Layer, &lease("request", "t"));
     bench.step(300);
     assert_eq!(bench.bridges("t"), [""; 0]);
 
@@ -145,14 +144,23 @@ fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
             .iter()
             .any(|output| matches!(output, Output::LayerScope { shared: true }))
     );
+    assert!(bench.core.is_reading_leases(Scope::Layer), "now it is ours");
+    assert_eq!(bench.core.state(), FlowState::Ready, "which holds nothing up any more");
+    let value = Bytes::from(lease("request", "t").to_string());
+    let kept = [("request|t|fog||a|0".to_owned(), value)];
+    bench.core.restore_leases(bench.now, Scope::Layer, &kept);
+    bench.step(300);
     assert_eq!(bench.bridges("t"), ["node>Layer"]);
-    assert!(
-        bench.core.is_reading_leases(Scope::Layer),
-        "what is kept there may have changed"
-    );
+    bench.outputs.clear();
     bench.core.set_scope_health(bench.now, Scope::Node, ScopeHealth::InUse);
     bench.step(300);
     assert_eq!(bench.bridges("t"), [""; 0]);
+    let saved = bench
+        .outputs
+        .iter()
+        .any(|output| matches!(output, Output::SaveLease(_)));
+    assert!(!saved, "what is kept there is the other's");
+    assert_eq!(bench.channels(), ["-node t"]);
 }
 
 #[test]

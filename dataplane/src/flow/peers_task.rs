@@ -159,11 +159,10 @@ impl PeersTask {
             let first = claims.first(now);
             if first.is_some() != standing_back {
                 standing_back = first.is_some();
-                match first {
-                    Some(first) => {
-                        tracing::warn!(%first, "another layer's flow uses this Kafka: give each layer a prefix")
-                    }
-                    None => tracing::info!("the Kafka of this layer is free again"),
+                if let Some(first) = first {
+                    tracing::warn!(%first, "another layer's flow uses this Kafka: give each layer a prefix");
+                } else {
+                    tracing::info!("the Kafka of this layer is free again");
                 }
                 self.side.stand_back(first.map(ToString::to_string));
             }

@@ -182,10 +182,9 @@ impl Routes {
             return Ok(held);
         }
         let broker = self.brokers.of(scope).ok_or("the scope has no broker")?;
-        let publisher = broker.publisher(&channel, options).map_err(|error| {
-            tracing::warn!(%topic, %scope, %error, "this topic cannot be written");
-            error.to_string()
-        })?;
+        let publisher = broker
+            .publisher(&channel, options)
+            .map_err(|error| format!("{topic} cannot be written: {error}"))?;
         Ok(NewWriter { publisher, options })
     }
 

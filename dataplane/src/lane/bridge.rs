@@ -71,6 +71,7 @@ impl BridgeState {
             Err(reason) => {
                 if !matches!(self.phase, Phase::Failed { .. }) {
                     self.phase = Phase::Failed { since: now };
+                    tracing::warn!(from = %self.from, to = ?self.target, reason, "a bridge cannot write, trying on");
                 }
                 self.failure = Some(reason);
             }

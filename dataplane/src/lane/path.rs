@@ -226,7 +226,7 @@ impl TopicPath {
     /// Whether nothing goes through it and nothing waits.
     #[must_use]
     pub fn is_idle(&self) -> bool {
-        self.bridges.iter().all(|bridge| bridge.is_over())
+        self.bridges.iter().all(BridgeState::is_over)
     }
 
     /// Size that decides the class: the largest seen, else as advertised.

@@ -35,6 +35,20 @@ impl LeaseTable {
         }
     }
 
+    /// Forgets the leases of a scope, without a word to the broker that keeps them: it belongs to another flow, whose they
+    /// are now. Once it is ours again they are to be read.
+    pub(super) fn give_up(&mut self, scope: Scope) {
+        for leases in self.topics.values_mut() {
+            let before = leases.len();
+            leases.retain(|key, _| key.scope != scope);
+            self.count -= before - leases.len();
+        }
+        self.topics.retain(|_, leases| !leases.is_empty());
+        self.expiry.retain(|(_, _, key)| key.scope != scope);
+        self.unsaved.retain(|(_, key)| key.scope != scope);
+        self.set_reading(scope, true);
+    }
+
     pub(super) fn is_reading(&self, scope: Scope) -> bool {
         self.reading.contains(&scope)
     }

@@ -155,7 +155,7 @@ pub struct LapsedLease {
 pub(super) struct LeaseTable {
     pub(super) topics: BTreeMap<TopicName, BTreeMap<LeaseKey, Lease>>,
     pub(super) expiry: BTreeSet<(Instant, TopicName, LeaseKey)>,
-    count: usize,
+    pub(super) count: usize,
     pub(super) limit: usize,
     lapsed: VecDeque<LapsedLease>,
     /// Scopes whose broker keeps leases.

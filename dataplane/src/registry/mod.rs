@@ -248,8 +248,8 @@ impl Registry {
         self.on_layer.remove(topic);
     }
 
-    /// A scope belongs to another flow, or no longer does: for everybody it is as if it were not there, its leases stay.
-    /// Returns the topics to plan anew.
+    /// A scope belongs to another flow, or no longer does. While it does it is as if it were not there, and its leases are
+    /// the other's; then they are to be read anew. Returns the topics to plan anew.
     pub fn set_in_use(&mut self, now: Instant, scope: Scope, in_use: bool) -> BTreeSet<TopicName> {
         let changes = if in_use {
             self.off.insert(scope)
@@ -259,14 +259,19 @@ impl Registry {
         if !changes {
             return BTreeSet::new();
         }
+        let leased: BTreeSet<TopicName> = self.leases.topics().cloned().collect();
+        if in_use {
+            self.leases.give_up(scope);
+        }
         let (node_scope, layer_scope) = (self.config.node_scope, self.config.layer_scope);
         let (node_off, layer_off) = (self.off.contains(&Scope::Node), self.off.contains(&Scope::Layer));
         if let Some(own) = self.own_view() {
             own.node_scope = node_scope && !node_off;
             own.layer_scope = layer_scope.filter(|_| !layer_off);
         }
-        self.refresh(now, self.leases.topics().cloned().collect());
-        self.all_topics()
+        let mut changed = self.all_topics();
+        changed.extend(self.refresh(now, leased));
+        changed
     }
 
     /// Whether the kept leases of a scope are still to be read.

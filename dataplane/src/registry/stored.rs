@@ -61,7 +61,7 @@ impl fmt::Display for StoredKey<'_> {
 }
 
 enum Kept {
-    Ours(ControlMessage),
+    Ours(Box<ControlMessage>),
     Foreign,
     Unreadable,
 }
@@ -80,7 +80,7 @@ fn read(scope: Scope, me: &FlowId, key: &str, value: &[u8]) -> Kept {
         return Kept::Unreadable;
     };
     match &object.message {
-        Ok(message) if is_under(scope, me, message, key) => Kept::Ours(message.clone()),
+        Ok(message) if is_under(scope, me, message, key) => Kept::Ours(Box::new(message.clone())),
         _ => Kept::Unreadable,
     }
 }
@@ -149,11 +149,6 @@ impl Registry {
         self.leases.set_reading(scope, false);
         outcome.changed = self.refresh(now, outcome.topics.clone());
         outcome
-    }
-
-    /// The leases that the broker of a scope keeps are to be read (again): what services say meanwhile counts for more.
-    pub fn begin_restore(&mut self, scope: Scope) {
-        self.leases.set_reading(scope, true);
     }
 
     /// Nobody can renew leases of a scope while its broker is away, so none lapses; when it is back, each finite one has its

@@ -10,7 +10,9 @@ use std::net::TcpStream;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, BrokerKind, Content, Health, Later, PublisherOptions, Received, SubscribeOptions};
+use blaze_brokers::{
+    Broker, BrokerKind, Content, Health, Later, PublishOutcome, PublisherOptions, Received, SubscribeOptions,
+};
 use blaze_domain::LayerKind;
 use blaze_domain::names::ChannelName;
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
@@ -123,13 +125,11 @@ async fn until(what: &str, mut holds: impl FnMut() -> bool) {
 }
 
 fn send(server: &Server, channel: &str, payload: impl Into<Bytes>) {
-    let channel: ChannelName = channel.parse().unwrap();
-    let publisher = server
-        .hub
-        .broker()
-        .publisher(&channel, PublisherOptions::default())
+    let client = server.hub.broker();
+    let publisher = client
+        .publisher(&channel.parse().unwrap(), PublisherOptions::default())
         .unwrap();
-    publisher.publish_bare(&payload.into(), None);
+    assert_eq!(publisher.publish_bare(&payload.into(), None), PublishOutcome::Taken);
 }
 
 fn control(server: &Server, json: &Value) {

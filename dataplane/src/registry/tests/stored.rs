@@ -322,7 +322,8 @@ fn a_topic_that_kafka_cannot_tell_from_another_is_refused() {
 fn a_scope_of_another_flow_is_as_if_it_were_not_there() {
     let now = Instant::now();
     let mut registry = keeping("edge/robot-1", now);
-    restore_all(&mut registry, now, &Kept::new());
+    let mut kept = Kept::new();
+    restore_all(&mut registry, now, &kept);
     send(
         &mut registry,
         now,
@@ -336,6 +337,7 @@ fn a_scope_of_another_flow_is_as_if_it_were_not_there() {
         &json!({"op": "request", "topic": "t", "service": "b", "ttl_s": 0}),
     );
     let before = registry.world().own().unwrap().clone();
+    save(&mut registry, &mut kept);
     let changed = registry.set_in_use(now, Scope::Layer, true);
     assert_eq!(changed, BTreeSet::from([topic("t")]));
     let own = registry.world().own().unwrap();
@@ -345,9 +347,12 @@ fn a_scope_of_another_flow_is_as_if_it_were_not_there() {
     registry.set_in_use(now, Scope::Node, true);
     let own = registry.world().own().unwrap();
     assert!(!own.node_scope && own.topics.is_empty());
-    assert_eq!(registry.lease_count(), 2, "the leases stay");
+    assert_eq!(registry.lease_count(), 0, "they are the other's");
+    assert_eq!(save(&mut registry, &mut kept), 0, "and nothing that is kept is touched");
     registry.set_in_use(now, Scope::Node, false);
     registry.set_in_use(now, Scope::Layer, false);
+    assert!(registry.is_reading(Scope::Node) && registry.is_reading(Scope::Layer));
+    restore_all(&mut registry, now, &kept);
     assert_eq!(*registry.world().own().unwrap(), before);
 }
 
