@@ -98,7 +98,7 @@ fn until_the_first_arrives(system: &RobotAndCloud, reader: &KafkaReader) -> anyh
 
 fn check_headers(record: &Record) {
     assert_eq!(record.header("blaze-version"), "1");
-    assert_eq!(record.header("blaze-origin"), "edge/robot-1/imu-driver/");
+    assert_eq!(record.header("blaze-origin"), "edge/robot-1/imu-driver/0");
     assert_eq!(record.header("blaze-encoding"), "application/json");
     assert_eq!(record.header("blaze-hops"), "2", "one on the link, one on Kafka");
     assert_eq!(record.header("blaze-reliable"), "1");
