@@ -9,11 +9,12 @@ import zipfile
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+import servers
 from common import DOWNLOADS, HOME, TEMPLATES, Failure, Pin, pins, run, say, sha256
 
 BIN = HOME / "bin"
 # A change of how things are unpacked makes old stamps void.
-LAYOUT = "1"
+LAYOUT = "2"
 MAVEN_COPY = "org.apache.maven.plugins:maven-dependency-plugin:3.8.1:copy-dependencies"
 
 
@@ -156,7 +157,8 @@ def jre() -> str:
                 path.write_bytes(archive.read(member))
     for program in [*target.glob("bin/*"), *target.glob("lib/jspawnhelper")]:
         program.chmod(0o755)
-    run(target / "bin" / "java", "-version")
+    # Without this archive of Java's own classes there is none of Kafka's.
+    run(target / "bin" / "java", "-XX:+UseSerialGC", "-Xshare:dump")
     return ""
 
 
@@ -180,7 +182,8 @@ def kafka() -> str:
     jars = sorted(f"{sha256(jar)}  {jar.name}" for jar in libraries.glob("*.jar"))
     check_sum(pin, sha256_of_text("\n".join(jars) + "\n"), f"the {len(jars)} jars")
     format_kafka(libraries)
-    return f"{len(jars)} jars"
+    archived = servers.ClassArchive("kafka-classes", "kafka", "", "").write()
+    return f"{len(jars)} jars" + ("" if archived else ", starts slowly: Java wrote no class archive")
 
 
 def format_kafka(libraries: Path) -> None:

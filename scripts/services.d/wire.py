@@ -29,10 +29,16 @@ def receive(connection: socket.socket, count: int) -> bytes:
 # --- Redis ----------------------------------------------------------------------------------------------------------
 
 
-def redis_answers(port: int) -> bool:
+def redis_pid(port: int) -> int:
+    """Process that answers on the port; 0 while it still reads its data."""
     with connect(port) as connection:
-        connection.sendall(b"PING\r\n")
-        return connection.recv(64).startswith(b"+PONG")
+        connection.sendall(b"*2\r\n$4\r\nINFO\r\n$6\r\nserver\r\n")
+        start = connection.recv(64)
+        if not start.startswith(b"$"):
+            return 0
+        head, _, data = start.partition(b"\r\n")
+        text = data + receive(connection, int(head[1:]) - len(data))
+    return int(text.partition(b"process_id:")[2].split()[0])
 
 
 # --- Kafka ----------------------------------------------------------------------------------------------------------
@@ -74,9 +80,17 @@ def kafka_text(value: str) -> bytes:
     return struct.pack(">h", len(value)) + value.encode()
 
 
-def kafka_brokers(port: int) -> int:
-    """How many brokers take part: 0 while the only one has not been let in by the controller."""
-    return kafka_call(port, METADATA, 1, struct.pack(">i", 0)).number("i")
+def kafka_cluster(port: int) -> str:
+    """Identity of the cluster; empty while the only broker has not been let in by the controller."""
+    answer = kafka_call(port, METADATA, 2, struct.pack(">i", 0))
+    brokers = answer.number("i")
+    for _ in range(brokers):
+        answer.number("i")  # node
+        answer.text()  # host
+        answer.number("i")  # port
+        answer.text()  # rack
+    cluster = answer.text()
+    return cluster if brokers else ""
 
 
 def kafka_warm(port: int) -> bool:
@@ -105,6 +119,11 @@ def mongo_initiate(port: int) -> bool:
     member = {"_id": 0, "host": f"127.0.0.1:{port}"}
     answer = mongo_command(port, {"replSetInitiate": {"_id": "rs0", "members": [member]}, "$db": "admin"})
     return answer.get("ok") == 1 or answer.get("code") == ALREADY_INITIALIZED
+
+
+def mongo_pid(port: int) -> int:
+    """Process that answers on the port."""
+    return mongo_command(port, {"serverStatus": 1, "repl": 0, "metrics": 0, "$db": "admin"})["pid"]
 
 
 def mongo_writable(port: int) -> bool:

@@ -18,6 +18,7 @@ const PROPERTIES: &str = include_str!(concat!(
     env!("CARGO_MANIFEST_DIR"),
     "/../scripts/services.d/kafka.properties"
 ));
+const JAVA_OPTIONS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../scripts/services.d/kafka.java-options");
 const LOGGING: &str = include_str!(concat!(
     env!("CARGO_MANIFEST_DIR"),
     "/../scripts/services.d/kafka.log4j2.properties"
@@ -47,6 +48,7 @@ pub struct KafkaServer {
     process: ServerProcess,
     options: KafkaOptions,
     port: u16,
+    cluster: String,
 }
 
 impl KafkaServer {
@@ -54,6 +56,10 @@ impl KafkaServer {
     ///
     /// # Errors
     /// When it is not installed, refuses its configuration, or does not answer in time.
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "options are written in place: `start(KafkaOptions::default())`"
+    )]
     pub fn start(options: KafkaOptions) -> anyhow::Result<Self> {
         let mut attempt = 1;
         loop {
@@ -76,7 +82,8 @@ impl KafkaServer {
         let folder = process.folder();
         let port = ports::free()?;
         let data = folder.join("data");
-        copy_formatted(&installed::path("kafka/formatted")?, &data)?;
+        let cluster = new_cluster_id();
+        copy_formatted(&installed::path("kafka/formatted")?, &data, &cluster)?;
         let mut text = PROPERTIES
             .replace("@PORT@", &port.to_string())
             .replace("@CONTROLLER_PORT@", &ports::free()?.to_string())
@@ -87,7 +94,12 @@ impl KafkaServer {
         }
         std::fs::write(folder.join("server.properties"), text)?;
         std::fs::write(folder.join("log4j2.properties"), LOGGING)?;
-        Ok(Self { process, options, port })
+        Ok(Self {
+            process,
+            options,
+            port,
+            cluster,
+        })
     }
 
     fn spawn(&self) -> anyhow::Result<()> {
@@ -95,13 +107,14 @@ impl KafkaServer {
         // Java itself expands the asterisk.
         let libraries = installed::path("kafka/libs")?.join("*");
         command
-            .args([
-                "-XX:+UseSerialGC",
-                "-XX:TieredStopAtLevel=1",
-                "-XX:-UsePerfData",
-                "-Xms128m",
-            ])
-            .arg(format!("-Xmx{}m", self.options.heap_mib))
+            .arg(format!("@{JAVA_OPTIONS}"))
+            .arg(format!("-Xmx{}m", self.options.heap_mib));
+        // Half the time to start. Java does without if the archive does not fit.
+        let archive = installed::folder().join("kafka/classes.jsa");
+        if archive.exists() {
+            command.arg(format!("-XX:SharedArchiveFile={}", archive.display()));
+        }
+        command
             .arg("-Dlog4j2.configurationFile=log4j2.properties")
             .arg("-cp")
             .arg(libraries)
@@ -121,7 +134,11 @@ impl KafkaServer {
     /// # Errors
     /// When it ends, or is not ready within a minute; with the last lines of its log.
     pub fn wait_ready(&self) -> anyhow::Result<()> {
-        let ready = || kafka_wire::metadata(self.port).is_ok_and(|metadata| metadata.is_ready());
+        // The cluster tells that it has the port: another broker there would answer as well.
+        let ready = || {
+            kafka_wire::metadata(self.port)
+                .is_ok_and(|metadata| metadata.cluster == self.cluster && metadata.is_ready())
+        };
         self.process.wait_ready(START, ready)?;
         Ok(())
     }
@@ -171,7 +188,7 @@ impl KafkaServer {
 
 /// Copies the empty data folder that `scripts/services install` formatted, which saves a start of Java, and gives it a
 /// cluster identity of its own.
-fn copy_formatted(from: &Path, to: &Path) -> anyhow::Result<()> {
+fn copy_formatted(from: &Path, to: &Path, cluster: &str) -> anyhow::Result<()> {
     std::fs::create_dir(to)?;
     for entry in std::fs::read_dir(from)? {
         let entry = entry?;
@@ -179,7 +196,7 @@ fn copy_formatted(from: &Path, to: &Path) -> anyhow::Result<()> {
     }
     let path = to.join("meta.properties");
     let text = std::fs::read_to_string(&path).context("kafka/formatted is not a formatted data folder")?;
-    std::fs::write(path, with_cluster_id(&text, &new_cluster_id()))?;
+    std::fs::write(path, with_cluster_id(&text, cluster))?;
     Ok(())
 }
 

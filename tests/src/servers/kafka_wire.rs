@@ -1,4 +1,4 @@
-//! Just enough of Kafka's protocol to ask a broker whether it can be used: metadata of all topics, version 1.
+//! Just enough of Kafka's protocol to ask a broker whether it can be used: metadata of all topics, version 2.
 //!
 //! A client library would do as well, but its back-off hides when the broker came back, and the harness must also build
 //! without the feature `kafka`.
@@ -14,12 +14,14 @@ const TIMEOUT: Duration = Duration::from_secs(1);
 const MAX_ANSWER: usize = 4 << 20;
 
 const METADATA: i16 = 3;
-const VERSION: i16 = 1;
+const VERSION: i16 = 2;
 const CORRELATION: i32 = 7;
 
 /// What a broker says about itself.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Metadata {
+    /// Identity of its cluster.
+    pub(super) cluster: String,
     /// Brokers that take part.
     pub(super) brokers: usize,
     /// Partitions that nobody leads: writing to them fails for now.
@@ -72,6 +74,7 @@ fn parse(answer: &[u8]) -> anyhow::Result<Metadata> {
         reader.int32()?; // port
         reader.string()?; // rack
     }
+    let cluster = reader.string()?.to_owned();
     reader.int32()?; // controller
     let mut leaderless = 0;
     for _ in 0..reader.length()? {
@@ -89,7 +92,11 @@ fn parse(answer: &[u8]) -> anyhow::Result<Metadata> {
             }
         }
     }
-    Ok(Metadata { brokers, leaderless })
+    Ok(Metadata {
+        cluster,
+        brokers,
+        leaderless,
+    })
 }
 
 struct Reader<'a>(&'a [u8]);
@@ -112,11 +119,10 @@ impl<'a> Reader<'a> {
         Ok(length)
     }
 
-    /// Skips a string, which may be null.
-    fn string(&mut self) -> anyhow::Result<()> {
+    /// A string; null is an empty one.
+    fn string(&mut self) -> anyhow::Result<&'a str> {
         let length = i16::from_be_bytes(self.take(2)?.try_into()?);
-        self.take(usize::try_from(length.max(0))?)?;
-        Ok(())
+        Ok(std::str::from_utf8(self.take(usize::try_from(length.max(0))?)?)?)
     }
 }
 
@@ -132,6 +138,7 @@ mod tests {
         bytes.extend(b"host");
         bytes.extend(9092_i32.to_be_bytes());
         bytes.extend((-1_i16).to_be_bytes());
+        bytes.extend([0, 2, b'i', b'd']);
         bytes.extend(1_i32.to_be_bytes());
         bytes.extend(1_i32.to_be_bytes());
         bytes.extend([0, 0, 0, 1, b't', 0]);
@@ -150,6 +157,7 @@ mod tests {
         assert_eq!(
             metadata,
             Metadata {
+                cluster: "id".to_owned(),
                 brokers: 1,
                 leaderless: 0
             }

@@ -20,7 +20,13 @@ const LOG_LINES: usize = 20;
 pub(super) struct ServerProcess {
     name: &'static str,
     folder: TempDir,
-    child: Mutex<Option<Child>>,
+    child: Mutex<Option<Running>>,
+}
+
+struct Running {
+    child: Child,
+    /// Length of the log when it was started.
+    log_start: u64,
 }
 
 impl ServerProcess {
@@ -50,6 +56,7 @@ impl ServerProcess {
         let mut child = self.child.lock();
         anyhow::ensure!(child.is_none(), "{} runs already", self.name);
         let log = File::options().create(true).append(true).open(self.log_path())?;
+        let log_start = log.metadata()?.len();
         command
             .current_dir(self.folder())
             .stdin(Stdio::null())
@@ -58,7 +65,10 @@ impl ServerProcess {
             .process_group(0);
         let started = command.spawn().with_context(|| format!("starting {}", self.name))?;
         let pid = started.id();
-        *child = Some(started);
+        *child = Some(Running {
+            child: started,
+            log_start,
+        });
         guard::add(pid, self.folder())
     }
 
@@ -90,7 +100,7 @@ impl ServerProcess {
     fn ended(&self) -> anyhow::Result<Option<String>> {
         match self.child.lock().as_mut() {
             None => Ok(Some("it was not started".to_owned())),
-            Some(child) => Ok(child.try_wait()?.map(|status| status.to_string())),
+            Some(running) => Ok(running.child.try_wait()?.map(|status| status.to_string())),
         }
     }
 
@@ -99,7 +109,7 @@ impl ServerProcess {
     /// # Errors
     /// When the system refuses.
     pub(super) fn kill(&self) -> anyhow::Result<()> {
-        let Some(mut child) = self.child.lock().take() else {
+        let Some(Running { mut child, .. }) = self.child.lock().take() else {
             return Ok(());
         };
         child.kill().with_context(|| format!("killing {}", self.name))?;
@@ -133,9 +143,11 @@ impl ServerProcess {
 
     fn signal(&self, signal: Signal) -> anyhow::Result<()> {
         // The lock is held so that the process cannot be reaped, and its number given away, in between.
-        let child = self.child.lock();
-        let child = child.as_ref().with_context(|| format!("{} does not run", self.name))?;
-        let pid = Pid::from_raw(i32::try_from(child.id())?).context("no process id")?;
+        let running = self.child.lock();
+        let running = running
+            .as_ref()
+            .with_context(|| format!("{} does not run", self.name))?;
+        let pid = Pid::from_raw(i32::try_from(running.child.id())?).context("no process id")?;
         kill_process(pid, signal).with_context(|| format!("{signal:?} to {}", self.name))
     }
 
@@ -147,7 +159,7 @@ impl ServerProcess {
 
     /// Its process id while it runs.
     pub(super) fn pid(&self) -> Option<u32> {
-        self.child.lock().as_ref().map(Child::id)
+        self.child.lock().as_ref().map(|running| running.child.id())
     }
 
     /// Resident memory in KiB.
@@ -166,6 +178,14 @@ impl ServerProcess {
 
     fn log_path(&self) -> PathBuf {
         self.folder().join("log")
+    }
+
+    /// Whether the process that runs now has written this.
+    pub(super) fn has_logged(&self, words: &str) -> bool {
+        let start = self.child.lock().as_ref().map(|running| running.log_start);
+        let text = std::fs::read(self.log_path()).unwrap_or_default();
+        let new = start.and_then(|start| text.get(usize::try_from(start).ok()?..));
+        new.is_some_and(|new| String::from_utf8_lossy(new).contains(words))
     }
 
     /// The last lines of its log.

@@ -71,6 +71,10 @@ impl RedisServer {
     ///
     /// # Errors
     /// When it is not installed, refuses its configuration, or does not answer in time.
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "options are written in place: `start(RedisOptions::default())`"
+    )]
     pub fn start(kind: RedisKind, options: RedisOptions) -> anyhow::Result<Self> {
         anyhow::ensure!(
             !(options.tls && kind == RedisKind::Valkey),
@@ -117,7 +121,9 @@ impl RedisServer {
         let mut command = Command::new(self.kind.program()?);
         command.arg("redis.conf");
         self.process.spawn(command)?;
-        self.process.wait_ready(START, || self.ping())?;
+        // The log tells that it has the port: another server there would answer as well.
+        let ready = || self.process.has_logged("Ready to accept connections") && self.ping();
+        self.process.wait_ready(START, ready)?;
         Ok(())
     }
 

@@ -83,7 +83,9 @@ async fn what_was_acknowledged_is_there_after_a_kill_and_a_frozen_broker_goes_on
     assert!(!answers(&bootstrap));
     server.rss_kib().expect_err("a process that has gone has no memory");
 
+    let begin = Instant::now();
     server.restart().unwrap();
+    println!("back {:?} after a kill", begin.elapsed());
     assert_eq!(server.bootstrap(), bootstrap);
     assert_eq!(cluster_id(&bootstrap), cluster);
     let expected: Vec<String> = (0..1000).map(|number| number.to_string()).collect();

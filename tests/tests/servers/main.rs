@@ -2,6 +2,8 @@
 //!
 //! Needs `scripts/services install`.
 
+#![allow(clippy::unwrap_used, reason = "the helpers of a test fail like the test")]
+
 #[cfg(feature = "kafka")]
 mod kafka;
 mod redis;

@@ -73,25 +73,26 @@ fn frozen_it_answers_nothing_and_thawed_it_goes_on() {
 #[test]
 fn users_have_only_their_rights() {
     let server = start(RedisOptions {
-        acl: vec!["edge on >secret ~b:* &b:* +@all -@dangerous".to_owned()],
+        acl: vec![
+            "default off".to_owned(),
+            "edge on >secret ~b:* &b:* +@all -@dangerous".to_owned(),
+        ],
         ..RedisOptions::default()
     });
-    let edge = ["--user", "edge", "--pass", "secret", "--no-auth-warning"];
-    let run = |command: &[&str]| server.cli(&[&edge[..], command].concat());
-    assert_eq!(run(&["SET", "b:x", "1"]).unwrap(), "OK");
-    assert!(run(&["SET", "other", "1"]).unwrap_err().to_string().contains("NOPERM"));
-    assert!(run(&["FLUSHALL"]).unwrap_err().to_string().contains("NOPERM"));
-    let wrong = [
-        "--user",
-        "edge",
-        "--pass",
-        "guess",
-        "--no-auth-warning",
-        "SET",
-        "b:x",
-        "2",
-    ];
-    assert!(server.cli(&wrong).is_err() || server.cli(&["GET", "b:x"]).unwrap() == "1");
+    assert!(server.ping(), "a refusal is an answer");
+    let run = |password: &str, command: &[&str]| {
+        let user = ["--user", "edge", "--pass", password, "--no-auth-warning"];
+        server.cli(&[&user[..], command].concat())
+    };
+    assert_eq!(run("secret", &["SET", "b:x", "1"]).unwrap(), "OK");
+    for (password, command, refusal) in [
+        ("secret", &["SET", "other", "1"][..], "NOPERM"),
+        ("secret", &["FLUSHALL"], "NOPERM"),
+        ("guess", &["GET", "b:x"], "NOAUTH"),
+    ] {
+        let error = run(password, command).unwrap_err().to_string();
+        assert!(error.contains(refusal), "{command:?}: {error}");
+    }
 }
 
 #[test]
@@ -130,7 +131,12 @@ fn a_port_may_be_chosen_and_a_taken_one_is_an_error() {
         port: first.port(),
         ..RedisOptions::default()
     };
-    assert!(RedisServer::start(RedisKind::Redis, options.clone()).is_err());
+    let error = RedisServer::start(RedisKind::Redis, options.clone()).err();
+    let error = error
+        .expect("the first one's answers are not taken for the second one's")
+        .to_string();
+    assert!(error.contains("in use"), "{error}");
+    assert!(first.ping());
     drop(first);
     assert_eq!(start(options.clone()).port(), options.port);
 }
