@@ -8,12 +8,13 @@ pub mod dds;
 #[cfg(feature = "kafka")]
 pub mod kafka;
 pub mod memory;
-pub mod open;
-#[allow(dead_code, reason = "its users, the adapters of Redis and Kafka, follow")]
+mod open;
+#[allow(dead_code, reason = "each adapter uses its part, and a build may lack one")]
 mod outbox;
 pub mod port;
+pub mod redis;
 
-pub use open::OpenError;
+pub use open::{OpenError, open_layer, open_node};
 pub use port::{
     Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, PublishOutcome, Publisher,
     PublisherOptions, Received, Role, SubscribeOptions, Subscription, SubscriptionSender, subscription,

@@ -5,10 +5,12 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
+use anyhow::Context as _;
 use blaze_brokers::memory::MemoryHub;
+use blaze_brokers::{Broker, Role, open_layer, open_node};
 use blaze_domain::node_file::{LayerBroker as LayerSection, NodeBroker, NodeFile};
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
-use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
+use blaze_flow::flow::{Beginning, Epochs, FlowOptions, LayerBroker, RunningFlow};
 use blaze_flow::world::LayerScopeId;
 use blaze_runtime::admin::{CheckStatus, Readiness};
 use blaze_runtime::config::{Current, Loaded, Schema, Sources, WatchSettings, load_typed, parse_override, watch};
@@ -54,6 +56,11 @@ fn main() -> ExitCode {
     };
     for warning in &loaded.warnings {
         say(format_args!("warning: {warning}"));
+    }
+    if cfg!(not(feature = "kafka")) && matches!(loaded.value.brokers.layer, Some(LayerSection::Kafka(_))) {
+        say(format_args!(
+            "warning: brokers.layer.kafka: this program was built without Kafka (cargo feature `kafka`) and cannot start with it"
+        ));
     }
     if arguments.check {
         return ExitCode::SUCCESS;
@@ -120,31 +127,58 @@ async fn start(supervisor: &Supervisor, file: &NodeFile) -> anyhow::Result<(Runn
         tracing::warn!(directory = %directory.path.display(), instead_of = refused, "state is kept elsewhere");
     }
     let settings = FlowSettings::try_from(file)?;
-    let node = match &file.brokers.node {
-        None => None,
-        Some(NodeBroker::Memory) => Some(MemoryHub::new(settings.me.to_string())),
-        Some(NodeBroker::Redis(_)) => {
-            anyhow::bail!("brokers.node.redis: this version has no Redis adapter; use memory: {{}}")
-        }
+    let epochs = Epochs::begin(&settings.me, Some(&directory.path)).context("keeping the epoch")?;
+    let role = Role::Flow {
+        flow: settings.me.clone(),
+        epoch: epochs.first(),
     };
-    let layer = match &file.brokers.layer {
-        None => None,
-        Some(LayerSection::Memory) => Some(MemoryHub::new(settings.me.layer.to_string())),
-        Some(LayerSection::Dds(_) | LayerSection::Kafka(_)) => {
-            anyhow::bail!("brokers.layer: this version has only the memory adapter; use memory: {{}}")
-        }
-    };
+    let node = node_broker(file, &settings, &role)?;
+    let (layer, layer_prefix) = layer_broker(file, &settings, &role)?;
     let options = FlowOptions {
         settings,
-        node: node.map(|hub| Arc::new(hub.broker()) as Arc<dyn blaze_brokers::Broker>),
-        // Only this process sees it, so nobody shares its identity.
-        layer: layer.map(|hub| LayerBroker {
-            broker: Arc::new(hub.broker()),
-            id: LayerScopeId::private(),
-        }),
+        node,
+        layer,
         state_dir: Some(directory.path),
     };
-    Ok((blaze_flow::flow::start(options, supervisor.clone()).await?, log))
+    let beginning = Beginning { epochs, layer_prefix };
+    Ok((
+        blaze_flow::flow::start_with(options, beginning, supervisor.clone()).await?,
+        log,
+    ))
+}
+
+fn node_broker(file: &NodeFile, settings: &FlowSettings, role: &Role) -> anyhow::Result<Option<Arc<dyn Broker>>> {
+    Ok(match &file.brokers.node {
+        None => None,
+        Some(NodeBroker::Memory) => Some(Arc::new(MemoryHub::new(settings.me.to_string()).broker())),
+        Some(section) => Some(open_node(section, role).context("brokers.node")?),
+    })
+}
+
+/// The layer broker and what it puts before every name.
+fn layer_broker(
+    file: &NodeFile,
+    settings: &FlowSettings,
+    role: &Role,
+) -> anyhow::Result<(Option<LayerBroker>, String)> {
+    let Some(section) = &file.brokers.layer else {
+        return Ok((None, String::new()));
+    };
+    let (broker, id, prefix): (Arc<dyn Broker>, _, _) = match section {
+        // Only this process sees it, so nobody shares its identity.
+        LayerSection::Memory => {
+            let hub = MemoryHub::new(settings.me.layer.to_string());
+            (Arc::new(hub.broker()), LayerScopeId::private(), String::new())
+        }
+        LayerSection::Dds(_) => {
+            anyhow::bail!("brokers.layer.dds: this version has no DDS layer broker; use kafka or memory: {{}}")
+        }
+        LayerSection::Kafka(kafka) => {
+            let broker = open_layer(section, role).context("brokers.layer")?;
+            (broker, LayerScopeId::kafka(&kafka.prefix), kafka.prefix.clone())
+        }
+    };
+    Ok((Some(LayerBroker { broker, id }), prefix))
 }
 
 /// Takes over what may change while the process runs; a faulty file changes nothing and shows on `/readyz`.

@@ -5,6 +5,7 @@
 use std::collections::BTreeMap;
 
 use blaze_domain::{Durability, FlowId, LayerKind, LayerName, Priority, Reliability, TopicName};
+use sha2::{Digest, Sha256};
 
 /// All flows that one flow knows, itself included.
 #[derive(Debug, Clone, PartialEq)]
@@ -43,6 +44,15 @@ impl LayerScopeId {
     #[must_use]
     pub fn private() -> Self {
         Self(rand::random::<u64>().max(1))
+    }
+
+    /// Identity of the Kafka broker of a layer: the same for all flows of the layer that give their names this prefix.
+    #[must_use]
+    pub fn kafka(prefix: &str) -> Self {
+        let digest = Sha256::digest(format!("kafka|{prefix}"));
+        let mut id = [0; 8];
+        id.copy_from_slice(&digest[..8]);
+        Self(u64::from_le_bytes(id).max(1))
     }
 }
 
@@ -189,5 +199,16 @@ impl World {
     /// The flows of one layer, by node.
     pub fn flows_of<'a>(&'a self, layer: &'a LayerName) -> impl Iterator<Item = (&'a FlowId, &'a FlowView)> {
         self.flows.iter().filter(move |(id, _)| id.layer == *layer)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_identity_of_a_kafka_broker_is_the_same_on_every_machine_and_in_every_version() {
+        assert_eq!(LayerScopeId::kafka("").0, 0x7EA7_172E_AAB7_C9FB);
+        assert_ne!(LayerScopeId::kafka(""), LayerScopeId::kafka("a."));
     }
 }

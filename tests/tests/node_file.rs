@@ -57,7 +57,6 @@ fn the_documented_example_has_no_fault_and_a_warning_for_each_section_without_ef
     assert_eq!(
         found,
         [
-            (4, "brokers.node.redis", NOT_YET),
             (5, "brokers.layer.dds", NOT_YET),
             (7, "brokers.plugins", NOT_YET),
             (9, "admin", &keys("worker, monitor")),

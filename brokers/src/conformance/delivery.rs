@@ -9,7 +9,7 @@ use bytes::Bytes;
 
 use super::Fixture;
 use super::tools::{
-    Outcome, Reader, channel, connected, describe, frame, numbered, open_publisher, pattern, publish, writer,
+    DEADLINE, Outcome, Reader, channel, connected, describe, frame, numbered, open_publisher, pattern, publish, writer,
 };
 use crate::port::{Broker, Content, PublishOutcome, Publisher};
 
@@ -98,19 +98,27 @@ pub async fn framed_payloads_arrive_as_they_are(fixture: &dyn Fixture) -> Outcom
         }
         let facts = |frame: &blaze_proto::Frame| {
             format!(
-                "topic {:?}, {:?}, writer {}, sequence {}, time {}, encoding {:?}, hops {}, age {}",
+                "topic {:?}, {:?}, writer {}, sequence {}, time {}, encoding {:?}, hops {}",
                 frame.topic(),
                 frame.origin(),
                 frame.writer(),
                 frame.sequence(),
                 frame.publish_time_ns(),
                 frame.encoding(),
-                frame.hops(),
-                frame.age_us()
+                frame.hops()
             )
         };
         if facts(&found) != facts(&sent) {
             return Err(format!("sent was {}, but received {}", facts(&sent), facts(&found)));
+        }
+        // The age grows by what the message waited for its adapter.
+        let waited = found.age_us().checked_sub(sent.age_us());
+        if waited.is_none_or(|waited| u128::from(waited) > DEADLINE.as_micros()) {
+            return Err(format!(
+                "sent with an age of {} µs, it came with {} µs",
+                sent.age_us(),
+                found.age_us()
+            ));
         }
     }
     Ok(())

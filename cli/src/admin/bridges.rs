@@ -43,6 +43,9 @@ pub struct Bridge {
     /// Messages dropped, by reason.
     #[serde(default)]
     pub dropped: BTreeMap<String, u64>,
+    /// Why it failed, if it did.
+    #[serde(default, deserialize_with = "super::text_or_null")]
+    pub detail: String,
     #[serde(default)]
     latency_ms: Option<Percentiles>,
 }
@@ -116,6 +119,9 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
     ];
     let rows = answer.bridges.iter().map(row).collect();
     text.push_str(&render_table(&columns, rows, width));
+    for bridge in answer.bridges.iter().filter(|bridge| !bridge.detail.is_empty()) {
+        text.push_str(&format!("{} {}: {}\n", bridge.topic, bridge.state, bridge.detail));
+    }
     Ok(text)
 }
 
@@ -174,5 +180,15 @@ mod tests {
              TOPIC     FROM         TO                               STATE   IN  OUT  QUEUED  p50/ms  p99/ms  DROPPED\n\
              imu/data  node:memory  inter:dds cloud (cloud/cloud-1)  up     100   97       1    0.51       -  lifespan 2\n"
         );
+    }
+
+    #[test]
+    fn a_failed_bridge_says_why() {
+        let value = json!({"flow": "fog/fog-1", "bridges": [
+            {"topic": "imu/data", "from": {"scope": "node", "broker": "redis"}, "to": {"scope": "layer", "broker": "kafka"},
+             "state": "failed", "detail": "no such name"}]});
+        let flow = "127.0.0.1:9101".parse().unwrap();
+        let text = table(&flow, &value, None).unwrap();
+        assert!(text.ends_with("imu/data failed: no such name\n"), "{text}");
     }
 }

@@ -26,6 +26,8 @@ const ENVIRONMENT_FILE: &str = ".services/env";
 pub(super) struct NodeBrokers {
     pub(super) flow_node: Arc<dyn Broker>,
     pub(super) flow_layer: LayerBroker,
+    /// What the layer broker puts before every name.
+    pub(super) layer_prefix: String,
     services_node: Arc<dyn Broker>,
     services_layer: Arc<dyn Broker>,
 }
@@ -121,33 +123,35 @@ impl BrokerSource {
             DemoNode::Cloud1 => Some(servers.kafka_cloud.clone()),
             DemoNode::Robot1 | DemoNode::Edge2 => None,
         });
-        let (flow_layer, services_layer): (LayerBroker, Arc<dyn Broker>) = match kafka {
+        let (flow_layer, services_layer, layer_prefix): (LayerBroker, Arc<dyn Broker>, String) = match kafka {
             None => {
                 let (hub, id) = self
                     .layers
                     .entry(node.layer())
                     .or_insert_with(|| (MemoryHub::new(node.layer()), LayerScopeId::private()));
                 let broker = Arc::new(hub.broker());
-                (LayerBroker { broker, id: *id }, Arc::new(hub.broker()))
+                (LayerBroker { broker, id: *id }, Arc::new(hub.broker()), String::new())
             }
             Some(bootstrap) => {
                 let prefix = format!("{}-{}.", self.run, node.layer());
-                let id = LayerScopeId::of_kafka(&prefix);
+                let id = LayerScopeId::kafka(&prefix);
                 let section = LayerSection::Kafka(KafkaBroker {
                     bootstrap: vec![bootstrap],
-                    prefix,
+                    prefix: prefix.clone(),
                     properties: BTreeMap::new(),
                 });
                 let broker = open_layer(&section, &role).map_err(fault)?;
                 (
                     LayerBroker { broker, id },
                     open_layer(&section, &Role::Service).map_err(fault)?,
+                    prefix,
                 )
             }
         };
         Ok(NodeBrokers {
             flow_node,
             flow_layer,
+            layer_prefix,
             services_node,
             services_layer,
         })

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant, SystemTime};
 use blaze_domain::node_file::NodeFile;
 use blaze_domain::ServiceName;
 use blaze_flow::flow::settings::FlowSettings;
-use blaze_flow::flow::{FlowOptions, RunningFlow};
+use blaze_flow::flow::{Beginning, Epochs, FlowOptions, RunningFlow};
 use blaze_runtime::Supervisor;
 use blaze_runtime::config::{Schema, Sources, load_typed};
 use blaze_sdk::{
@@ -172,19 +172,20 @@ async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<N
     let mut source = BrokerSource::new(options.brokers)?;
     let mut running = Vec::new();
     for (node, settings) in settings {
-        let epochs = Epochs::new(settings.me.clone(), None);
-        let epoch = epochs
-            .next()
+        let epochs = Epochs::begin(&settings.me, None)
             .map_err(|error| CliError::Failed(format!("{} has no epoch: {error}", node.name())))?;
-        let brokers = source.of(node, &settings.me, epoch)?;
+        let brokers = source.of(node, &settings.me, epochs.first())?;
+        let beginning = Beginning {
+            epochs,
+            layer_prefix: brokers.layer_prefix.clone(),
+        };
         let flow_options = FlowOptions {
             settings,
             node: Some(Arc::clone(&brokers.flow_node)),
             layer: Some(brokers.flow_layer.clone()),
-            epoch,
-            epochs,
+            state_dir: None,
         };
-        let flow = blaze_flow::flow::start(flow_options, supervisor.child(node.name()))
+        let flow = blaze_flow::flow::start_with(flow_options, beginning, supervisor.child(node.name()))
             .await
             .map_err(|error| CliError::Failed(format!("{} does not start: {error:#}", node.name())))?;
         running.push(RunningNode {

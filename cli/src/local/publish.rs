@@ -1,12 +1,13 @@
 //! `blaze pub`.
 
+use std::io::{BufRead, Read as _};
 use std::time::Duration;
 
 use blaze_sdk::{Advertise, FlowEventKind, FlowEvents, PublishOutcome, Publisher};
 use bytes::Bytes;
 use clap::Args;
 use serde_json::json;
-use tokio::io::{AsyncBufReadExt as _, BufReader};
+use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout_at};
 
 use super::{LocalService, LocalTopic, interrupted, lease_error};
@@ -15,6 +16,8 @@ use crate::output::{self, Format};
 
 /// Longest line of standard input.
 const MAX_LINE_BYTES: usize = blaze_domain::MAX_PAYLOAD_BYTES;
+/// Lines that are read ahead.
+const WAITING_LINES: usize = 64;
 
 /// Options of `blaze pub`.
 #[derive(Debug, Args)]
@@ -152,7 +155,7 @@ async fn feed(options: &PublishOptions, publisher: &Publisher) -> Result<Sent, C
     });
     let endless = options.rate.is_some() || options.payload == "-";
     let most = options.count.unwrap_or(if endless { u64::MAX } else { 1 });
-    let mut lines = (options.payload == "-").then(|| BufReader::new(tokio::io::stdin()));
+    let mut lines = (options.payload == "-").then(lines_of_input);
     let fixed = Bytes::from(options.payload.clone());
     let mut sent = Sent {
         published: 0,
@@ -162,8 +165,8 @@ async fn feed(options: &PublishOptions, publisher: &Publisher) -> Result<Sent, C
     while sent.published + sent.dropped < most {
         let payload = match &mut lines {
             None => fixed.clone(),
-            Some(lines) => match next_line(lines).await? {
-                Some(line) => line,
+            Some(lines) => match lines.recv().await {
+                Some(line) => line?,
                 None => break,
             },
         };
@@ -187,26 +190,56 @@ async fn feed(options: &PublishOptions, publisher: &Publisher) -> Result<Sent, C
     Ok(sent)
 }
 
-/// The next line without its end; `None` at the end of input.
-async fn next_line(lines: &mut BufReader<tokio::io::Stdin>) -> Result<Option<Bytes>, CliError> {
+/// The lines of standard input, without their ends. A thread reads them: one that waits for input that never comes must not
+/// hold up the end of the process.
+fn lines_of_input() -> mpsc::Receiver<Result<Bytes, CliError>> {
+    let (tell, told) = mpsc::channel(WAITING_LINES);
+    std::thread::spawn(move || {
+        let mut input = std::io::stdin().lock();
+        while let Some(line) = next_line(&mut input).transpose() {
+            let ends = line.is_err();
+            if tell.blocking_send(line).is_err() || ends {
+                return;
+            }
+        }
+    });
+    told
+}
+
+/// The next line; `None` at the end of input.
+fn next_line(input: &mut impl BufRead) -> Result<Option<Bytes>, CliError> {
     let mut line = Vec::new();
-    loop {
-        let fault = |error: std::io::Error| CliError::Failed(format!("standard input: {error}"));
-        let available = lines.fill_buf().await.map_err(fault)?;
-        if available.is_empty() {
-            return Ok((!line.is_empty()).then(|| Bytes::from(line)));
+    let mut most = input.by_ref().take(MAX_LINE_BYTES as u64 + 2);
+    let taken = most
+        .read_until(b'\n', &mut line)
+        .map_err(|error| CliError::Failed(format!("standard input: {error}")))?;
+    if taken == 0 {
+        return Ok(None);
+    }
+    if line.last() == Some(&b'\n') {
+        line.pop();
+    }
+    if line.len() > MAX_LINE_BYTES {
+        return Err(CliError::Failed(
+            "a line of standard input is longer than 16 MiB".to_owned(),
+        ));
+    }
+    Ok(Some(Bytes::from(line)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_come_without_their_ends_and_not_too_long() {
+        let mut input: &[u8] = b"one\n\nlast";
+        let mut lines = Vec::new();
+        while let Some(line) = next_line(&mut input).unwrap() {
+            lines.push(line);
         }
-        let (taken, ended) = match available.iter().position(|byte| *byte == b'\n') {
-            Some(end) => (end, true),
-            None => (available.len(), false),
-        };
-        line.extend_from_slice(&available[..taken]);
-        lines.consume(taken + usize::from(ended));
-        if line.len() > MAX_LINE_BYTES {
-            return Err(CliError::Failed("a line of standard input is longer than 16 MiB".to_owned()));
-        }
-        if ended {
-            return Ok(Some(Bytes::from(line)));
-        }
+        assert_eq!(lines, [Bytes::from("one"), Bytes::new(), Bytes::from("last")]);
+        let long = vec![b'x'; MAX_LINE_BYTES + 10];
+        assert!(next_line(&mut long.as_slice()).is_err());
     }
 }

@@ -9,20 +9,28 @@
 //! Without input or output: what it wants done comes out of [`ControlCore::poll`]. Production carries it out with tasks and
 //! brokers, the simulated network with plain calls.
 
+mod info;
+mod routes;
+mod scopes;
+
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 
 use blaze_domain::control::EventKind;
 use blaze_domain::names::ChannelName;
-use blaze_domain::{Durability, FlowId, LayerKind, Scope, TopicName};
-use blaze_proto::link::link_control::{Body, RouteState};
+use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
+use blaze_proto::link::link_control::Body;
 use bytes::Bytes;
 
 use crate::lane::path::TopicInfo;
 use crate::link::LinkEvent;
-use crate::plan::{Destination, PlanRules, Target, TopicPlan, plan_topic};
-use crate::registry::{EventDraft, Registry, RegistryConfig};
-use crate::world::{FlowState, FlowView, LayerScopeId, Reach, World};
+use crate::plan::{PlanRules, TopicPlan, plan_topic};
+use crate::registry::{EventDraft, LayerNames, Registry, RegistryConfig, UnsavedLease};
+use crate::world::{FlowState, LayerScopeId, Reach, World};
+use info::local_info;
+use routes::route_states;
+pub use scopes::ScopeHealth;
+use scopes::{LOCAL, Scopes};
 
 /// A changed topic is planned after this much quiet …
 pub const QUIET: Duration = Duration::from_millis(50);
@@ -32,9 +40,6 @@ pub const LATEST: Duration = Duration::from_millis(250);
 pub const LISTEN: Duration = Duration::from_millis(1500);
 /// All topics are planned anew that often, changed or not.
 pub const RECONCILE: Duration = Duration::from_secs(5);
-
-/// Routes of one topic that other flows are told of.
-const MAX_ROUTE_STATES: usize = 16;
 
 /// What the control core wants done.
 #[derive(Debug)]
@@ -73,6 +78,29 @@ pub enum Output {
     },
     /// Say this state in Hello.
     State(FlowState),
+    /// Say in Hello that the layer broker is there for this flow, or is not.
+    LayerScope {
+        /// It is.
+        shared: bool,
+    },
+    /// Let the broker of a scope keep or forget a lease.
+    SaveLease(UnsavedLease),
+    /// Let the broker of a scope make a channel.
+    Prepare {
+        /// Node or layer.
+        scope: Scope,
+        /// The channel.
+        channel: ChannelName,
+        /// Samples that it keeps per writer for late joiners; 0 = none.
+        depth: u32,
+    },
+    /// Tell the broker of a scope that nobody uses a channel any more.
+    Release {
+        /// Node or layer.
+        scope: Scope,
+        /// The channel.
+        channel: ChannelName,
+    },
 }
 
 /// What a control core is told at its start.
@@ -92,6 +120,10 @@ pub struct ControlConfig {
     pub inter_scope: bool,
     /// Answers on the layer scope share one channel (Kafka, DDS).
     pub layer_answers_need_id: bool,
+    /// What the layer broker makes of topic names.
+    pub layer_names: LayerNames,
+    /// Scopes whose broker keeps leases; the flow is not ready before they were read.
+    pub lease_stores: BTreeSet<Scope>,
     /// Rules of the node file.
     pub rules: PlanRules,
 }
@@ -112,12 +144,15 @@ pub struct ControlCore {
     started: Instant,
     reconciled: Instant,
     announced: (u64, u64),
+    scopes: Scopes,
     /// Where other flows say that they are found.
     addresses: BTreeMap<FlowId, String>,
     /// Control payloads or parts of them that were refused.
     pub refused: u64,
     /// Control payloads that came faster than they could be read.
     pub overrun: u64,
+    /// Kept leases that could not be taken.
+    pub skipped_leases: u64,
 }
 
 impl ControlCore {
@@ -132,6 +167,8 @@ impl ControlCore {
             layer_scope: config.layer_scope,
             max_leases: 10_000,
             layer_answers_need_id: config.layer_answers_need_id,
+            layer_names: config.layer_names,
+            lease_stores: config.lease_stores.clone(),
             started: now,
         });
         Self {
@@ -144,9 +181,11 @@ impl ControlCore {
             started: now,
             reconciled: now,
             announced: (0, 0),
+            scopes: Scopes::default(),
             addresses: BTreeMap::new(),
             refused: 0,
             overrun: 0,
+            skipped_leases: 0,
         }
     }
 
@@ -206,13 +245,18 @@ impl ControlCore {
     pub fn control(&mut self, now: Instant, wall_ms: u64, scope: Scope, payload: &[u8]) {
         let outcome = self.registry.control(now, scope, payload);
         self.refused += outcome.faults;
+        // A channel is asked for before anybody is told that it may be used.
+        self.update_channels_of(&outcome.touched);
+        self.save_leases();
+        let shared = scope == Scope::Layer && self.config.layer_answers_need_id;
         for answer in outcome.answers.into_iter().filter(|answer| answer.designated) {
             let body = Bytes::from(answer.body.to_string());
-            self.outputs.push_back(Output::Publish {
-                scope,
-                channel: answer.reply_to,
-                body,
-            });
+            let channel = if shared {
+                ChannelName::shared_reply()
+            } else {
+                answer.reply_to
+            };
+            self.outputs.push_back(Output::Publish { scope, channel, body });
         }
         for event in &outcome.events {
             self.tell(event, wall_ms);
@@ -248,14 +292,19 @@ impl ControlCore {
     /// Does what is due. To be called every few ten milliseconds.
     pub fn tick(&mut self, now: Instant, wall_ms: u64) {
         let listened = !self.config.inter_scope || now.saturating_duration_since(self.started) >= LISTEN;
-        if self.state == FlowState::Starting && listened {
+        let knows_leases = !LOCAL.iter().any(|scope| self.is_reading_leases(*scope));
+        if self.state == FlowState::Starting && listened && knows_leases {
             self.set_state(now, FlowState::Ready);
         }
         let expired = self.registry.expire(now);
         for event in &expired.events {
             self.tell(event, wall_ms);
         }
+        for lapsed in &expired.lapsed {
+            self.update_channels(&lapsed.topic);
+        }
         self.touch(now, expired.changed);
+        self.save_leases();
         if now.saturating_duration_since(self.reconciled) >= RECONCILE {
             self.reconciled = now;
             self.touch_all(now);
@@ -324,18 +373,31 @@ impl ControlCore {
     fn plan(&mut self, now: Instant, topic: &TopicName, wall_ms: u64) {
         let previous = self.plans.get(topic);
         let world = self.registry.world();
-        let plan = plan_topic(world, topic, &self.config.rules, previous);
+        let mut plan = plan_topic(world, topic, &self.config.rules, previous);
         let had_route = previous.is_some_and(|plan| !plan.bridges.is_empty());
+        let fault = if plan.uses_layer() {
+            self.registry.put_on_layer(topic).err()
+        } else {
+            None
+        };
+        if let Some(fault) = &fault {
+            plan.block_layer(&self.config.me, fault.code(), &format!("{topic} {fault}"));
+        }
+        if !plan.uses_layer() {
+            self.registry.take_off_layer(topic);
+        }
         let has_route = !plan.bridges.is_empty();
-        let info = Box::new(local_info(world.own(), topic));
+        let world = self.registry.world();
+        let info = Box::new(local_info(&self.registry, topic));
         let unused = plan.bridges.is_empty() && world.flows.values().all(|flow| !flow.topics.contains_key(topic));
         if unused {
             self.plans.remove(topic);
         } else {
             self.plans.insert(topic.clone(), plan.clone());
         }
-        self.registry
-            .set_route_state(now, topic, route_states(&self.config.me, &plan));
+        let routes = route_states(&self.config.me, &plan, |scope| self.scopes.health(scope));
+        self.registry.set_route_state(now, topic, routes);
+        self.update_channels(topic);
         self.outputs.push_back(Output::Plan {
             topic: topic.clone(),
             plan,
@@ -379,74 +441,5 @@ fn draft(event: EventKind, topic: Option<TopicName>) -> EventDraft {
     }
 }
 
-/// What this flow does for a topic, as other flows are told for their `why`.
-fn route_states(me: &FlowId, plan: &TopicPlan) -> Vec<RouteState> {
-    let carried = plan.bridges.iter().map(|bridge| {
-        let (to_layer, receiver, step) = match &bridge.to {
-            Target::Inter { layer, receiver } => (layer.to_string(), receiver.to_string(), "bridge"),
-            Target::Node { .. } | Target::Layer => (me.layer.to_string(), me.to_string(), "deliver"),
-        };
-        RouteState {
-            to_layer,
-            receiver,
-            step: step.to_owned(),
-            ok: true,
-            code: "ok".to_owned(),
-            next_offset: 0,
-        }
-    });
-    let blocked = plan.blocked.iter().map(|blocked| {
-        let (to_layer, receiver) = match &blocked.to {
-            Destination::Flow(flow) => (flow.layer.to_string(), flow.to_string()),
-            Destination::Layer(layer) => (layer.to_string(), String::new()),
-        };
-        let code = blocked.code.as_str().to_owned();
-        RouteState {
-            to_layer,
-            receiver,
-            step: "plan".to_owned(),
-            ok: false,
-            code,
-            next_offset: 0,
-        }
-    });
-    carried.chain(blocked).take(MAX_ROUTE_STATES).collect()
-}
-
-/// What the local advertisements of a topic say.
-fn local_info(own: Option<&FlowView>, topic: &TopicName) -> TopicInfo {
-    let Some(entry) = own.and_then(|own| own.topics.get(topic)) else {
-        return TopicInfo::default();
-    };
-    let advertised: Vec<_> = [&entry.node.advertise, &entry.layer.advertise]
-        .into_iter()
-        .flatten()
-        .collect();
-    let Some(first) = advertised.first() else {
-        return TopicInfo::default();
-    };
-    let sources: BTreeSet<_> = advertised.iter().flat_map(|advertise| &advertise.sources).collect();
-    let only = (sources.len() == 1 && !advertised.iter().any(|a| a.more_sources))
-        .then(|| sources.first())
-        .flatten();
-    let kept = advertised.iter().filter(|a| a.durability == Durability::TransientLocal);
-    let endless = advertised.iter().any(|a| a.lifespan_ms == 0);
-    TopicInfo {
-        encoding: first.encoding.clone(),
-        service: only.map(|source| source.service.clone()).unwrap_or_default(),
-        instance: String::new(),
-        priority: advertised.iter().filter_map(|a| a.priority).min(),
-        max_bytes: advertised.iter().filter_map(|a| a.max_bytes).max(),
-        rate_hz: advertised.iter().map(|a| a.rate_hz).sum::<Option<f64>>(),
-        reliable: advertised
-            .iter()
-            .any(|a| a.reliability == blaze_domain::Reliability::Reliable),
-        depth: kept.map(|a| a.depth).max().unwrap_or(0),
-        // 0 = endless, which is the longest.
-        lifespan_ms: if endless {
-            0
-        } else {
-            advertised.iter().map(|a| a.lifespan_ms).max().unwrap_or(0)
-        },
-    }
-}
+#[cfg(test)]
+mod tests;

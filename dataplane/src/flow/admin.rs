@@ -16,7 +16,8 @@ use serde_json::{Map, Value, json};
 
 use super::Shared;
 use super::plane::wall_ns;
-use crate::lane::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
+use super::routes::SourceState;
+use crate::lane::path::{BridgeState, Phase, Sink, TopicPath};
 use crate::link::{Engine, PeerState};
 use crate::plan::Target;
 use crate::registry::{LeaseView, Terms};
@@ -63,8 +64,7 @@ async fn topics(State(shared): App) -> Json<Value> {
         state
             .core
             .topics_mut()
-            .iter_mut()
-            .map(|path| (path.name.clone(), path.in_rate.rate(now)))
+            .map(|(_, path)| (path.name.clone(), path.in_rate.rate(now)))
             .collect()
     });
     let control = shared.control.lock();
@@ -182,12 +182,13 @@ fn remote_request(flow: &blaze_domain::FlowId, scope: Scope, request: &Request) 
 
 async fn bridges(State(shared): App) -> Json<Value> {
     let now = Instant::now();
-    let routes = &shared.routes;
     // First the places, then whether they are subscribed: the two locks are never held together.
     let mut rows = shared.plane.read(|state| {
         let mut rows = Vec::new();
-        for (index, path) in state.core.topics().iter().enumerate() {
-            let id = TopicId(u32::try_from(index).unwrap_or(u32::MAX));
+        for (id, path) in state.core.topics_mut() {
+            path.bridges.iter_mut().for_each(|bridge| {
+                bridge.settle();
+            });
             for bridge in path.bridges.iter().filter(|bridge| bridge.phase != Phase::Ended) {
                 rows.push((id, bridge.from, bridge_row(&shared, now, path, bridge)));
             }
@@ -195,8 +196,16 @@ async fn bridges(State(shared): App) -> Json<Value> {
         rows
     });
     for (id, from, row) in &mut rows {
-        if row["state"] == "up" && !routes.is_subscribed(*id, *from) {
-            row["state"] = json!("starting");
+        if row["state"] != "up" {
+            continue;
+        }
+        match shared.routes.source_state(*id, *from) {
+            SourceState::Subscribed => {}
+            SourceState::Starting => row["state"] = json!("starting"),
+            SourceState::Failed(reason) => {
+                row["state"] = json!("failed");
+                row["detail"] = json!(reason);
+            }
         }
     }
     let rows: Vec<Value> = rows.into_iter().map(|(_, _, row)| row).collect();
@@ -240,6 +249,7 @@ fn bridge_id(path: &TopicPath, bridge: &BridgeState, own_layer: &str) -> String 
 fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeState) -> Value {
     let (state, since) = match bridge.phase {
         Phase::Up { since } => ("up", now.saturating_duration_since(since).as_secs_f64()),
+        Phase::Failed { since } => ("failed", now.saturating_duration_since(since).as_secs_f64()),
         Phase::Draining { .. } | Phase::Ended => ("draining", 0.0),
     };
     let (to_scope, layer, flow) = match &bridge.target {
@@ -268,7 +278,7 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
         "latency_ms": {
             "p50": bridge.stats.latency.quantile_ms(0.5), "p99": bridge.stats.latency.quantile_ms(0.99),
         },
-        "class": class, "reliable": bridge.lane.reliable, "max_rate_hz": bridge.lane.max_rate_hz,
+        "detail": bridge.failure, "class": class, "reliable": bridge.lane.reliable, "max_rate_hz": bridge.lane.max_rate_hz,
         "lifespan_ms": bridge.lane.lifespan_ms,
     })
 }
@@ -316,7 +326,7 @@ async fn allocation(State(shared): App) -> Json<Value> {
     let rows = shared.plane.read(|state| {
         let mut rows = Vec::new();
         let mut payload = 0.0;
-        for path in state.core.topics_mut() {
+        for (_, path) in state.core.topics_mut() {
             if let Some(row) = allocation_row(now, path, &mut payload) {
                 rows.push(row);
             }

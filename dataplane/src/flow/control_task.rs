@@ -7,11 +7,11 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
-    Broker, BrokerError, Content, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
+    Broker, BrokerError, Content, FlowSide, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
 };
 use blaze_domain::Scope;
 use blaze_domain::names::ChannelName;
-use blaze_proto::link::link_control::State as HelloState;
+use blaze_proto::link::link_control::{LayerScope, State as HelloState};
 use bytes::Bytes;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
@@ -143,7 +143,44 @@ impl ControlTask {
                 }
             }
             Output::Plan { topic, plan, info } => self.shared.routes.apply(&topic, &plan, *info),
+            Output::LayerScope { shared } => {
+                let said = if shared {
+                    self.shared.layer_scope
+                } else {
+                    (LayerScope::None, 0)
+                };
+                plane.with(|state| {
+                    state
+                        .engine
+                        .as_mut()
+                        .map(|engine| engine.set_layer_scope(now, said.0, said.1))
+                });
+            }
+            Output::SaveLease(lease) => {
+                if let Some(side) = self.side(lease.scope) {
+                    match lease.value {
+                        Some(value) => side.put_lease(&lease.key, value),
+                        None => side.remove_lease(&lease.key),
+                    }
+                }
+            }
+            Output::Prepare { scope, channel, depth } => {
+                if let Some(side) = self.side(scope)
+                    && let Err(error) = side.prepare(&channel, depth)
+                {
+                    tracing::warn!(%channel, %scope, %error, "the broker cannot have this channel");
+                }
+            }
+            Output::Release { scope, channel } => {
+                if let Some(side) = self.side(scope) {
+                    side.release(&channel);
+                }
+            }
         }
+    }
+
+    fn side(&self, scope: Scope) -> Option<Arc<dyn FlowSide>> {
+        self.shared.brokers.of(scope)?.flow_side()
     }
 
     fn publish(&mut self, scope: Scope, channel: ChannelName, body: &Bytes) {

@@ -1,18 +1,19 @@
 //! `/metrics`: the counters of the flow in Prometheus' words. Made anew for each scrape from the state under its lock.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::time::Instant;
 
 use blaze_domain::{Priority, Scope};
 use prometheus::core::Collector;
 use prometheus::{CounterVec, Encoder, GaugeVec, Opts, Registry, TextEncoder};
 
+use super::routes::SourceState;
 use super::{Shared, class_label};
 use crate::lane::path::{BridgeState, Phase, TopicId, TopicPath};
 use crate::registry::Terms;
 
 /// Topics that have label values of their own; the rest share one.
-const MAX_TOPICS: usize = 1000;
+const MAX_TOPICS: u32 = 1000;
 const OTHER: &str = "_other";
 /// Upper bounds of the latency buckets in seconds.
 const BUCKETS: [f64; 14] = [
@@ -158,7 +159,7 @@ impl Page {
 
     fn fill_topics(&self, shared: &Shared) {
         let now = Instant::now();
-        let subscribed = shared.routes.subscribed();
+        let sources = shared.routes.source_states();
         let mut histograms: BTreeMap<(String, String), Histogram> = BTreeMap::new();
         shared.plane.read(|state| {
             for (reason, count) in state.core.unattributed.iter() {
@@ -166,14 +167,13 @@ impl Page {
                     .with_label_values(&["", "", reason.as_str()])
                     .inc_by(count as f64);
             }
-            for (index, path) in state.core.topics_mut().iter_mut().enumerate() {
-                let topic = if index < MAX_TOPICS {
+            for (id, path) in state.core.topics_mut() {
+                let topic = if id.0 < MAX_TOPICS {
                     path.name.to_string()
                 } else {
                     OTHER.to_owned()
                 };
-                let id = TopicId(u32::try_from(index).unwrap_or(u32::MAX));
-                self.fill_topic(now, (&topic, id), path, &subscribed, &mut histograms);
+                self.fill_topic(now, (&topic, id), path, &sources, &mut histograms);
             }
         });
         let mut text = String::new();
@@ -192,7 +192,7 @@ impl Page {
         now: Instant,
         (topic, id): (&str, TopicId),
         path: &mut TopicPath,
-        subscribed: &BTreeSet<(TopicId, Scope)>,
+        sources: &BTreeMap<(TopicId, Scope), SourceState>,
         histograms: &mut BTreeMap<(String, String), Histogram>,
     ) {
         for (reason, count) in path.ingress_drops.iter() {
@@ -204,6 +204,7 @@ impl Page {
         for bridge in &mut path.bridges {
             let to = bridge.to_label();
             let from = bridge.from.as_str();
+            bridge.settle();
             let stats = &bridge.stats;
             for (direction, count) in [("in", stats.taken), ("out", stats.out)] {
                 self.messages
@@ -222,13 +223,14 @@ impl Page {
                 .entry((topic.to_owned(), to.clone()))
                 .or_default()
                 .add(bridge);
-            let state = match bridge.phase {
-                Phase::Up { .. } if bridge.from != Scope::Inter && !subscribed.contains(&(id, bridge.from)) => {
-                    "starting"
-                }
-                Phase::Up { .. } => "up",
-                Phase::Draining { .. } => "draining",
-                Phase::Ended => continue,
+            let source = sources.get(&(id, bridge.from));
+            let state = match (bridge.phase, source) {
+                (Phase::Failed { .. }, _) | (Phase::Up { .. }, Some(SourceState::Failed(_))) => "failed",
+                (Phase::Up { .. }, Some(SourceState::Subscribed)) => "up",
+                (Phase::Up { .. }, _) if bridge.from == Scope::Inter => "up",
+                (Phase::Up { .. }, _) => "starting",
+                (Phase::Draining { .. }, _) => "draining",
+                (Phase::Ended, _) => continue,
             };
             self.bridges.with_label_values(&[state]).inc();
             if !matches!(bridge.from, Scope::Inter) {
@@ -333,6 +335,9 @@ impl Page {
         self.link
             .with_label_values(&["control_message_refused"])
             .inc_by(control.refused as f64);
+        self.link
+            .with_label_values(&["kept_lease_skipped"])
+            .inc_by(control.skipped_leases as f64);
     }
 
     fn text(&self) -> prometheus::Result<String> {

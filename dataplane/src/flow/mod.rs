@@ -3,6 +3,8 @@
 //! | who | what | how many |
 //! |---|---|---|
 //! | control task | control channels, link news → control core → answers, plans | 1 |
+//! | scope task | health of a local broker, the leases that it keeps → control core | per local scope |
+//! | peers task | who else uses the layer's Kafka | 1 where there is one |
 //! | source task | one topic of one local scope → message path | per topic and scope that is read |
 //! | pacer thread | link engine → transport, within the budget | 1 |
 //! | transport threads | transport → link engine → message path → brokers | 3 readers and DDS's own |
@@ -10,10 +12,14 @@
 
 mod admin;
 mod control_task;
+mod epochs;
+mod health;
 mod metrics;
 pub mod pacing;
+mod peers_task;
 pub mod plane;
 mod routes;
+mod scope_task;
 pub mod settings;
 mod why;
 
@@ -21,17 +27,17 @@ use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use blaze_brokers::{Broker, BrokerKind, Health};
-use blaze_domain::{FlowId, Priority};
+use blaze_brokers::{Broker, BrokerKind};
+use blaze_domain::{FlowId, LayerKind, Priority, Scope};
 use blaze_proto::link::link_control::{Egress as SaidEgress, LayerScope};
-use blaze_runtime::admin::{AdminServer, CheckStatus, Gate, Readiness};
+use blaze_runtime::admin::{AdminServer, Readiness};
 use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
-use tokio::sync::Notify;
+use tokio::sync::{Notify, watch};
 use tokio_util::sync::CancellationToken;
 
 use crate::control::{ControlConfig, ControlCore};
@@ -39,11 +45,16 @@ use crate::lane::core::{DataConfig, DataCore};
 use crate::link::dds::{DdsConfig, DdsStatus, DdsTransport};
 use crate::link::transport::{Endpoint, Transport};
 use crate::link::{DownReason, Engine, EngineConfig, Limits, LinkEvent};
+use crate::registry::{LayerNames, peers_channel};
 use crate::world::LayerScopeId;
+pub use epochs::Epochs;
+use health::{readiness, watch_health};
 use pacing::Egress;
+use peers_task::PeersTask;
 use plane::{News, Plane, wall_ns};
 pub use routes::LocalBrokers;
 use routes::Routes;
+use scope_task::ScopeTask;
 use settings::{FlowSettings, InterSettings, LiveSettings};
 
 /// The layer broker of a flow, and who shares it.
@@ -63,7 +74,7 @@ pub struct FlowOptions {
     pub node: Option<Arc<dyn Broker>>,
     /// Broker of the layer scope.
     pub layer: Option<LayerBroker>,
-    /// Where the epoch is kept; `None`: the clock alone gives it.
+    /// Where [`start`] keeps the epoch; `None`: the clock alone gives it.
     pub state_dir: Option<PathBuf>,
 }
 
@@ -113,6 +124,8 @@ impl InterTransport {
 /// What the parts of one flow share.
 pub(crate) struct Shared {
     pub(crate) me: FlowId,
+    /// What Hello says of the layer broker while this flow may use it.
+    pub(crate) layer_scope: (LayerScope, u64),
     /// Changes when the transport is rebuilt.
     pub(crate) epoch: AtomicU64,
     pub(crate) plane: Arc<Plane>,
@@ -159,30 +172,51 @@ pub struct RunningFlow {
 const DRAIN: Duration = Duration::from_millis(600);
 /// How long its good-bye may take to leave.
 const GOODBYE: Duration = Duration::from_millis(100);
-/// `why` looks at what happened during the last one to two of these.
-const MARK: Duration = Duration::from_secs(2);
-/// How often the health of brokers and link is looked at.
-const HEALTH: Duration = Duration::from_millis(200);
 
-/// Starts a flow. It returns as soon as the admin port listens; [`RunningFlow::ready`] waits for the rest.
+/// How long brokers may take to deliver what they have taken when the flow ends.
+const CLOSE: Duration = Duration::from_millis(1500);
+
+/// What is known of a flow before its brokers are opened.
+#[derive(Debug, Clone)]
+pub struct Beginning {
+    /// The flow's lives; its brokers know it by the first epoch.
+    pub epochs: Epochs,
+    /// What the layer broker puts before every name.
+    pub layer_prefix: String,
+}
+
+/// Starts a flow whose brokers need to know nothing of it, as those within a process. It returns as soon as the admin port
+/// listens; [`RunningFlow::ready`] waits for the rest.
 ///
 /// # Errors
-/// When the admin port cannot be bound, the epoch cannot be kept or the inter scope's configuration can never work.
+/// As [`start_with`], and when the epoch cannot be kept.
 pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Result<RunningFlow> {
+    let epochs = Epochs::begin(&options.settings.me, options.state_dir.as_deref()).context("keeping the epoch")?;
+    let beginning = Beginning {
+        epochs,
+        layer_prefix: String::new(),
+    };
+    start_with(options, beginning, supervisor).await
+}
+
+/// Starts a flow whose brokers were opened for the life that has begun; its `state_dir` was used for that already.
+///
+/// # Errors
+/// When the admin port cannot be bound or the inter scope's configuration can never work.
+pub async fn start_with(
+    options: FlowOptions,
+    beginning: Beginning,
+    supervisor: Supervisor,
+) -> anyhow::Result<RunningFlow> {
     let FlowOptions {
-        settings,
-        node,
-        layer,
-        state_dir,
+        settings, node, layer, ..
     } = options;
-    let epochs = Arc::new(Epochs {
-        me: settings.me.clone(),
-        state_dir,
-        last: AtomicU64::new(0),
-    });
-    let epoch = epochs.next().context("keeping the epoch")?;
+    let Beginning { epochs, layer_prefix } = beginning;
+    let epoch = epochs.first();
     let now = Instant::now();
     let layer_scope = layer.as_ref().map(|layer| layer.id);
+    let said_layer_scope = said_layer_scope(layer.as_ref());
+    let layer_kind = layer.as_ref().map(|layer| layer.broker.kind());
 
     let core = DataCore::new(DataConfig {
         me: settings.me.clone(),
@@ -197,7 +231,7 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
             me: settings.me.clone(),
             kind: settings.kind,
             epoch,
-            layer_scope: said_layer_scope(layer.as_ref()),
+            layer_scope: said_layer_scope,
             max_datagram,
             limits: Limits::default(),
         };
@@ -214,27 +248,36 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         plane.with(|state| state.engine.as_mut().map(|engine| engine.set_addresses(addresses)));
     }
 
+    let brokers = LocalBrokers {
+        node,
+        layer: layer.map(|layer| layer.broker),
+    };
     let control = ControlCore::new(
         ControlConfig {
             me: settings.me.clone(),
             kind: settings.kind,
             epoch,
-            node_scope: node.is_some(),
+            node_scope: brokers.node.is_some(),
             layer_scope,
             inter_scope: settings.inter.is_some(),
-            layer_answers_need_id: false,
+            // Channels there are set up beforehand, so all answers share one.
+            layer_answers_need_id: matches!(layer_kind, Some(BrokerKind::Kafka | BrokerKind::Dds)),
+            layer_names: match layer_kind {
+                Some(BrokerKind::Kafka) => LayerNames::Kafka {
+                    prefix_bytes: layer_prefix.len(),
+                },
+                _ => LayerNames::Any,
+            },
+            lease_stores: brokers.lease_stores(),
             rules: settings.live.rules.clone(),
         },
         now,
     );
-    let brokers = LocalBrokers {
-        node,
-        layer: layer.map(|layer| layer.broker),
-    };
     let egress = Egress::new(settings.live.budget_bytes_per_s());
     let readiness = readiness(&brokers, transport.is_some());
     let shared = Arc::new(Shared {
         me: settings.me.clone(),
+        layer_scope: said_layer_scope,
         epoch: AtomicU64::new(epoch),
         routes: Routes::new(Arc::clone(&plane), brokers.clone(), supervisor.clone()),
         plane,
@@ -267,6 +310,7 @@ pub async fn start(options: FlowOptions, supervisor: Supervisor) -> anyhow::Resu
         draining: draining.clone(),
     };
     let control = supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
+    watch_brokers(&shared, &supervisor, (settings.kind, epoch, layer_scope));
     supervisor.spawn(
         "health",
         TaskPolicy::Essential,
@@ -352,6 +396,12 @@ impl RunningFlow {
             tokio::time::sleep(GOODBYE).await;
         }
         shared.routes.stop();
+        let brokers = [&shared.brokers.node, &shared.brokers.layer];
+        for broker in brokers.into_iter().flatten() {
+            if tokio::time::timeout(CLOSE, broker.close()).await.is_err() {
+                tracing::warn!(broker = %broker.kind(), "the broker did not take everything in time");
+            }
+        }
         shared.egress.stop();
         shared.plane.wake();
         if let Some(pacer) = &self.pacer {
@@ -370,11 +420,11 @@ fn connect(
     inter: &InterSettings,
     me: &FlowId,
     epoch: u64,
-    epochs: &Arc<Epochs>,
+    epochs: &Epochs,
     plane: &Arc<Plane>,
 ) -> anyhow::Result<InterTransport> {
     let sink = Arc::clone(plane);
-    let epochs = Arc::clone(epochs);
+    let epochs = epochs.clone();
     let dds = DdsTransport::start(DdsConfig {
         domain: inter.domain,
         listen: inter.listen_address(),
@@ -386,44 +436,46 @@ fn connect(
             flow: me.clone(),
             epoch,
         },
-        next_epoch: Arc::new(move || epochs.next_anyhow()),
+        next_epoch: Arc::new(move || epochs.renew()),
         sink: Arc::new(move |event| sink.transport_event(event)),
     })
     .context("brokers.inter.dds")?;
     Ok(InterTransport { dds })
 }
 
-/// Gives this flow's epochs: the clock in milliseconds, and always larger than the last.
-struct Epochs {
-    me: FlowId,
-    state_dir: Option<PathBuf>,
-    last: AtomicU64,
-}
-
-impl Epochs {
-    fn next(&self) -> std::io::Result<u64> {
-        let given = match &self.state_dir {
-            Some(dir) => blaze_runtime::state::next_epoch(dir, self.me.layer.as_str(), self.me.node.as_str())?,
-            None => wall_ns() / 1_000_000,
+/// Starts what follows the local brokers.
+fn watch_brokers(shared: &Arc<Shared>, supervisor: &Supervisor, life: (LayerKind, u64, Option<LayerScopeId>)) {
+    let (kind, epoch, layer_scope) = life;
+    for scope in [Scope::Node, Scope::Layer] {
+        let Some(broker) = shared.brokers.of(scope) else {
+            continue;
         };
-        Ok(self.after_last(given))
-    }
-
-    /// One for a rebuilt participant: a directory that cannot be written any more does not hold it up.
-    fn next_anyhow(&self) -> u64 {
-        self.next().unwrap_or_else(|error| {
-            tracing::warn!(%error, "the epoch is not kept");
-            self.after_last(wall_ns() / 1_000_000)
-        })
-    }
-
-    /// The clock may have been set back.
-    fn after_last(&self, given: u64) -> u64 {
-        let newer = |last: u64| given.max(last + 1);
-        let before = self
-            .last
-            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |last| Some(newer(last)));
-        newer(before.unwrap_or_else(|last| last))
+        let shares = scope == Scope::Layer && broker.kind() == BrokerKind::Kafka;
+        let (tell, listened) = watch::channel(true);
+        if let (true, Some(side), Some(channel), Some(id)) = (shares, broker.flow_side(), peers_channel(), layer_scope)
+        {
+            tell.send_replace(false);
+            let peers = PeersTask {
+                broker: Arc::clone(broker),
+                side,
+                channel,
+                me: shared.me.clone(),
+                kind,
+                epoch,
+                scope: id,
+                listened: tell,
+                stop: supervisor.shutdown_token(),
+            };
+            supervisor.spawn("peers", TaskPolicy::Essential, peers.run());
+        }
+        let task = ScopeTask {
+            shared: Arc::clone(shared),
+            scope,
+            broker: Arc::clone(broker),
+            listened,
+            stop: supervisor.shutdown_token(),
+        };
+        supervisor.spawn(format!("scope {scope}"), TaskPolicy::Essential, task.run());
     }
 }
 
@@ -439,60 +491,6 @@ fn said_layer_scope(layer: Option<&LayerBroker>) -> (LayerScope, u64) {
         BrokerKind::Memory | BrokerKind::Redis => LayerScope::None,
     };
     (kind, layer.id.0)
-}
-
-fn readiness(brokers: &LocalBrokers, inter: bool) -> Readiness {
-    let readiness = Readiness::new();
-    let there = [
-        ("node_broker", brokers.node.is_some()),
-        ("layer_broker", brokers.layer.is_some()),
-        ("inter", inter),
-    ];
-    for (check, _) in there.into_iter().filter(|(_, there)| *there) {
-        readiness.add(check, Gate::Decides, CheckStatus::Failed, "starting");
-    }
-    readiness.add("config", Gate::Shows, CheckStatus::Ok, "");
-    readiness
-}
-
-/// Keeps the checks of `/readyz` true to brokers and link, until the process ends.
-async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: CancellationToken) {
-    let mut listened = false;
-    let mut marked = Instant::now();
-    loop {
-        if marked.elapsed() >= MARK {
-            marked = Instant::now();
-            shared.plane.read(|state| state.core.mark());
-            shared.tell_link();
-        }
-        for (check, broker) in [
-            ("node_broker", &shared.brokers.node),
-            ("layer_broker", &shared.brokers.layer),
-        ] {
-            let Some(broker) = broker else { continue };
-            let status = broker.status().borrow().clone();
-            let state = if status.health == Health::Up {
-                CheckStatus::Ok
-            } else {
-                CheckStatus::Failed
-            };
-            shared.readiness.set(check, state, status.detail);
-        }
-        if let Some(transport) = &shared.transport {
-            let status = transport.status();
-            let (state, detail) = match (status.ready, listened) {
-                (true, true) => (CheckStatus::Ok, status.detail),
-                (true, false) => (CheckStatus::Failed, "listening for other flows".to_owned()),
-                (false, _) => (CheckStatus::Failed, status.detail),
-            };
-            shared.readiness.set("inter", state, detail);
-        }
-        tokio::select! {
-            () = stop.cancelled() => return,
-            () = tokio::time::sleep(HEALTH) => {}
-            () = ready.notified() => listened = true,
-        }
-    }
 }
 
 /// Classes in the order of [`Priority::ALL`], for labels.

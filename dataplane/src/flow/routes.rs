@@ -1,11 +1,10 @@
 //! Makes reality equal to the plan: writers of brokers, and one task for each (topic, scope) that is read.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, Publisher, PublisherOptions, SubscribeOptions};
+use blaze_brokers::{Broker, BrokerError, PublisherOptions, SubscribeOptions};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName};
 use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
@@ -13,7 +12,8 @@ use parking_lot::Mutex;
 
 use super::plane::Plane;
 use crate::lane::path::{TopicId, TopicInfo};
-use crate::plan::{LaneSpec, Target, TopicPlan};
+use crate::lane::writer::NewWriter;
+use crate::plan::{Bridge, Target, TopicPlan};
 
 /// Messages that a source task takes at once.
 const BATCH: usize = 64;
@@ -39,14 +39,31 @@ impl LocalBrokers {
             Scope::Inter => None,
         }
     }
+
+    /// Scopes whose broker keeps leases.
+    pub(super) fn lease_stores(&self) -> BTreeSet<Scope> {
+        let keeps = |scope: &Scope| self.of(*scope).is_some_and(|broker| broker.flow_side().is_some());
+        [Scope::Node, Scope::Layer].into_iter().filter(keeps).collect()
+    }
+}
+
+/// Whether a source is subscribed.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(super) enum SourceState {
+    /// Not yet, or the broker is away.
+    #[default]
+    Starting,
+    /// It is.
+    Subscribed,
+    /// The broker refuses the channel, for this reason.
+    Failed(String),
 }
 
 struct Source {
     task: TaskHandle,
-    subscribed: Arc<AtomicBool>,
+    state: Arc<Mutex<SourceState>>,
+    large: bool,
 }
-
-type WriterKey = (Scope, ChannelName, PublisherOptions);
 
 /// Writers and source tasks of one flow.
 pub(crate) struct Routes {
@@ -54,7 +71,6 @@ pub(crate) struct Routes {
     brokers: LocalBrokers,
     supervisor: Supervisor,
     sources: Mutex<BTreeMap<(TopicId, Scope), Source>>,
-    writers: Mutex<HashMap<WriterKey, Arc<dyn Publisher>>>,
 }
 
 impl Routes {
@@ -66,29 +82,44 @@ impl Routes {
             brokers,
             supervisor,
             sources: Mutex::default(),
-            writers: Mutex::default(),
         }
     }
 
     /// Makes the bridges of a topic equal to its plan.
     pub(super) fn apply(&self, topic: &TopicName, plan: &TopicPlan, info: TopicInfo) {
-        if plan.bridges.is_empty() && self.plane.read(|state| state.core.find(topic.as_str()).is_none()) {
+        let now = Instant::now();
+        let held = self.plane.read(|state| {
+            state.core.find(topic.as_str())?;
+            let large = state.core.is_large(topic, info.max_bytes);
+            let writers: Vec<Option<NewWriter>> = plan
+                .bridges
+                .iter()
+                .map(|bridge| state.core.writer_of(topic, bridge.from, &bridge.to).cloned())
+                .collect();
+            Some((large, writers))
+        });
+        if held.is_none() && plan.bridges.is_empty() {
             // A topic of other flows that this one has no part in takes no place here.
             return;
         }
-        let now = Instant::now();
-        let large = self.plane.read(|state| state.core.is_large(info.max_bytes));
-        let mut writers: HashMap<Target, Arc<dyn Publisher>> = HashMap::new();
-        for bridge in &plan.bridges {
-            if let Some(writer) = self.writer(topic, &bridge.to, &bridge.lane, large) {
-                writers.insert(bridge.to.clone(), writer);
-            }
-        }
+        let (large, held) = held.unwrap_or_else(|| {
+            let large = self.plane.read(|state| state.core.is_large(topic, info.max_bytes));
+            (large, vec![None; plan.bridges.len()])
+        });
+        // Made before the lock is taken, because making one takes time.
+        let local = plan.bridges.iter().zip(held);
+        let mut writers: Vec<(Scope, &Target, Result<NewWriter, String>)> = local
+            .filter(|(bridge, _)| bridge.to.receiver().is_none())
+            .map(|(bridge, held)| (bridge.from, &bridge.to, self.writer(topic, bridge, large, held)))
+            .collect();
         let applied = self.plane.with(|state| {
             let id = state.core.intern(topic, now)?;
-            state
-                .core
-                .apply(now, id, info, plan, |target| writers.get(target).cloned());
+            state.core.apply(now, id, info, plan, |bridge| {
+                let made = writers
+                    .iter()
+                    .position(|(from, to, _)| (*from, *to) == (bridge.from, &bridge.to));
+                made.map_or_else(|| Err(String::new()), |at| writers.swap_remove(at).2)
+            });
             let path = state.core.path(id);
             Some((id, [Scope::Node, Scope::Layer].map(|scope| (scope, path.reads(scope)))))
         });
@@ -99,33 +130,26 @@ impl Routes {
         for (scope, wanted) in reads {
             self.read(id, topic, scope, wanted, large);
         }
-        if plan.bridges.is_empty() {
-            self.writers.lock().retain(|(_, channel, _), _| {
-                *channel != ChannelName::from(topic) && *channel != ChannelName::bare(topic)
-            });
-        }
     }
 
-    /// Whether everything that the topic's bridges read is subscribed.
+    /// Whether what a topic's bridges read is subscribed.
     #[must_use]
-    pub(super) fn is_subscribed(&self, topic: TopicId, scope: Scope) -> bool {
+    pub(super) fn source_state(&self, topic: TopicId, scope: Scope) -> SourceState {
         match scope {
-            Scope::Inter => true,
-            _ => self
-                .sources
-                .lock()
-                .get(&(topic, scope))
-                .is_some_and(|s| s.subscribed.load(Ordering::Relaxed)),
+            Scope::Inter => SourceState::Subscribed,
+            _ => {
+                let sources = self.sources.lock();
+                let source = sources.get(&(topic, scope));
+                source.map_or_else(SourceState::default, |source| source.state.lock().clone())
+            }
         }
     }
 
-    /// What is subscribed.
-    pub(super) fn subscribed(&self) -> BTreeSet<(TopicId, Scope)> {
+    /// The states of all sources.
+    pub(super) fn source_states(&self) -> BTreeMap<(TopicId, Scope), SourceState> {
         let sources = self.sources.lock();
-        let there = sources
-            .iter()
-            .filter(|(_, source)| source.subscribed.load(Ordering::Relaxed));
-        there.map(|(key, _)| *key).collect()
+        let states = sources.iter().map(|(key, source)| (*key, source.state.lock().clone()));
+        states.collect()
     }
 
     /// Ends all source tasks.
@@ -135,48 +159,59 @@ impl Routes {
         }
     }
 
-    fn writer(&self, topic: &TopicName, target: &Target, lane: &LaneSpec, large: bool) -> Option<Arc<dyn Publisher>> {
-        let (scope, channel) = match target {
+    /// The writer of a bridge: the one that it has, unless another kind is needed now.
+    fn writer(
+        &self,
+        topic: &TopicName,
+        bridge: &Bridge,
+        large: bool,
+        held: Option<NewWriter>,
+    ) -> Result<NewWriter, String> {
+        let (scope, channel) = match bridge.to {
             Target::Node { bare: true } => (Scope::Node, ChannelName::bare(topic)),
             Target::Node { bare: false } => (Scope::Node, topic.into()),
-            Target::Layer => (Scope::Layer, topic.into()),
-            Target::Inter { .. } => return None,
+            Target::Layer | Target::Inter { .. } => (Scope::Layer, topic.into()),
         };
-        let depth = if lane.durable { lane.depth } else { 0 };
+        let lane = &bridge.lane;
         let options = PublisherOptions {
-            depth,
+            depth: if lane.durable { lane.depth } else { 0 },
             reliable: lane.reliable,
             large,
         };
-        let key = (scope, channel, options);
-        if let Some(writer) = self.writers.lock().get(&key) {
-            return Some(Arc::clone(writer));
+        if let Some(held) = held.filter(|held| held.options == options) {
+            return Ok(held);
         }
-        match self.brokers.of(scope)?.publisher(&key.1, options) {
-            Ok(writer) => {
-                self.writers.lock().insert(key, Arc::clone(&writer));
-                Some(writer)
-            }
-            Err(error) => {
-                tracing::error!(%topic, %scope, %error, "this topic cannot be written");
-                None
-            }
-        }
+        let broker = self.brokers.of(scope).ok_or("the scope has no broker")?;
+        let publisher = broker.publisher(&channel, options).map_err(|error| {
+            tracing::warn!(%topic, %scope, %error, "this topic cannot be written");
+            error.to_string()
+        })?;
+        Ok(NewWriter { publisher, options })
     }
 
     fn read(&self, id: TopicId, topic: &TopicName, scope: Scope, wanted: bool, large: bool) {
         let mut sources = self.sources.lock();
+        let held = sources.remove(&(id, scope));
         if !wanted {
-            if let Some(source) = sources.remove(&(id, scope)) {
+            if let Some(source) = held {
                 source.task.stop();
             }
             return;
         }
-        if sources.contains_key(&(id, scope)) {
-            return;
-        }
+        let before = match held {
+            Some(source) if source.large == large => {
+                sources.insert((id, scope), source);
+                return;
+            }
+            Some(source) => {
+                tracing::info!(%topic, %scope, large, "the subscription moves to the connection for its size");
+                source.task.stop();
+                Some(source.task)
+            }
+            None => None,
+        };
         let Some(broker) = self.brokers.of(scope) else { return };
-        let subscribed = Arc::new(AtomicBool::new(false));
+        let state = Arc::<Mutex<SourceState>>::default();
         let source = SourceTask {
             plane: Arc::clone(&self.plane),
             broker: Arc::clone(broker),
@@ -187,11 +222,12 @@ impl Routes {
                 large,
                 ..SubscribeOptions::default()
             },
-            subscribed: Arc::clone(&subscribed),
+            state: Arc::clone(&state),
+            before,
         };
         let name = format!("source {scope} {topic}");
         let task = self.supervisor.spawn(name, TaskPolicy::Essential, source.run());
-        sources.insert((id, scope), Source { task, subscribed });
+        sources.insert((id, scope), Source { task, state, large });
     }
 }
 
@@ -203,16 +239,21 @@ struct SourceTask {
     topic: TopicId,
     scope: Scope,
     options: SubscribeOptions,
-    subscribed: Arc<AtomicBool>,
+    state: Arc<Mutex<SourceState>>,
+    /// The task that it replaces: two at a time would read everything twice.
+    before: Option<TaskHandle>,
 }
 
 impl SourceTask {
-    async fn run(self) {
+    async fn run(mut self) {
+        if let Some(before) = self.before.take() {
+            before.finished().await;
+        }
         let mut reported = false;
         loop {
             match self.broker.subscribe(&self.channel, self.options).await {
                 Ok(mut subscription) => {
-                    self.subscribed.store(true, Ordering::Relaxed);
+                    *self.state.lock() = SourceState::Subscribed;
                     reported = false;
                     let mut batch = Vec::with_capacity(BATCH);
                     while subscription.receive(&mut batch, BATCH).await > 0 {
@@ -222,13 +263,19 @@ impl SourceTask {
                         }
                         self.plane.ingest(self.topic, self.scope, &mut batch);
                     }
-                    self.subscribed.store(false, Ordering::Relaxed);
+                    *self.state.lock() = SourceState::Starting;
                 }
-                Err(error) if !reported => {
-                    reported = true;
-                    tracing::warn!(channel = %self.channel, scope = %self.scope, %error, "cannot subscribe, trying on");
+                Err(error) => {
+                    if !std::mem::replace(&mut reported, true) {
+                        tracing::warn!(channel = %self.channel, scope = %self.scope, %error, "cannot subscribe, trying on");
+                    }
+                    *self.state.lock() = match error {
+                        BrokerError::Name { .. } | BrokerError::TooManyChannels(_) => {
+                            SourceState::Failed(error.to_string())
+                        }
+                        BrokerError::Away(_) | BrokerError::Closed => SourceState::Starting,
+                    };
                 }
-                Err(_) => {}
             }
             tokio::time::sleep(RETRY).await;
         }

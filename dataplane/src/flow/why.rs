@@ -8,14 +8,15 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use blaze_brokers::{Broker, BrokerKind, Health};
 use blaze_domain::control::LeaseKind;
-use blaze_domain::{Scope, TopicName, WhyCode};
+use blaze_domain::{TopicName, WhyCode};
 use blaze_proto::link::link_control::RouteState;
 use serde_json::{Value, json};
 
 use super::Shared;
 use super::admin::{answer, query_text, refusal};
+use super::routes::SourceState;
 use crate::control::ControlCore;
-use crate::lane::path::{BridgeState as Bridge, Phase, TopicId};
+use crate::lane::path::{BridgeState as Bridge, Phase};
 use crate::plan::TopicPlan;
 use crate::why::{
     BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, StepKind, WhyInput, WhyTarget, explain,
@@ -76,61 +77,54 @@ fn nothing_such(shared: &Shared, topic: &str, to: Option<&str>, code: WhyCode, r
 fn bridge_facts(shared: &Shared, topic: &TopicName) -> Vec<BridgeFacts> {
     let found = shared.plane.read(|state| {
         let id = state.core.find(topic.as_str())?;
-        let live = |bridge: &&Bridge| matches!(bridge.phase, Phase::Up { .. });
-        Some((
-            id,
-            state
-                .core
-                .path(id)
-                .bridges
-                .iter()
-                .filter(live)
-                .map(facts_of)
-                .collect::<Vec<_>>(),
-        ))
+        let path = state.core.path_mut(id);
+        let live = |bridge: &&mut Bridge| matches!(bridge.phase, Phase::Up { .. } | Phase::Failed { .. });
+        let facts: Vec<BridgeFacts> = path.bridges.iter_mut().filter(live).map(facts_of).collect();
+        Some((id, facts))
     });
     let Some((id, mut facts)) = found else {
         return Vec::new();
     };
-    for fact in &mut facts {
-        fact.state = state_of(shared, id, fact.from);
+    for fact in facts.iter_mut().filter(|fact| fact.state == BridgeState::Up) {
+        fact.state = match shared.routes.source_state(id, fact.from) {
+            SourceState::Subscribed => BridgeState::Up,
+            SourceState::Starting => BridgeState::Starting,
+            SourceState::Failed(reason) => BridgeState::Failed(reason),
+        };
     }
     facts
 }
 
-fn facts_of(bridge: &Bridge) -> BridgeFacts {
+fn facts_of(bridge: &mut Bridge) -> BridgeFacts {
+    bridge.settle();
     let lately = bridge.stats.lately();
     BridgeFacts {
         from: bridge.from,
         to: bridge.target.clone(),
-        state: BridgeState::Up,
+        state: match bridge.phase {
+            Phase::Failed { .. } => BridgeState::Failed(bridge.failure.clone().unwrap_or_default()),
+            _ => BridgeState::Up,
+        },
         received: lately.taken,
         sent: lately.out,
         dropped: lately.dropped.into_iter().collect(),
     }
 }
 
-fn state_of(shared: &Shared, topic: TopicId, from: Scope) -> BridgeState {
-    if shared.routes.is_subscribed(topic, from) {
-        BridgeState::Up
-    } else {
-        BridgeState::Starting
-    }
-}
-
 fn broker_facts(broker: &dyn Broker) -> BrokerFacts {
     let status = broker.status().borrow().clone();
+    let kind = broker.kind().to_string();
+    let (name, health, detail) = match status.health {
+        // Up, it says server and version, which are the better name.
+        Health::Up if status.detail.is_empty() => (kind, BrokerHealth::Up, String::new()),
+        Health::Up => (status.detail, BrokerHealth::Up, String::new()),
+        Health::InUse => (kind, BrokerHealth::InUse, status.detail),
+        Health::Connecting | Health::Down | Health::Closed => (kind, BrokerHealth::Down, status.detail),
+    };
     BrokerFacts {
-        name: if status.detail.is_empty() {
-            broker.kind().to_string()
-        } else {
-            status.detail
-        },
-        health: if status.health == Health::Up {
-            BrokerHealth::Up
-        } else {
-            BrokerHealth::Down
-        },
+        name,
+        health,
+        detail,
         at_most_once: broker.kind() == BrokerKind::Redis,
     }
 }

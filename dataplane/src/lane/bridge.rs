@@ -1,18 +1,22 @@
 //! What one bridge does with a message: filter, lifespan, rate, then broker or lane.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{PublishOutcome, Publisher};
+use blaze_brokers::PublishOutcome;
 use blaze_domain::{DropReason, Priority};
 
-use super::core::{Admitted, LaneLink};
+use super::admit::Admitted;
+use super::core::LaneLink;
 use super::measure::RateMeter;
 use super::path::{BridgeState, Phase, Sink, TopicId};
 use super::stats::BridgeStats;
+use super::writer::{NewWriter, Writer};
 use crate::limit::bucket::TokenBucket;
 use crate::link::{StreamKey, Submit};
 use crate::plan::{Bridge, Target};
+
+/// Replaced writers of a bridge that may still have something to deliver.
+const MAX_PAST: usize = 4;
 
 impl BridgeState {
     pub(super) fn new(now: Instant, planned: &Bridge, sink: Sink) -> Self {
@@ -21,6 +25,8 @@ impl BridgeState {
             target: planned.to.clone(),
             lane: planned.lane.clone(),
             phase: Phase::Up { since: now },
+            failure: None,
+            ended: None,
             bucket: planned.lane.max_rate_hz.map(|rate| TokenBucket::new(rate, now)),
             sink,
             stats: BridgeStats::default(),
@@ -28,20 +34,11 @@ impl BridgeState {
         }
     }
 
-    pub(super) fn renew(
-        &mut self,
-        now: Instant,
-        planned: &Bridge,
-        publisher: &mut impl FnMut(&Target) -> Option<Arc<dyn Publisher>>,
-    ) {
-        if !matches!(self.phase, Phase::Up { .. }) {
+    pub(super) fn renew(&mut self, now: Instant, planned: &Bridge) {
+        if let Phase::Draining { .. } | Phase::Ended = self.phase {
             self.phase = Phase::Up { since: now };
         }
-        if let Sink::Publish { publisher: current, .. } = &mut self.sink
-            && let Some(publisher) = publisher(&planned.to)
-        {
-            *current = publisher;
-        }
+        self.ended = None;
         match (planned.lane.max_rate_hz, &mut self.bucket) {
             (Some(rate), Some(bucket)) => bucket.set_rate(rate, now),
             (Some(rate), bucket) => *bucket = Some(TokenBucket::new(rate, now)),
@@ -50,13 +47,76 @@ impl BridgeState {
         self.lane = planned.lane.clone();
     }
 
+    /// Gives a bridge to a local broker its writer, or says why there is none. One that it had goes on delivering.
+    pub(super) fn set_writer(&mut self, now: Instant, made: Result<NewWriter, String>) {
+        let Sink::Publish { writer, past, .. } = &mut self.sink else {
+            return;
+        };
+        match made {
+            Ok(made) => {
+                if let Phase::Failed { .. } = self.phase {
+                    self.phase = Phase::Up { since: now };
+                }
+                self.failure = None;
+                if writer.as_ref().is_some_and(|writer| writer.is(&made)) {
+                    return;
+                }
+                past.extend(writer.replace(Writer::new(made)));
+                if past.len() > MAX_PAST {
+                    past.remove(0).close(&mut self.stats);
+                }
+            }
+            // One that works is better than none.
+            Err(_) if writer.is_some() => {}
+            Err(reason) => {
+                if !matches!(self.phase, Phase::Failed { .. }) {
+                    self.phase = Phase::Failed { since: now };
+                }
+                self.failure = Some(reason);
+            }
+        }
+    }
+
+    /// Brings the counters up to date with what the broker's adapter did, and lets go of writers that have nothing more to
+    /// deliver. Returns how many messages wait there.
+    pub fn settle(&mut self) -> u64 {
+        let ended = self.phase == Phase::Ended;
+        let Sink::Publish { writer, past, .. } = &mut self.sink else {
+            return 0;
+        };
+        let stats = &mut self.stats;
+        let mut waiting = 0;
+        past.retain_mut(|writer| {
+            let queued = writer.settle(stats);
+            waiting += queued;
+            queued > 0
+        });
+        if let Some(current) = writer {
+            let queued = current.settle(stats);
+            waiting += queued;
+            if ended && queued == 0 {
+                *writer = None;
+            }
+        }
+        waiting
+    }
+
+    /// It takes nothing more and has nothing to empty.
+    pub(super) fn end(&mut self, now: Instant) {
+        (self.phase, self.ended, self.failure) = (Phase::Ended, Some(now), None);
+        self.settle();
+    }
+
     /// Whether the message is meant for this bridge at all; what is not is not counted as taken.
     pub(super) fn wants(&self, message: &Admitted) -> bool {
-        let frame = &message.frame;
         // What a flow wrote stays in the layer: only what was born here leaves for another one.
         if matches!(self.target, Target::Inter { .. }) && !message.born_here {
             return false;
         }
+        if self.lane.from.is_empty() {
+            return true;
+        }
+        let frame = &message.frame;
         self.lane
             .carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
     }
@@ -85,17 +145,15 @@ impl BridgeState {
             return;
         }
         match &mut self.sink {
-            Sink::Publish { publisher, bare } => {
+            Sink::Publish { writer, bare, .. } => {
+                let Some(writer) = writer else {
+                    self.stats.dropped.add(DropReason::BrokerError, 1);
+                    return;
+                };
                 let deadline = (lifespan_ms > 0)
                     .then(|| now + Duration::from_millis(lifespan_ms.into()) - Duration::from_micros(message.age_us));
-                let outcome = if *bare {
-                    publisher.publish_bare(frame.payload(), deadline)
-                } else {
-                    publisher.publish(&frame.clone().with_hops_and_age(frame.hops() + 1, message.age_us), deadline)
-                };
-                match outcome {
+                match writer.publish(frame, *bare, deadline) {
                     PublishOutcome::Taken => {
-                        self.stats.out.add(bytes);
                         self.stats.latency.record(message.here_us);
                         self.out_rate.add(now, bytes);
                     }
@@ -124,7 +182,8 @@ impl BridgeState {
                         topic: topic.0,
                         writer: frame.writer(),
                     },
-                    frame: frame.clone().with_hops_and_age(frame.hops(), message.age_us),
+                    // The link adds its own hop.
+                    frame: frame.clone().with_hops_and_age(message.hops, message.age_us),
                     arrived: now,
                     reliable: self.lane.reliable,
                     lifespan: (lifespan_ms > 0).then(|| Duration::from_millis(lifespan_ms.into())),

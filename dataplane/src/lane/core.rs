@@ -10,26 +10,29 @@
 
 use std::collections::HashMap;
 use std::num::NonZeroUsize;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Content, Publisher, Received};
-use blaze_domain::{DropReason, FlowId, Origin, Scope, TopicName, WriterId};
-use blaze_proto::{Frame, Header};
-use bytes::Bytes;
+use blaze_brokers::Received;
+use blaze_domain::{DropReason, FlowId, Scope, TopicName, WriterId};
+use blaze_proto::Frame;
 use lru::LruCache;
 
+use super::admit::Admitted;
 use super::measure::micros;
-use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
+use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
+use super::places::topic_id;
 use super::stats::Drops;
 use super::window::DuplicateWindow;
+use super::writer::{NewWriter, Writer};
 use crate::link::{Engine, LaneId, Submit};
-use crate::plan::{Target, TopicPlan};
+use crate::plan::Target;
 
 /// Writers whose duplicate window a flow keeps; the least recently used go first.
 pub const MAX_WRITERS: usize = 65_536;
-/// Topics that a flow carries.
+/// Topics that a flow carries at a time.
 pub const MAX_TOPICS: usize = 10_000;
+/// A topic, or a bridge, that nobody has used for this long is forgotten.
+pub const FORGET: Duration = Duration::from_secs(600);
 /// How long a bridge whose pair has vanished may empty its queue.
 pub const DRAIN: Duration = Duration::from_millis(500);
 
@@ -73,24 +76,21 @@ pub struct DataConfig {
 
 /// The data plane of one flow.
 pub struct DataCore {
-    config: DataConfig,
-    topics: Vec<TopicPath>,
-    by_name: HashMap<TopicName, TopicId>,
-    windows: LruCache<(TopicId, WriterId), DuplicateWindow>,
-    lanes: Vec<(TopicId, usize)>,
+    pub(super) config: DataConfig,
+    pub(super) topics: Vec<TopicPath>,
+    pub(super) by_name: HashMap<TopicName, TopicId>,
+    pub(super) windows: LruCache<(TopicId, WriterId), DuplicateWindow>,
+    pub(super) lanes: Vec<(TopicId, usize)>,
+    /// Places of topics that were forgotten.
+    pub(super) vacant: Vec<TopicId>,
+    /// Lanes of topics that were forgotten.
+    pub(super) free_lanes: Vec<LaneId>,
+    /// A bridge empties its queue.
+    pub(super) draining: bool,
     /// What could not be attributed to a topic.
     pub unattributed: Drops,
     /// Windows that gave way to newer writers.
     pub evicted_writers: u64,
-}
-
-/// Where a message stands when it reaches the bridges.
-pub(super) struct Admitted {
-    pub(super) frame: Frame,
-    pub(super) born_here: bool,
-    pub(super) age_us: u64,
-    /// Since it came to this flow.
-    pub(super) here_us: u64,
 }
 
 impl DataCore {
@@ -104,20 +104,24 @@ impl DataCore {
             by_name: HashMap::new(),
             windows: LruCache::new(capacity),
             lanes: Vec::new(),
+            vacant: Vec::new(),
+            free_lanes: Vec::new(),
+            draining: false,
             unattributed: Drops::default(),
             evicted_writers: 0,
         }
     }
 
-    /// All topics, also those that nobody uses any more.
-    #[must_use]
-    pub fn topics(&self) -> &[TopicPath] {
-        &self.topics
+    /// All topics, also those that nobody has used for a while.
+    pub fn topics(&self) -> impl Iterator<Item = (TopicId, &TopicPath)> {
+        let all = self.topics.iter().enumerate().filter(|(_, path)| !path.vacant);
+        all.map(|(index, path)| (topic_id(index), path))
     }
 
     /// All topics, for what reads meters.
-    pub fn topics_mut(&mut self) -> &mut [TopicPath] {
-        &mut self.topics
+    pub fn topics_mut(&mut self) -> impl Iterator<Item = (TopicId, &mut TopicPath)> {
+        let all = self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant);
+        all.map(|(index, path)| (topic_id(index), path))
     }
 
     /// A topic by name.
@@ -132,10 +136,27 @@ impl DataCore {
         &self.topics[topic.0 as usize]
     }
 
-    /// Whether a payload of that size makes a topic `bulk`.
+    /// A topic's path, for what reads counters.
+    pub fn path_mut(&mut self, topic: TopicId) -> &mut TopicPath {
+        &mut self.topics[topic.0 as usize]
+    }
+
+    /// Whether a topic is large, as advertised or as seen.
     #[must_use]
-    pub fn is_large(&self, bytes: Option<u64>) -> bool {
-        bytes.is_some_and(|bytes| bytes > self.config.large_bytes)
+    pub fn is_large(&self, topic: &TopicName, advertised: Option<u64>) -> bool {
+        let seen = self.find(topic.as_str()).map_or(0, |id| self.path(id).largest_bytes);
+        seen.max(advertised.unwrap_or(0)) > self.config.large_bytes
+    }
+
+    /// The writer that a bridge to a local broker has, or had and has not emptied yet.
+    #[must_use]
+    pub fn writer_of(&self, topic: &TopicName, from: Scope, to: &Target) -> Option<&NewWriter> {
+        let path = self.path(self.find(topic.as_str())?);
+        let bridge = path.bridges.iter().find(|b| b.from == from && b.target == *to)?;
+        match &bridge.sink {
+            Sink::Publish { writer, .. } => writer.as_ref().map(Writer::made),
+            Sink::Lane { .. } => None,
+        }
     }
 
     /// Whether a bridge still empties its queue.
@@ -161,6 +182,7 @@ impl DataCore {
     /// Puts a mark into the counters of every bridge: what happened since the one before is "lately".
     pub fn mark(&mut self) {
         for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
+            bridge.settle();
             bridge.stats.mark();
         }
     }
@@ -168,72 +190,6 @@ impl DataCore {
     /// Changes what counts as large, from the next message on.
     pub fn set_large_bytes(&mut self, bytes: u64) {
         self.config.large_bytes = bytes;
-    }
-
-    /// The number of a topic, given at first use. `None` when there are [`MAX_TOPICS`] already.
-    pub fn intern(&mut self, name: &TopicName, now: Instant) -> Option<TopicId> {
-        if let Some(id) = self.by_name.get(name) {
-            return Some(*id);
-        }
-        if self.topics.len() >= MAX_TOPICS {
-            return None;
-        }
-        let id = TopicId(u32::try_from(self.topics.len()).ok()?);
-        self.topics.push(TopicPath::new(name.clone(), now));
-        self.by_name.insert(name.clone(), id);
-        Some(id)
-    }
-
-    /// Makes the bridges of a topic equal to its plan. `publisher` gives the writer for a local target, if there is one.
-    /// Bridges that are no longer planned drain.
-    pub fn apply(
-        &mut self,
-        now: Instant,
-        topic: TopicId,
-        info: TopicInfo,
-        plan: &TopicPlan,
-        mut publisher: impl FnMut(&Target) -> Option<Arc<dyn Publisher>>,
-    ) {
-        let Self {
-            topics, lanes, config, ..
-        } = self;
-        let path = &mut topics[topic.0 as usize];
-        path.info = info;
-        for bridge in &mut path.bridges {
-            let planned = plan
-                .bridges
-                .iter()
-                .any(|p| p.from == bridge.from && p.to == bridge.target);
-            if !planned && matches!(bridge.phase, Phase::Up { .. }) {
-                bridge.phase = Phase::Draining { until: now + DRAIN };
-            }
-        }
-        for planned in &plan.bridges {
-            let class = path.class(&planned.lane, config.large_bytes);
-            let existing = path
-                .bridges
-                .iter_mut()
-                .find(|b| b.from == planned.from && b.target == planned.to);
-            if let Some(bridge) = existing {
-                bridge.renew(now, planned, &mut publisher);
-                continue;
-            }
-            let sink = match &planned.to {
-                Target::Inter { .. } => {
-                    let lane = LaneId(u32::try_from(lanes.len()).unwrap_or(u32::MAX));
-                    lanes.push((topic, path.bridges.len()));
-                    Sink::Lane { lane, class }
-                }
-                target => match publisher(target) {
-                    Some(publisher) => Sink::Publish {
-                        publisher,
-                        bare: is_bare(target),
-                    },
-                    None => continue,
-                },
-            };
-            path.bridges.push(BridgeState::new(now, planned, sink));
-        }
     }
 
     /// Takes a batch that a local scope delivered. `wall_ns` is the clock since 1970 at `now`.
@@ -282,18 +238,8 @@ impl DataCore {
             return;
         }
         let age_us = frame.age_us();
-        self.fan_out(
-            now,
-            topic,
-            Scope::Inter,
-            &Admitted {
-                frame,
-                born_here: false,
-                age_us,
-                here_us: 0,
-            },
-            link,
-        );
+        let message = Admitted::new(frame, false, age_us, 0);
+        self.fan_out(now, topic, Scope::Inter, &message, link);
     }
 
     /// The link has sent the last byte of a message for the first time.
@@ -328,17 +274,21 @@ impl DataCore {
 
     /// Ends bridges that have drained. Returns when it wants to be called again.
     pub fn drain(&mut self, now: Instant, link: &mut dyn LaneLink) -> Option<Instant> {
+        if !self.draining {
+            return None;
+        }
         let mut next = None;
         for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
             let Phase::Draining { until } = bridge.phase else {
                 continue;
             };
-            let lane = match bridge.sink {
-                Sink::Lane { lane, .. } => Some(lane),
-                Sink::Publish { .. } => None,
+            let lane = bridge.lane_id();
+            let queued = match lane {
+                Some(lane) => link.queued(lane),
+                None => bridge.settle(),
             };
             // What a bridge from the inter scope has to empty is on its way to it: it stays until the end.
-            let empty = bridge.from != Scope::Inter && lane.is_none_or(|lane| link.queued(lane) == 0);
+            let empty = bridge.from != Scope::Inter && queued == 0;
             if empty || now >= until {
                 if let Some(lane) = lane {
                     bridge
@@ -346,137 +296,18 @@ impl DataCore {
                         .dropped
                         .add(DropReason::NoDestination, link.drop_lane(lane));
                 }
-                bridge.phase = Phase::Ended;
+                bridge.end(now);
             } else {
                 next = Some(next.map_or(until, |other: Instant| other.min(until)));
             }
         }
+        self.draining = next.is_some();
         next
     }
 
     fn lane_bridge(&mut self, lane: LaneId) -> Option<&mut BridgeState> {
         let (topic, bridge) = *self.lanes.get(lane.0 as usize)?;
         self.topics.get_mut(topic.0 as usize)?.bridges.get_mut(bridge)
-    }
-
-    fn check_local(
-        &mut self,
-        now: Instant,
-        wall_ns: u64,
-        topic: TopicId,
-        from: Scope,
-        received: Received,
-    ) -> Result<Admitted, DropReason> {
-        let at = received.at;
-        let waited_us = received.broker_age_us + micros(now.saturating_duration_since(at));
-        let (frame, bare) = match received.content {
-            Content::Malformed { .. } => return Err(DropReason::DecodeError),
-            Content::Frame(frame) => (frame, false),
-            Content::Bare { payload, identity } => (
-                self.wrap(wall_ns.saturating_sub(waited_us * 1000), topic, from, payload, identity)?,
-                true,
-            ),
-        };
-        if frame.topic() != self.path(topic).name.as_str() {
-            return Err(DropReason::DecodeError);
-        }
-        let born_here = frame.hops() == 0;
-        if from == Scope::Node && !born_here {
-            // Only this flow writes to its node scope, and what it writes carries hops.
-            return Err(DropReason::Echo);
-        }
-        let me = &self.config.me;
-        let own_layer = frame.origin_layer() == me.layer.as_str();
-        let own_node = frame.origin_node() == me.node.as_str();
-        let foreign = match from {
-            Scope::Node => !(own_layer && own_node),
-            Scope::Layer | Scope::Inter => born_here && !own_layer,
-        };
-        // Before the window takes the number: a foreign message must not silence the writer whose name it bears.
-        if foreign {
-            return Err(DropReason::ForeignOrigin);
-        }
-        if !self.is_new(topic, &frame) {
-            // What a flow has written carries hops; a publisher that repeats itself does not.
-            return Err(if born_here {
-                DropReason::Duplicate
-            } else {
-                DropReason::Echo
-            });
-        }
-        let mut age_us = frame.age_us().saturating_add(waited_us);
-        if from == Scope::Node && !bare {
-            // One host, one clock: the publisher's time tells what nobody could measure.
-            age_us = age_us.max(wall_ns.saturating_sub(frame.publish_time_ns()) / 1000);
-        }
-        let path = &mut self.topics[topic.0 as usize];
-        let bytes = frame.payload().len() as u64;
-        path.largest_bytes = path.largest_bytes.max(bytes);
-        path.in_rate.add(now, bytes);
-        let here_us = micros(now.saturating_duration_since(at));
-        Ok(Admitted {
-            frame,
-            born_here,
-            age_us,
-            here_us,
-        })
-    }
-
-    /// Gives a bare payload its header.
-    fn wrap(
-        &mut self,
-        publish_time_ns: u64,
-        topic: TopicId,
-        from: Scope,
-        payload: Bytes,
-        identity: Option<(WriterId, u64)>,
-    ) -> Result<Frame, DropReason> {
-        let config = &self.config;
-        let path = &mut self.topics[topic.0 as usize];
-        let (writer, sequence) = identity.unwrap_or_else(|| {
-            let (writer, sequence) = path
-                .bare
-                .entry(from)
-                .or_insert_with(|| (bare_writer(config, from, path.name.as_str()), 0));
-            *sequence += 1;
-            (*writer, *sequence)
-        });
-        let info = &path.info;
-        let node = if from == Scope::Node {
-            config.me.node.to_string()
-        } else {
-            String::new()
-        };
-        let origin = Origin {
-            layer: config.me.layer.to_string(),
-            node,
-            service: info.service.clone(),
-            instance: info.instance.clone(),
-            epoch: config.epoch,
-        };
-        let header = Header {
-            encoding: info.encoding.clone(),
-            lifespan_ms: info.lifespan_ms,
-            priority: info.priority,
-            reliable: info.reliable,
-            depth: info.depth,
-            ..Header::new(path.name.as_str(), origin, writer, sequence, publish_time_ns)
-        };
-        Frame::new(&header, payload).map_err(|_| DropReason::TooLarge)
-    }
-
-    fn is_new(&mut self, topic: TopicId, frame: &Frame) -> bool {
-        let key = (topic, frame.writer());
-        if let Some(window) = self.windows.get_mut(&key) {
-            return window.insert(frame.sequence());
-        }
-        if self.windows.len() == self.windows.cap().get() {
-            self.evicted_writers += 1;
-        }
-        let mut window = DuplicateWindow::default();
-        window.insert(frame.sequence());
-        self.windows.put(key, window);
-        true
     }
 
     fn fan_out(&mut self, now: Instant, topic: TopicId, from: Scope, message: &Admitted, link: &mut dyn LaneLink) {
@@ -489,23 +320,6 @@ impl DataCore {
             }
         }
     }
-}
-
-fn is_bare(target: &Target) -> bool {
-    matches!(target, Target::Node { bare: true })
-}
-
-/// Writer of bare messages that this flow numbers: new at each start of the flow.
-fn bare_writer(config: &DataConfig, from: Scope, topic: &str) -> WriterId {
-    use sha2::{Digest, Sha256};
-    let text = format!(
-        "{from}|{}|{}|{topic}|{}|{}",
-        config.me.layer, config.me.node, config.epoch, config.salt
-    );
-    let digest = Sha256::digest(text.as_bytes());
-    let mut id = [0; 16];
-    id.copy_from_slice(&digest[..16]);
-    WriterId(id)
 }
 
 #[cfg(test)]

@@ -1,8 +1,11 @@
 //! The path of a message through one flow.
 
+mod admit;
 mod bridge;
 pub mod core;
 pub mod measure;
 pub mod path;
+mod places;
 pub mod stats;
 pub mod window;
+pub mod writer;

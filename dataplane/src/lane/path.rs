@@ -1,14 +1,14 @@
 //! One topic in one flow: its bridges and what is known of its messages.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::time::Instant;
 
-use blaze_brokers::Publisher;
 use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WriterId};
 
+use super::core::FORGET;
 use super::measure::RateMeter;
 use super::stats::{BridgeStats, Drops};
+use super::writer::Writer;
 use crate::limit::bucket::TokenBucket;
 use crate::link::LaneId;
 use crate::plan::{LaneSpec, Target};
@@ -20,32 +20,54 @@ pub struct TopicId(pub u32);
 /// What local advertisements say of a topic: the ground for headers of bare messages and for its class.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TopicInfo {
+    /// Those of the node scope.
+    pub node: BareInfo,
+    /// Those of the layer scope.
+    pub layer: BareInfo,
+    /// Largest payload as advertised.
+    pub max_bytes: Option<u64>,
+    /// Advertised rate in Hz, summed over the writers; `None` where one of them gives none.
+    pub rate_hz: Option<f64>,
+}
+
+/// What the advertisements of one scope say of messages that come without a header.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct BareInfo {
     /// Media type as advertised.
     pub encoding: String,
-    /// The only advertising service and its instance; empty where there are several or none.
+    /// The only advertising service; empty where there are several or none.
     pub service: String,
     /// Instance of that service.
     pub instance: String,
     /// Class as advertised.
     pub priority: Option<Priority>,
-    /// Largest payload as advertised.
-    pub max_bytes: Option<u64>,
-    /// Advertised rate in Hz, summed over the writers; `None` where one of them gives none.
-    pub rate_hz: Option<f64>,
     /// Advertised as reliable.
     pub reliable: bool,
-    /// Samples kept per writer.
+    /// Samples kept per writer for late joiners.
     pub depth: u32,
     /// Lifespan in milliseconds; 0 = none.
     pub lifespan_ms: u32,
+}
+
+impl TopicInfo {
+    /// What is said on the scope that a bare message came from.
+    #[must_use]
+    pub fn bare(&self, from: Scope) -> &BareInfo {
+        match from {
+            Scope::Node => &self.node,
+            Scope::Layer | Scope::Inter => &self.layer,
+        }
+    }
 }
 
 /// Where a bridge writes.
 pub enum Sink {
     /// A local broker.
     Publish {
-        /// Writer of the channel.
-        publisher: Arc<dyn Publisher>,
+        /// Writer of the channel, of this bridge alone; absent while it cannot be made, and when the bridge has ended.
+        writer: Option<Writer>,
+        /// Writers that were replaced and have not delivered all yet.
+        past: Vec<Writer>,
         /// Payloads only.
         bare: bool,
     },
@@ -71,6 +93,11 @@ pub enum Phase {
         /// Until then at most.
         until: Instant,
     },
+    /// Its writer cannot be made: the reason is with the bridge.
+    Failed {
+        /// Since when.
+        since: Instant,
+    },
     /// Its counters alone remain.
     Ended,
 }
@@ -85,6 +112,10 @@ pub struct BridgeState {
     pub lane: LaneSpec,
     /// Whether it takes messages in.
     pub phase: Phase,
+    /// Why it failed.
+    pub failure: Option<String>,
+    /// When it ended, if it did.
+    pub ended: Option<Instant>,
     /// Thins to `max_rate_hz`.
     pub bucket: Option<TokenBucket>,
     /// Where it writes.
@@ -113,7 +144,33 @@ impl BridgeState {
         match self.phase {
             Phase::Up { .. } => true,
             Phase::Draining { .. } => self.from == Scope::Inter,
-            Phase::Ended => false,
+            Phase::Failed { .. } | Phase::Ended => false,
+        }
+    }
+
+    /// Whether it has ended and nothing of it waits for a broker.
+    #[must_use]
+    pub fn is_over(&self) -> bool {
+        let waits = match &self.sink {
+            Sink::Publish { writer, past, .. } => writer.is_some() || !past.is_empty(),
+            Sink::Lane { .. } => false,
+        };
+        self.phase == Phase::Ended && !waits
+    }
+
+    /// Whether it ended so long ago that another bridge may have its place.
+    #[must_use]
+    pub fn is_forgotten(&self, now: Instant) -> bool {
+        let long_ago = |ended| now.saturating_duration_since(ended) >= FORGET;
+        self.is_over() && self.ended.is_some_and(long_ago)
+    }
+
+    /// Its lane, if it writes to one.
+    #[must_use]
+    pub fn lane_id(&self) -> Option<LaneId> {
+        match self.sink {
+            Sink::Lane { lane, .. } => Some(lane),
+            Sink::Publish { .. } => None,
         }
     }
 
@@ -143,6 +200,10 @@ pub struct TopicPath {
     pub ingress_drops: Drops,
     /// Identity that the flow gives to bare messages, per source scope.
     pub bare: BTreeMap<Scope, (WriterId, u64)>,
+    /// Since when nobody has used it.
+    pub(super) idle: Option<Instant>,
+    /// It was forgotten: its place waits for another topic.
+    pub(super) vacant: bool,
 }
 
 impl TopicPath {
@@ -157,7 +218,15 @@ impl TopicPath {
             in_rate: RateMeter::new(now),
             ingress_drops: Drops::default(),
             bare: BTreeMap::new(),
+            idle: None,
+            vacant: false,
         }
+    }
+
+    /// Whether nothing goes through it and nothing waits.
+    #[must_use]
+    pub fn is_idle(&self) -> bool {
+        self.bridges.iter().all(|bridge| bridge.is_over())
     }
 
     /// Size that decides the class: the largest seen, else as advertised.

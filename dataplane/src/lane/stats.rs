@@ -1,4 +1,5 @@
-//! Counters of one bridge. For each of them `in = out + Σ dropped + queued` holds at any time.
+//! Counters of one bridge. For each of them `in = out + Σ dropped + queued` holds at any time; what brokers' adapters did since
+//! is in them after [`BridgeState::settle`](super::path::BridgeState::settle).
 
 use blaze_domain::DropReason;
 
@@ -81,7 +82,7 @@ pub struct Lately {
 pub struct BridgeStats {
     /// Taken in.
     pub taken: Count,
-    /// Written to the destination; on the link of reliable or chunked messages: acknowledged.
+    /// Written to the destination: the broker's server has it; on the link of reliable or chunked messages: acknowledged.
     pub out: Count,
     /// Dropped, by reason.
     pub dropped: Drops,

@@ -39,6 +39,45 @@ pub struct TopicPlan {
     pub blocked: Vec<Blocked>,
 }
 
+impl TopicPlan {
+    /// Whether a bridge reads or writes the layer scope.
+    #[must_use]
+    pub fn uses_layer(&self) -> bool {
+        self.bridges.iter().any(Bridge::uses_layer)
+    }
+
+    /// Makes no bridge from or to the layer scope, because its broker cannot have the topic; says so to the layer, and to
+    /// the own node if it was to get the topic from there.
+    pub fn block_layer(&mut self, me: &FlowId, code: WhyCode, detail: &str) {
+        let blocked = |to| Blocked {
+            to,
+            code,
+            detail: detail.to_owned(),
+        };
+        let (gone, kept): (Vec<Bridge>, Vec<Bridge>) = std::mem::take(&mut self.bridges)
+            .into_iter()
+            .partition(Bridge::uses_layer);
+        self.bridges = kept;
+        if !gone.is_empty() {
+            self.blocked.push(blocked(Destination::Layer(me.layer.clone())));
+        }
+        if gone.iter().any(|bridge| matches!(bridge.to, Target::Node { .. })) {
+            self.blocked.push(blocked(Destination::Flow(me.clone())));
+        }
+        self.blocked.sort();
+        self.blocked
+            .dedup_by(|next, kept| next.to == kept.to && next.code == kept.code);
+    }
+}
+
+impl Bridge {
+    /// Whether it reads or writes the layer scope.
+    #[must_use]
+    pub fn uses_layer(&self) -> bool {
+        self.from == Scope::Layer || self.to == Target::Layer
+    }
+}
+
 /// One way of a topic through the flow.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bridge {

@@ -9,6 +9,8 @@ use blaze_domain::control::{
 };
 use blaze_domain::{FlowId, InstanceName, LayerName, NodeName, Scope, ServiceName, TopicName};
 
+use super::holder::{key_of, lease_of};
+
 /// Most lapsed leases that are remembered for people who ask why a topic stopped.
 const MAX_LAPSED: usize = 1024;
 
@@ -151,11 +153,21 @@ pub struct LapsedLease {
 
 /// All leases of one flow, bounded.
 pub(super) struct LeaseTable {
-    topics: BTreeMap<TopicName, BTreeMap<LeaseKey, Lease>>,
-    expiry: BTreeSet<(Instant, TopicName, LeaseKey)>,
+    pub(super) topics: BTreeMap<TopicName, BTreeMap<LeaseKey, Lease>>,
+    pub(super) expiry: BTreeSet<(Instant, TopicName, LeaseKey)>,
     count: usize,
-    limit: usize,
+    pub(super) limit: usize,
     lapsed: VecDeque<LapsedLease>,
+    /// Scopes whose broker keeps leases.
+    pub(super) stores: BTreeSet<Scope>,
+    /// Leases that are to be written to or removed from the broker that keeps them.
+    pub(super) unsaved: BTreeSet<(TopicName, LeaseKey)>,
+    /// Scopes whose kept leases are being read.
+    pub(super) reading: BTreeSet<Scope>,
+    /// Leases that ended while those of their scope were being read: what is read of them is old.
+    pub(super) ended: BTreeSet<(TopicName, LeaseKey)>,
+    /// Scopes whose broker is away.
+    pub(super) not_renewable: BTreeSet<Scope>,
 }
 
 /// What a message did to the table.
@@ -167,14 +179,35 @@ pub(super) struct Applied {
 }
 
 impl LeaseTable {
-    pub(super) fn new(limit: usize) -> Self {
+    /// A table without leases; those that the brokers of `stores` keep are still to be read.
+    pub(super) fn new(limit: usize, stores: BTreeSet<Scope>) -> Self {
         Self {
             topics: BTreeMap::new(),
             expiry: BTreeSet::new(),
             count: 0,
             limit,
             lapsed: VecDeque::new(),
+            unsaved: BTreeSet::new(),
+            reading: stores.clone(),
+            stores,
+            ended: BTreeSet::new(),
+            not_renewable: BTreeSet::new(),
         }
+    }
+
+    pub(super) fn get<'a>(&'a self, topic: &'a TopicName, key: &'a LeaseKey) -> Option<LeaseView<'a>> {
+        let lease = self.topics.get(topic)?.get(key)?;
+        Some(view(topic, key, lease))
+    }
+
+    /// Whether any lease of the topic is of that scope.
+    pub(super) fn has(&self, topic: &TopicName, scope: Scope) -> bool {
+        let leases = self.topics.get(topic);
+        leases.is_some_and(|leases| leases.keys().any(|key| key.scope == scope))
+    }
+
+    pub(super) fn topics(&self) -> impl Iterator<Item = &TopicName> {
+        self.topics.keys()
     }
 
     pub(super) fn len(&self) -> usize {
@@ -190,57 +223,31 @@ impl LeaseTable {
         message: &ControlMessage,
         pointer: &str,
     ) -> Result<Applied, ControlError> {
-        let common = message.common();
-        let (layer, node) = holder(scope, me, common, pointer)?;
-        let key = |kind| LeaseKey {
-            scope,
-            kind,
-            layer: layer.clone(),
-            node: node.clone(),
-            service: common.service.clone(),
-            instance: common.instance.clone(),
-        };
-        let (kind, ttl_s, terms) = match message {
-            ControlMessage::Advertise(message) => (
-                LeaseKind::Advertise,
-                message.ttl_s,
-                Terms::Advertise {
-                    rate_hz: message.rate_hz,
-                    max_bytes: message.max_bytes,
-                    quality: message.quality.clone(),
-                },
-            ),
-            ControlMessage::Request(message) => (
-                LeaseKind::Request,
-                message.ttl_s,
-                Terms::Request {
-                    max_rate_hz: message.max_rate_hz,
-                    bare: message.bare,
-                    from: message.from.clone(),
-                    quality: message.quality.clone(),
-                },
-            ),
-            ControlMessage::Withdraw(message) => {
-                let kinds = message.kind.as_ref().map_or(LeaseKind::ALL, std::slice::from_ref);
-                let keys: Vec<LeaseKey> = kinds.iter().copied().map(key).collect();
-                return self.withdraw(&common.topic, &keys, common.epoch, pointer);
-            }
-        };
-        let lease = Lease {
-            epoch: common.epoch,
-            ttl_s,
-            expires_at: (ttl_s > 0).then(|| now + Duration::from_secs(ttl_s.into())),
-            terms,
-        };
-        let changed = self.grant(&common.topic, key(kind), lease, pointer)?;
-        Ok(Applied {
-            lease_s: ttl_s,
-            changed,
-        })
+        if let ControlMessage::Withdraw(withdraw) = message {
+            let kinds = withdraw.kind.as_ref().map_or(LeaseKind::ALL, std::slice::from_ref);
+            let keys: Result<Vec<LeaseKey>, ControlError> = kinds
+                .iter()
+                .map(|kind| key_of(scope, me, *kind, &withdraw.common, pointer))
+                .collect();
+            return self.withdraw(&withdraw.common.topic, &keys?, withdraw.common.epoch, pointer);
+        }
+        let (topic, key, lease) = lease_of(now, scope, me, message, pointer)?;
+        let lease_s = lease.ttl_s;
+        let changed = self.grant(topic, key, lease, pointer)?;
+        Ok(Applied { lease_s, changed })
     }
 
-    fn grant(&mut self, topic: &TopicName, key: LeaseKey, lease: Lease, pointer: &str) -> Result<bool, ControlError> {
+    pub(super) fn grant(
+        &mut self,
+        topic: &TopicName,
+        key: LeaseKey,
+        lease: Lease,
+        pointer: &str,
+    ) -> Result<bool, ControlError> {
         let held = self.topics.get(topic).and_then(|leases| leases.get(&key));
+        // A mere renewal changes nothing of what is kept.
+        let unsaved =
+            held.is_none_or(|held| (held.epoch, held.ttl_s) != (lease.epoch, lease.ttl_s) || held.terms != lease.terms);
         let changed = match held {
             Some(held) => {
                 check_epoch(held, lease.epoch, pointer)?;
@@ -264,6 +271,14 @@ impl LeaseTable {
         if let Some(at) = lease.expires_at {
             self.expiry.insert((at, topic.clone(), key.clone()));
         }
+        if self.stores.contains(&key.scope) {
+            let entry = (topic.clone(), key.clone());
+            self.ended.remove(&entry);
+            // While those of the broker are being read nobody knows what it keeps of this one.
+            if unsaved || self.reading.contains(&key.scope) {
+                self.unsaved.insert(entry);
+            }
+        }
         self.topics.entry(topic.clone()).or_default().insert(key, lease);
         Ok(changed)
     }
@@ -283,7 +298,12 @@ impl LeaseTable {
         }
         let mut changed = false;
         for key in keys {
-            changed |= self.remove(topic, key);
+            let removed = self.remove(topic, key);
+            // One that is not known here may be among those that are still being read.
+            if removed || self.reading.contains(&key.scope) {
+                self.note_end(topic, key);
+            }
+            changed |= removed;
         }
         Ok(Applied { lease_s: 0, changed })
     }
@@ -312,7 +332,12 @@ impl LeaseTable {
             let Some((at, topic, key)) = self.expiry.pop_first() else {
                 break;
             };
+            if self.not_renewable.contains(&key.scope) {
+                self.renew(now, &topic, &key);
+                continue;
+            }
             self.remove(&topic, &key);
+            self.note_end(&topic, &key);
             lapsed.push(LapsedLease { topic, key, at });
         }
         for lease in &lapsed {
@@ -373,29 +398,4 @@ fn check_epoch(held: &Lease, epoch: u64, pointer: &str) -> Result<(), ControlErr
         ));
     }
     Ok(())
-}
-
-/// Layer and node of whoever speaks: where it was received, unless it says otherwise and may.
-fn holder(
-    scope: Scope,
-    me: &FlowId,
-    common: &Common,
-    pointer: &str,
-) -> Result<(LayerName, Option<NodeName>), ControlError> {
-    let mismatch = |field: &str, found: &str, here: &str| {
-        Err(ControlError::new(
-            ErrorCode::SourceMismatch,
-            format!("{pointer}/{field}"),
-            format!("{found} is not the {field} where the message was received, {here}"),
-        ))
-    };
-    match &common.layer {
-        Some(layer) if *layer != me.layer => return mismatch("layer", layer.as_str(), me.layer.as_str()),
-        _ => {}
-    }
-    match (scope, &common.node) {
-        (Scope::Node, Some(node)) if *node != me.node => mismatch("node", node.as_str(), me.node.as_str()),
-        (Scope::Node, _) => Ok((me.layer.clone(), Some(me.node.clone()))),
-        (Scope::Layer | Scope::Inter, node) => Ok((me.layer.clone(), node.clone())),
-    }
 }

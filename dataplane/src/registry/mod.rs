@@ -9,32 +9,41 @@
 //! that each call reports as changed. Poll after every message and at [`Registry::next_poll`].
 
 mod announce;
+mod holder;
+mod kept;
 mod leases;
 mod merge;
+mod names;
 mod peers;
 mod pieces;
 mod pull;
 mod remote;
+mod stored;
 mod types;
 mod wire;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
-use blaze_domain::control::{Answer, ControlError, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload};
+use blaze_domain::control::{
+    Answer, ControlError, ControlMessage, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload,
+};
 use blaze_domain::names::ChannelName;
-use blaze_domain::{FlowId, Scope, TopicName};
+use blaze_domain::{Durability, FlowId, Scope, TopicName};
 use blaze_proto::link::link_control::{Body, RouteState};
 
 use announce::{Announcer, MAX_LEASED_ENTRIES};
 use leases::LeaseTable;
 pub use leases::{LapsedLease, LeaseKey, LeaseView, Terms};
+use names::NameBook;
+pub use names::{LayerNames, NameFault, peers_channel};
 pub use peers::MAX_FLOWS;
 pub use pieces::MAX_LINK_CONTROL_BYTES;
 use remote::Remote;
+pub use stored::{Restored, UnsavedLease};
 pub use types::{AnswerOut, Changes, ControlOutcome, EventDraft, RegistryConfig, RemoteLease, SyncFaults};
 
-use crate::world::{FlowState, FlowView, Reach, World};
+use crate::world::{FlowState, FlowView, Reach, ScopeEntry, World};
 
 /// All that a flow knows of who publishes and who wants which topic.
 pub struct Registry {
@@ -46,6 +55,11 @@ pub struct Registry {
     world: World,
     outgoing: VecDeque<(FlowId, Body)>,
     faults: SyncFaults,
+    names: NameBook,
+    /// Topics that a bridge of this flow reads from or writes to the layer scope.
+    on_layer: BTreeSet<TopicName>,
+    /// Scopes that belong to another flow: for the world they are not there.
+    off: BTreeSet<Scope>,
 }
 
 impl Registry {
@@ -62,7 +76,10 @@ impl Registry {
             topics: BTreeMap::new(),
         };
         Self {
-            leases: LeaseTable::new(config.max_leases.min(MAX_LEASED_ENTRIES)),
+            leases: LeaseTable::new(config.max_leases.min(MAX_LEASED_ENTRIES), config.lease_stores.clone()),
+            names: NameBook::new(config.layer_names),
+            on_layer: BTreeSet::new(),
+            off: BTreeSet::new(),
             routes: BTreeMap::new(),
             announcer: Announcer::default(),
             remotes: BTreeMap::new(),
@@ -186,6 +203,15 @@ impl Registry {
                 "is required here with reply_to, because answers share one channel",
             ));
         }
+        if !matches!(message, ControlMessage::Withdraw(_)) {
+            self.claim_name(scope, &common.topic).map_err(|fault| {
+                let code = match fault {
+                    NameFault::TooLong { .. } => ErrorCode::NameNotExpressible,
+                    NameFault::Collision { .. } => ErrorCode::NameCollision,
+                };
+                ControlError::new(code, format!("{}/topic", object.pointer), fault.to_string())
+            })?;
+        }
         let applied = self
             .leases
             .apply(now, scope, &self.config.me, message, &object.pointer)?;
@@ -194,6 +220,59 @@ impl Registry {
         }
         touched.insert(common.topic.clone());
         Ok(applied.lease_s)
+    }
+
+    /// Takes a topic's name on the layer broker, where the topic is to be on it.
+    fn claim_name(&mut self, scope: Scope, topic: &TopicName) -> Result<(), NameFault> {
+        if scope != Scope::Layer {
+            return Ok(());
+        }
+        let (leases, on_layer) = (&self.leases, &self.on_layer);
+        self.names.claim(topic, |other| {
+            on_layer.contains(other) || leases.has(other, Scope::Layer)
+        })
+    }
+
+    /// A bridge of this flow is to read or write a topic on the layer scope, whether or not anybody leases it there.
+    ///
+    /// # Errors
+    /// [`NameFault`] where the layer broker cannot have it.
+    pub fn put_on_layer(&mut self, topic: &TopicName) -> Result<(), NameFault> {
+        self.claim_name(Scope::Layer, topic)?;
+        self.on_layer.insert(topic.clone());
+        Ok(())
+    }
+
+    /// No bridge of this flow uses the topic on the layer scope any more.
+    pub fn take_off_layer(&mut self, topic: &TopicName) {
+        self.on_layer.remove(topic);
+    }
+
+    /// A scope belongs to another flow, or no longer does: for everybody it is as if it were not there, its leases stay.
+    /// Returns the topics to plan anew.
+    pub fn set_in_use(&mut self, now: Instant, scope: Scope, in_use: bool) -> BTreeSet<TopicName> {
+        let changes = if in_use {
+            self.off.insert(scope)
+        } else {
+            self.off.remove(&scope)
+        };
+        if !changes {
+            return BTreeSet::new();
+        }
+        let (node_scope, layer_scope) = (self.config.node_scope, self.config.layer_scope);
+        let (node_off, layer_off) = (self.off.contains(&Scope::Node), self.off.contains(&Scope::Layer));
+        if let Some(own) = self.own_view() {
+            own.node_scope = node_scope && !node_off;
+            own.layer_scope = layer_scope.filter(|_| !layer_off);
+        }
+        self.refresh(now, self.leases.topics().cloned().collect());
+        self.all_topics()
+    }
+
+    /// Whether the kept leases of a scope are still to be read.
+    #[must_use]
+    pub fn is_reading(&self, scope: Scope) -> bool {
+        self.leases.is_reading(scope)
     }
 
     /// Whether this flow answers, of all that share the layer broker: the same one in every flow with the same view.
@@ -221,7 +300,12 @@ impl Registry {
     fn refresh(&mut self, now: Instant, dirty: BTreeSet<TopicName>) -> BTreeSet<TopicName> {
         let mut changed = BTreeSet::new();
         for topic in dirty {
-            let merged = merge::merge(&self.leases.of_topic(&topic));
+            let mut merged = merge::merge(&self.leases.of_topic(&topic));
+            for (scope, entry) in [(Scope::Node, &mut merged.node), (Scope::Layer, &mut merged.layer)] {
+                if self.off.contains(&scope) {
+                    *entry = ScopeEntry::default();
+                }
+            }
             let Some(own) = self.world.flows.get_mut(&self.config.me) else {
                 continue;
             };
@@ -263,6 +347,18 @@ impl Registry {
     #[must_use]
     pub fn next_expiry(&self) -> Option<Instant> {
         self.leases.next_expiry()
+    }
+
+    /// The most samples that an advertisement of the topic on that scope keeps per writer for late joiners, 0 = none; `None`
+    /// where nobody leases the topic there.
+    #[must_use]
+    pub fn channel_depth(&self, topic: &TopicName, scope: Scope) -> Option<u32> {
+        let of_scope = self.leases.of_topic(topic).filter(|lease| lease.key.scope == scope);
+        let depth = |lease: LeaseView<'_>| match (lease.key.kind, lease.quality().durability) {
+            (LeaseKind::Advertise, Durability::TransientLocal) => lease.quality().depth,
+            _ => 0,
+        };
+        of_scope.map(depth).max()
     }
 
     /// All leases, by topic.

@@ -9,6 +9,7 @@ use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
 use serde_json::Value;
 
 use super::leases::LapsedLease;
+use super::names::LayerNames;
 use crate::world::{Advertise, LayerScopeId, Request};
 
 /// What a registry is told once.
@@ -28,6 +29,10 @@ pub struct RegistryConfig {
     pub max_leases: usize,
     /// Answers on the layer scope share one channel (Kafka, DDS): a message that wants one must have an `id`.
     pub layer_answers_need_id: bool,
+    /// What the layer broker makes of topic names.
+    pub layer_names: LayerNames,
+    /// Scopes whose broker keeps leases; they are to be read.
+    pub lease_stores: BTreeSet<Scope>,
     /// When the flow started.
     pub started: Instant,
 }
@@ -75,7 +80,7 @@ pub struct ControlOutcome {
     pub events: Vec<EventDraft>,
     /// Topics whose own entry in the world changed.
     pub changed: BTreeSet<TopicName>,
-    /// Topics with a lease that was granted, renewed or withdrawn: what is persisted is to be written again.
+    /// Topics with a lease that was granted, renewed or withdrawn: their channels are in use.
     pub touched: BTreeSet<TopicName>,
     /// Objects that were refused; 1 for a payload that is none.
     pub faults: u64,

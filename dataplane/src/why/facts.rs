@@ -80,6 +80,8 @@ pub struct BrokerFacts {
     pub name: String,
     /// Whether it works.
     pub health: BrokerHealth,
+    /// Where it does not: the last error, or whose the scope is.
+    pub detail: String,
     /// It loses messages of reliable topics (Redis Pub/Sub).
     pub at_most_once: bool,
 }

@@ -19,7 +19,7 @@ pub use facts::{BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, 
 
 use crate::plan::{Group, Pairing, Publisher, Requester, TopicView};
 use crate::world::{FlowState, FlowView, Reach};
-use trace::{Trace, Tracer};
+use trace::{Trace, Tracer, fault};
 
 /// Pairs of publisher and requester that are looked at; those that the flow has a part in come first.
 const MAX_PAIRS: usize = 256;
@@ -192,10 +192,9 @@ impl<'w> Explainer<'_, 'w> {
         });
         let (flow, code, detail) = match lost {
             Some((id, flow)) => (id, absent(flow), absence(id, flow)),
-            None => match self.hint(StepKind::Advertise) {
-                Some(hint) => (&hint.flow, hint.code, format!("{} of {}", hint.code, hint.service)),
-                None => (self.view.me, WhyCode::NoAdvertise, "nobody advertises it".to_owned()),
-            },
+            None => self.missing(StepKind::Advertise, WhyCode::NoAdvertise, || {
+                "nobody advertises it".to_owned()
+            }),
         };
         Err(Trace::failed(flow, StepKind::Advertise, code, detail))
     }
@@ -219,17 +218,11 @@ impl<'w> Explainer<'_, 'w> {
         if !found.is_empty() {
             return Ok(found);
         }
-        let (flow, code, detail) = match self.hint(StepKind::Request) {
-            Some(hint) => (&hint.flow, hint.code, format!("{} of {}", hint.code, hint.service)),
-            None => {
-                let place = self
-                    .input
-                    .to
-                    .as_ref()
-                    .map_or_else(String::new, |to| format!(" in {to}"));
-                (self.view.me, WhyCode::NoRequest, format!("nobody{place} requests it"))
-            }
-        };
+        let (flow, code, detail) = self.missing(StepKind::Request, WhyCode::NoRequest, || {
+            let to = self.input.to.as_ref();
+            let place = to.map_or_else(String::new, |to| format!(" in {to}"));
+            format!("nobody{place} requests it")
+        });
         Err(Trace::failed(flow, StepKind::Request, code, detail))
     }
 
@@ -273,6 +266,26 @@ impl<'w> Explainer<'_, 'w> {
         };
         let node_asks = || all.iter().any(|other| other.scope == Scope::Node && in_node(other));
         in_node(requester) && (to.node.is_none() || requester.scope == Scope::Node || !node_asks())
+    }
+
+    /// Why a lease is missing: nobody is heard on a scope that is another flow's, it lapsed, or there never was one.
+    fn missing(&self, kind: StepKind, code: WhyCode, nobody: impl Fn() -> String) -> (&FlowId, WhyCode, String) {
+        let me = self.view.me;
+        let to = self.input.to.as_ref().filter(|_| kind == StepKind::Request);
+        let brokers = [&self.input.node_broker, &self.input.layer_broker];
+        let mut in_use = brokers
+            .into_iter()
+            .flatten()
+            .filter(|broker| broker.health == BrokerHealth::InUse);
+        if to.is_none_or(|to| to.layer == me.layer)
+            && let Some((code, detail)) = in_use.find_map(fault)
+        {
+            return (me, code, detail);
+        }
+        match self.hint(kind) {
+            Some(hint) => (&hint.flow, hint.code, format!("{} of {}", hint.code, hint.service)),
+            None => (me, code, nobody()),
+        }
     }
 
     fn hint(&self, kind: StepKind) -> Option<&LeaseHint> {

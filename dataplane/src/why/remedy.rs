@@ -27,25 +27,35 @@ pub(super) fn remedy(code: WhyCode) -> &'static str {
         WhyCode::BridgeStarting => {
             "Wait a moment: the bridge, or its flow, is starting; if it stays, read the flow's log."
         }
-        WhyCode::BridgeFailed => "Read the step's detail and the flow's log: the broker refused what the bridge needs.",
+        WhyCode::BridgeFailed => {
+            "Read the step's detail: the broker refused what the bridge needs; it is tried again every 5 s."
+        }
         WhyCode::TypeMismatch => "Let publisher and requester give the same `type` and `type_hash`, or leave them out.",
         WhyCode::QosMismatch => {
             "It flows as offered: let the publisher advertise the reliability and durability that is asked for."
         }
-        WhyCode::NameNotExpressible => "Rename the topic: this broker cannot express its name.",
-        WhyCode::NameCollision => "Rename one of the two topics: the broker has one name for both.",
+        WhyCode::NameNotExpressible => {
+            "Rename the topic, or shorten the broker's `prefix`: this broker cannot express its name."
+        }
+        WhyCode::NameCollision => {
+            "Rename one of the two topics, which the step names: the broker has one name for both."
+        }
         WhyCode::AccessDenied => "Let the operator allow this service to use the topic.",
         WhyCode::BudgetStarved => {
             "Raise `flow.bandwidth.limit_mbps`, or lower the rate or size of the topics that use it up (`/v1/allocation`)."
         }
         WhyCode::RateLimited => {
-            "It flows slower than published: raise `flow.bandwidth.limit_mbps` or ask for less (`/v1/allocation`)."
+            "It flows slower than published: raise `flow.bandwidth.limit_mbps` or ask for less (`/v1/allocation`); at `deliver` the broker is the slow one."
         }
-        WhyCode::TooLarge => "Make the messages smaller, or raise the broker's limit: they are larger than it carries.",
+        WhyCode::TooLarge => {
+            "Make the messages smaller, or raise the broker's limit (Kafka: `max.message.bytes` of the topic): they are larger than it carries."
+        }
         WhyCode::Lifespan => {
-            "Messages are too old when it is their turn: raise `lifespan_ms`, or the rate of the link."
+            "Messages are too old when it is their turn: raise `lifespan_ms`, or find where they wait (`queued` of `/v1/bridges`)."
         }
-        WhyCode::BrokerDown => "Start the broker of this scope, or correct its address in the node file.",
+        WhyCode::BrokerDown => {
+            "Start the broker of this scope, or correct its address in the node file; `/readyz` says since when it is away."
+        }
         WhyCode::ScopeInUse => {
             "Give each node and each layer a broker or a `prefix` of its own: another flow uses this one."
         }

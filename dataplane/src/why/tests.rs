@@ -25,6 +25,7 @@ impl Setup {
         let broker = |name: &str, at_most_once| BrokerFacts {
             name: name.to_owned(),
             health: BrokerHealth::Up,
+            detail: String::new(),
             at_most_once,
         };
         let mut setup = Self {
@@ -69,6 +70,16 @@ impl Setup {
             step,
             ok: code == WhyCode::Ok,
             code,
+        });
+    }
+
+    fn block_layer(&mut self, code: WhyCode) {
+        self.plan.block_layer(&self.world.me, code, "it is another's");
+        let plan = &self.plan;
+        self.bridges.retain(|facts| {
+            plan.bridges
+                .iter()
+                .any(|bridge| (bridge.from, &bridge.to) == (facts.from, &facts.to))
         });
     }
 
@@ -174,6 +185,29 @@ fn rows() -> Vec<Row> {
         "another broker is away": PAIR, |s| s.layer_broker.health = BrokerHealth::Down => Flowing Ok;
         "another flow uses the source": PAIR, |s| s.node_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Bridge;
         "another flow uses the target": &["e/a@1 node+ layer-"], |s| s.layer_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Deliver;
+        "another flow uses the scope where it would be advertised": &["e/a@1 layer-"], |s| s.node_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Advertise;
+        "another flow uses the scope where it would be requested": &["e/a@1 node+"], |s| s.layer_broker.health = BrokerHealth::InUse => NotFlowing ScopeInUse Request;
+        "what a scope that is in use has to do with another layer": &["e/a@1 node+"], |s| { s.layer_broker.health = BrokerHealth::InUse; s.to = Some("c"); } => NotFlowing NoRequest Request;
+        "a lease that lapsed because the scope is another's": &["e/a@1 layer-"], |s| {
+            s.node_broker.health = BrokerHealth::InUse;
+            s.hint(StepKind::Advertise, WhyCode::LeaseExpired);
+        } => NotFlowing ScopeInUse Advertise;
+        "the target broker is away and its queue is full": FROM_CLOUD, |s| {
+            s.node_broker.health = BrokerHealth::Down;
+            s.drops(DropReason::QueueFull, 0);
+        } => NotFlowing BrokerDown Deliver;
+        "the broker is slower than the publisher": FROM_CLOUD, |s| s.drops(DropReason::QueueFull, 4) => Degraded RateLimited Deliver;
+        "larger than the topic of the broker carries": FROM_CLOUD, |s| s.drops(DropReason::TooLarge, 0) => NotFlowing TooLarge Admit;
+        "a name that is another's on the layer broker": &["e/a@1 node+", "e/b@1 node-"], |s| s.block_layer(WhyCode::NameCollision) => NotFlowing NameCollision Plan;
+        "a name that the layer broker cannot have": &["e/a@1 node+ layer-"], |s| s.block_layer(WhyCode::NameNotExpressible) => NotFlowing NameNotExpressible Plan;
+        "a way from the layer that it cannot have": &["e/b@1 node-", "e/a@1 node+"], |s| s.block_layer(WhyCode::NameCollision) => NotFlowing NameCollision Plan;
+        "a way past the layer that cannot have it": PAIR, |s| s.block_layer(WhyCode::NameCollision) => Flowing Ok;
+        "the writer's flow says that its layer broker cannot have it": &["e/b@1 node-", "e/a@1 node+"], |s| s.route("e/a", None, StepKind::Plan, WhyCode::NameCollision) => NotFlowing NameCollision Plan;
+        "the receiver says that its broker is away": PAIR, |s| s.route("c/b", Some("c/b"), StepKind::Deliver, WhyCode::BrokerDown) => NotFlowing BrokerDown Deliver;
+        "the receiver delivers in one way and not in the other": PAIR, |s| {
+            s.route("c/b", Some("c/b"), StepKind::Deliver, WhyCode::Ok);
+            s.route("c/b", Some("c/b"), StepKind::Deliver, WhyCode::ScopeInUse);
+        } => NotFlowing ScopeInUse Deliver;
         "no budget at all": PAIR, |s| s.drops(DropReason::RateLimit, 0) => NotFlowing BudgetStarved Admit;
         "less budget than rate": PAIR, |s| s.drops(DropReason::RateLimit, 4) => Degraded RateLimited Admit;
         "thinned as asked": PAIR, |s| s.drops(DropReason::MaxRate, 4) => Flowing Ok;
@@ -265,7 +299,7 @@ fn the_answer_has_the_keys_of_the_contract_in_their_order() {
     let text = serde_json::to_string(&setup.why()).unwrap();
     let expected = concat!(
         r#"{"topic":"imu/data","to":"c/b","verdict":"not_flowing","code":"bridge_failed","remedy":"Read the step's "#,
-        r#"detail and the flow's log: the broker refused what the bridge needs.","steps":["#,
+        r#"detail: the broker refused what the bridge needs; it is tried again every 5 s.","steps":["#,
         r#"{"flow":"e/a","step":"advertise","ok":true,"code":"ok","detail":"driver on node scope"},"#,
         r#"{"flow":"c/b","step":"request","ok":true,"code":"ok","detail":"on node scope"},"#,
         r#"{"flow":"e/a","step":"plan","ok":true,"code":"ok","detail":"they match"},"#,
@@ -274,6 +308,23 @@ fn the_answer_has_the_keys_of_the_contract_in_their_order() {
     assert_eq!(text, expected);
     setup.to = None;
     assert!(serde_json::to_string(&setup.why()).unwrap().contains(r#""to":null"#));
+}
+
+#[test]
+fn a_broker_that_is_another_s_or_away_is_described() {
+    let mut setup = Setup::new(world(PAIR));
+    setup.node_broker = BrokerFacts {
+        name: "redis".to_owned(),
+        health: BrokerHealth::InUse,
+        detail: "edge/robot-7 holds it".to_owned(),
+        at_most_once: true,
+    };
+    let detail = |setup: &Setup| setup.why().steps.iter().find(|step| !step.ok).unwrap().detail.clone();
+    assert_eq!(detail(&setup), "another flow uses this redis: edge/robot-7 holds it");
+    assert!(setup.why().remedy.contains("`prefix`"));
+    setup.node_broker.health = BrokerHealth::Down;
+    setup.node_broker.detail = "connection refused".to_owned();
+    assert_eq!(detail(&setup), "redis does not answer: connection refused");
 }
 
 #[test]

@@ -5,7 +5,9 @@ use std::fmt::Write as _;
 use blaze_domain::{DropReason, FlowId, Reliability, Scope, WhyCode};
 
 use super::{BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, Step, StepKind, Verdict, WhyInput, absence, absent};
-use crate::plan::{Pairing, Publisher, Requester, Target, TopicView, asks_too_much, meets_directly, type_detail};
+use crate::plan::{
+    Blocked, Destination, Pairing, Publisher, Requester, Target, TopicView, asks_too_much, meets_directly, type_detail,
+};
 use crate::world::{FlowState, Reach};
 
 /// The steps of one pair, in the order of a message's way.
@@ -231,10 +233,13 @@ impl<'w> Tracer<'_, 'w> {
             Target::Inter { layer, receiver } => (layer, Some(receiver)),
             Target::Node { .. } | Target::Layer => (&hop.flow.layer, None),
         };
+        // A way that ends in the flow's own layer names the flow itself, or nobody where it is blocked.
         let fits = |route: &&super::RouteFacts| {
-            route.flow == *hop.flow && route.to_layer == *to_layer && route.receiver.as_ref() == receiver
+            let to = route.receiver.as_ref();
+            let same = to == receiver || (receiver.is_none() && to == Some(hop.flow));
+            route.flow == *hop.flow && route.to_layer == *to_layer && same
         };
-        let route = self.input.routes.iter().find(fits);
+        let route = self.input.routes.iter().filter(fits).min_by_key(|route| route.ok);
         let own_layer = self.view.own_layer_publisher().is_some() && hop.from == Scope::Layer;
         if let Some(route) = route {
             let detail = format!("{} says so of its way to {}", hop.flow, describe(&hop.to));
@@ -252,6 +257,9 @@ impl<'w> Tracer<'_, 'w> {
         let way = format!("{} to {}", hop.from, describe(&hop.to));
         if let Some((code, detail)) = self.broker(hop.from).and_then(fault) {
             return trace.add(flow, bridge, false, code, detail);
+        }
+        if let Some(blocked) = self.blocked(hop) {
+            return trace.add(flow, StepKind::Plan, false, blocked.code, blocked.detail.clone());
         }
         let planned = self
             .input
@@ -278,27 +286,34 @@ impl<'w> Tracer<'_, 'w> {
             }
         }
         trace.add(flow, bridge, true, WhyCode::Ok, way);
+        let target = match hop.to {
+            Target::Node { .. } => Scope::Node,
+            Target::Layer => Scope::Layer,
+            Target::Inter { .. } => Scope::Inter,
+        };
+        // A broker that is away explains what was dropped on the way to it.
+        if let Some((code, detail)) = self.broker(target).and_then(fault) {
+            return trace.add(flow, StepKind::Deliver, false, code, detail);
+        }
         if let Some(facts) = facts {
             drops(trace, hop, facts);
         }
         self.link(trace, hop);
-        if let Target::Node { .. } | Target::Layer = hop.to {
-            let scope = if hop.to == Target::Layer {
-                Scope::Layer
-            } else {
-                Scope::Node
-            };
-            match self.broker(scope).and_then(fault) {
-                Some((code, detail)) => trace.add(flow, StepKind::Deliver, false, code, detail),
-                None => trace.add(
-                    flow,
-                    StepKind::Deliver,
-                    true,
-                    WhyCode::Ok,
-                    facts.map_or_else(String::new, counts),
-                ),
-            }
+        if target != Scope::Inter {
+            let counted = facts.map_or_else(String::new, counts);
+            trace.add(flow, StepKind::Deliver, true, WhyCode::Ok, counted);
         }
+    }
+
+    /// Why this flow makes no bridge for a hop over the layer scope, if its broker cannot have the topic.
+    fn blocked(&self, hop: &Hop<'w>) -> Option<&Blocked> {
+        let on_layer = hop.from == Scope::Layer || hop.to == Target::Layer;
+        let of_layer = |blocked: &&Blocked| {
+            let layer = Destination::Layer(self.view.me.layer.clone());
+            let of_name = matches!(blocked.code, WhyCode::NameCollision | WhyCode::NameNotExpressible);
+            blocked.to == layer && of_name
+        };
+        self.input.plan.blocked.iter().filter(|_| on_layer).find(of_layer)
     }
 
     /// Whether the receiver of a hop over the inter scope answers.
@@ -331,11 +346,20 @@ impl<'w> Tracer<'_, 'w> {
     }
 }
 
-fn fault(broker: &BrokerFacts) -> Option<(WhyCode, String)> {
+/// What is wrong with a broker.
+pub(super) fn fault(broker: &BrokerFacts) -> Option<(WhyCode, String)> {
+    let BrokerFacts { name, detail, .. } = broker;
+    let because = |what: String| {
+        if detail.is_empty() {
+            what
+        } else {
+            format!("{what}: {detail}")
+        }
+    };
     match broker.health {
         BrokerHealth::Up => None,
-        BrokerHealth::Down => Some((WhyCode::BrokerDown, format!("{} does not answer", broker.name))),
-        BrokerHealth::InUse => Some((WhyCode::ScopeInUse, format!("another flow uses {}", broker.name))),
+        BrokerHealth::Down => Some((WhyCode::BrokerDown, because(format!("{name} does not answer")))),
+        BrokerHealth::InUse => Some((WhyCode::ScopeInUse, because(format!("another flow uses this {name}")))),
     }
 }
 

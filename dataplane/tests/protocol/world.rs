@@ -4,15 +4,17 @@ use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Content, PublishOutcome, Publisher, Received};
+use blaze_brokers::{Content, PublishOutcome, Publisher, PublisherOptions, Received};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{FlowId, LayerKind, Origin, Priority, Scope, TopicName, WriterId};
 use blaze_flow::control::{ControlConfig, ControlCore, Output};
 use blaze_flow::flow::plane::PlaneState;
 use blaze_flow::lane::core::{DataConfig, DataCore};
+use blaze_flow::lane::writer::NewWriter;
 use blaze_flow::link::transport::Endpoint;
 use blaze_flow::link::{Engine, EngineConfig, Limits};
 use blaze_flow::plan::{PlanRules, Target};
+use blaze_flow::registry::LayerNames;
 use blaze_flow::world::{FlowState, LayerScopeId};
 use blaze_proto::link::link_control::{LayerScope, State};
 use blaze_proto::{Frame, Header};
@@ -192,6 +194,8 @@ impl<'a> Simulation<'a> {
                 layer_scope: Some(layer_scope),
                 inter_scope: true,
                 layer_answers_need_id: false,
+                layer_names: LayerNames::Any,
+                lease_stores: BTreeSet::new(),
                 rules: PlanRules::default(),
             },
             self.now,
@@ -513,7 +517,11 @@ impl<'a> Simulation<'a> {
         while let Some(output) = flow.control.poll() {
             let Some(engine) = &mut flow.plane.engine else { continue };
             match output {
-                Output::Publish { .. } => {}
+                Output::Publish { .. }
+                | Output::LayerScope { .. }
+                | Output::SaveLease(_)
+                | Output::Prepare { .. }
+                | Output::Release { .. } => {}
                 Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
                 Output::Announce { version, digest } => engine.set_registry(now, version, digest),
                 Output::State(state) => engine.set_state(now, hello_state(state)),
@@ -521,16 +529,19 @@ impl<'a> Simulation<'a> {
                     let Some(id) = flow.plane.core.intern(&topic, now) else {
                         continue;
                     };
-                    flow.plane.core.apply(now, id, *info, &plan, |target| {
-                        let scope = match target {
+                    flow.plane.core.apply(now, id, *info, &plan, |bridge| {
+                        let scope = match bridge.to {
                             Target::Layer => Scope::Layer,
                             _ => Scope::Node,
                         };
-                        let scope = Arc::clone(&scopes[&scope]);
-                        Some(Arc::new(ScopeWriter {
-                            scope,
+                        let writer = ScopeWriter {
+                            scope: Arc::clone(&scopes[&scope]),
                             topic: topic.clone(),
-                        }) as Arc<dyn Publisher>)
+                        };
+                        Ok(NewWriter {
+                            publisher: Arc::new(writer),
+                            options: PublisherOptions::default(),
+                        })
                     });
                     for scope in [Scope::Node, Scope::Layer] {
                         if flow.plane.core.path(id).reads(scope) {

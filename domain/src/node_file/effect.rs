@@ -8,9 +8,7 @@ const NOT_YET: &str = "not in effect in this version";
 
 /// Sections without effect, each worth one warning.
 const SECTIONS: &[&str] = &[
-    "brokers.node.redis",
     "brokers.layer.dds",
-    "brokers.layer.kafka",
     "brokers.plugins",
     "config",
     "cache",

@@ -83,7 +83,6 @@ fn the_example_is_read_whole() {
     assert_eq!(
         places,
         [
-            "brokers.node.redis",
             "brokers.layer.dds",
             "brokers.plugins",
             "config",
@@ -97,11 +96,24 @@ fn the_example_is_read_whole() {
             "flow.topics[0]"
         ]
     );
-    assert_eq!(warnings[8].detail, "worker, monitor: not in effect in this version");
+    assert_eq!(warnings[7].detail, "worker, monitor: not in effect in this version");
     assert_eq!(
-        warnings[9].detail,
+        warnings[8].detail,
         "per_message_share, overhead, min_rate_hz, share, wire_overhead, adaptive, links: not in effect in this version"
     );
+}
+
+#[test]
+fn brokers_with_a_server_are_in_effect() {
+    let tree = json!({
+        "layer": { "name": "fog", "kind": "fog" },
+        "node": { "name": "fog-1" },
+        "brokers": { "node": { "redis": { "url": "redis://127.0.0.1:6379" } },
+                     "layer": { "kafka": { "bootstrap": ["127.0.0.1:9092"] } } },
+    });
+    let (file, warnings) = NodeFile::read(&tree).unwrap();
+    assert!(warnings.is_empty(), "{warnings:?}");
+    assert!(matches!(file.brokers.layer, Some(LayerBroker::Kafka(_))));
 }
 
 #[test]

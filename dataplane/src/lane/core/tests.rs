@@ -1,14 +1,18 @@
 //! The message path alone: a link that only takes notes, brokers that only collect.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use blaze_brokers::PublishOutcome;
-use blaze_domain::{LayerName, Priority};
+use blaze_brokers::{Content, Later, PublishOutcome, Publisher, PublisherOptions};
+use blaze_domain::{LayerName, Origin, Priority};
+use blaze_proto::Header;
+use bytes::Bytes;
 use parking_lot::Mutex;
 use proptest::prelude::*;
 
 use super::*;
-use crate::plan::Bridge;
+use crate::lane::path::{BareInfo, TopicInfo};
+use crate::plan::{Bridge, TopicPlan};
 
 #[derive(Default)]
 struct NotingLink {
@@ -114,7 +118,10 @@ impl Bench {
         };
         let out = Arc::clone(&self.out);
         self.core.apply(self.now, self.topic, info, &plan, |_| {
-            Some(Arc::clone(&out) as Arc<dyn Publisher>)
+            Ok(NewWriter {
+                publisher: Arc::clone(&out) as Arc<dyn Publisher>,
+                options: PublisherOptions::default(),
+            })
         });
     }
 
@@ -228,8 +235,15 @@ fn bare_payloads_get_an_identity_of_this_life_of_the_flow() {
         bridge(Scope::Node, Target::Node { bare: true }),
     ]);
     let info = TopicInfo {
-        encoding: "application/json".into(),
-        service: "imu".into(),
+        node: BareInfo {
+            encoding: "application/json".into(),
+            service: "imu".into(),
+            ..BareInfo::default()
+        },
+        layer: BareInfo {
+            service: "another".into(),
+            ..BareInfo::default()
+        },
         ..TopicInfo::default()
     };
     bench.apply(
@@ -372,13 +386,332 @@ proptest! {
             bench.take(Scope::Node, vec![Content::Frame(message)]);
             bench.now += Duration::from_millis(7);
         }
-        for bridge in &bench.core.path(bench.topic).bridges {
+        for bridge in &mut bench.core.path_mut(bench.topic).bridges {
+            bridge.settle();
             let stats = &bridge.stats;
             prop_assert_eq!(stats.taken.messages, stats.out.messages + stats.dropped.total() + stats.queued());
         }
         let mut seen = std::collections::HashSet::new();
         for frame in bench.out.frames.lock().iter() {
             prop_assert!(seen.insert((frame.writer(), frame.sequence())), "written twice");
+        }
+    }
+}
+
+/// A broker's adapter that takes everything, and later does with it as it is told.
+#[derive(Default)]
+struct Adapter {
+    later: Mutex<Later>,
+    taken: Mutex<u64>,
+}
+
+impl Adapter {
+    /// Drops or delivers of what is queued.
+    fn settle(&self, delivered: u64, too_large: u64, lifespan: u64) {
+        let mut later = self.later.lock();
+        let mut take = |wanted: u64| {
+            let part = wanted.min(later.queued);
+            later.queued -= part;
+            part
+        };
+        take(delivered);
+        let (too_large, lifespan) = (take(too_large), take(lifespan));
+        later.too_large += too_large;
+        later.lifespan += lifespan;
+    }
+}
+
+impl Publisher for Adapter {
+    fn publish(&self, _: &Frame, _: Option<Instant>) -> PublishOutcome {
+        self.later.lock().queued += 1;
+        *self.taken.lock() += 1;
+        PublishOutcome::Taken
+    }
+    fn publish_bare(&self, _: &Bytes, _: Option<Instant>) -> PublishOutcome {
+        self.later.lock().queued += 1;
+        *self.taken.lock() += 1;
+        PublishOutcome::Taken
+    }
+    fn later(&self) -> Later {
+        *self.later.lock()
+    }
+}
+
+impl Bench {
+    /// Applies one bridge from node to layer with this writer.
+    fn write_with(&mut self, writer: Result<&Arc<Adapter>, &str>) {
+        let plan = TopicPlan {
+            bridges: vec![bridge(Scope::Node, Target::Layer)],
+            blocked: Vec::new(),
+        };
+        self.core
+            .apply(self.now, self.topic, TopicInfo::default(), &plan, |_| match writer {
+                Ok(adapter) => Ok(NewWriter {
+                    publisher: Arc::clone(adapter) as Arc<dyn Publisher>,
+                    options: PublisherOptions::default(),
+                }),
+                Err(reason) => Err(reason.to_owned()),
+            });
+    }
+
+    fn publish(&mut self, sequences: std::ops::RangeInclusive<u64>) {
+        let frames = sequences.map(|n| Content::Frame(frame(1, n, "robot-1", 0, 100)));
+        self.take(Scope::Node, frames.collect());
+    }
+
+    /// Taken, out, too large, lifespan and queued of the only bridge.
+    fn counts(&mut self) -> (u64, u64, u64, u64, u64) {
+        let bridge = &mut self.core.path_mut(self.topic).bridges[0];
+        bridge.settle();
+        let stats = &bridge.stats;
+        let dropped = |reason| stats.dropped.get(reason);
+        assert_eq!(
+            stats.taken.messages,
+            stats.out.messages + stats.dropped.total() + stats.queued()
+        );
+        let (too_large, lifespan) = (dropped(DropReason::TooLarge), dropped(DropReason::Lifespan));
+        (
+            stats.taken.messages,
+            stats.out.messages,
+            too_large,
+            lifespan,
+            stats.queued(),
+        )
+    }
+}
+
+#[test]
+fn what_the_broker_drops_later_is_not_out() {
+    let mut bench = Bench::new(Vec::new());
+    let adapter = Arc::new(Adapter::default());
+    bench.write_with(Ok(&adapter));
+    bench.publish(1..=10);
+    assert_eq!(bench.counts(), (10, 0, 0, 0, 10));
+    adapter.settle(4, 1, 0);
+    assert_eq!(bench.counts(), (10, 4, 1, 0, 5));
+    assert_eq!(bench.core.path(bench.topic).bridges[0].stats.out.bytes, 400);
+    adapter.settle(0, 0, 2);
+    bench.publish(11..=12);
+    assert_eq!(bench.counts(), (12, 4, 1, 2, 5));
+    adapter.settle(5, 0, 0);
+    assert_eq!(bench.counts(), (12, 9, 1, 2, 0));
+    assert_eq!(bench.core.path(bench.topic).bridges[0].stats.out.bytes, 900);
+}
+
+#[test]
+fn a_replaced_writer_ends_its_account() {
+    let mut bench = Bench::new(Vec::new());
+    let (first, second) = (Arc::new(Adapter::default()), Arc::new(Adapter::default()));
+    bench.write_with(Ok(&first));
+    bench.publish(1..=4);
+    bench.write_with(Ok(&second));
+    bench.publish(5..=6);
+    assert_eq!((*first.taken.lock(), *second.taken.lock()), (4, 2));
+    first.settle(1, 0, 3);
+    assert_eq!(bench.counts(), (6, 1, 0, 3, 2));
+    assert_eq!(Arc::strong_count(&first), 1, "nobody needs it any more");
+    second.settle(2, 0, 0);
+    assert_eq!(bench.counts(), (6, 3, 0, 3, 0));
+    // However often it is replaced, what is kept is bounded and the counts hold.
+    let many: Vec<_> = (0..20).map(|_| Arc::new(Adapter::default())).collect();
+    for (n, adapter) in (7..).zip(&many) {
+        bench.write_with(Ok(adapter));
+        bench.publish(n..=n);
+    }
+    let (taken, out, .., queued) = bench.counts();
+    assert_eq!((taken, out, queued), (26, 18, 5));
+}
+
+#[test]
+fn a_bridge_that_ends_keeps_its_writer_until_all_is_delivered() {
+    let mut bench = Bench::new(Vec::new());
+    let adapter = Arc::new(Adapter::default());
+    bench.write_with(Ok(&adapter));
+    bench.publish(1..=4);
+    bench.apply(Vec::new(), TopicInfo::default());
+    assert!(bench.core.drain(bench.now, &mut bench.link).is_some(), "it still waits");
+    assert!(bench.core.drain(bench.now + DRAIN, &mut bench.link).is_none());
+    let ended = |bench: &Bench| bench.core.path(bench.topic).bridges[0].is_over();
+    assert!(!ended(&bench) && Arc::strong_count(&adapter) == 2);
+    let name: TopicName = "imu/data".parse().unwrap();
+    let held = bench.core.writer_of(&name, Scope::Node, &Target::Layer).cloned();
+    assert!(
+        held.is_some(),
+        "if it comes back it goes on with the same queue, in order"
+    );
+    drop(held);
+    adapter.settle(3, 1, 0);
+    bench.core.mark();
+    assert!(ended(&bench) && Arc::strong_count(&adapter) == 1);
+    assert_eq!(bench.counts(), (4, 3, 1, 0, 0));
+}
+
+#[test]
+fn a_bridge_without_a_writer_has_failed_and_reads_nothing() {
+    let mut bench = Bench::new(Vec::new());
+    bench.write_with(Err("no such name"));
+    let failed = bench.core.path(bench.topic).bridges[0].phase;
+    assert!(matches!(failed, Phase::Failed { .. }) && !bench.core.path(bench.topic).reads(Scope::Node));
+    bench.now += Duration::from_secs(5);
+    bench.write_with(Err("still none"));
+    let found = &bench.core.path(bench.topic).bridges[0];
+    assert_eq!((found.phase, found.failure.as_deref()), (failed, Some("still none")));
+    let adapter = Arc::new(Adapter::default());
+    bench.write_with(Ok(&adapter));
+    bench.publish(1..=2);
+    assert_eq!(bench.counts().0, 2);
+    bench.write_with(Err("not now"));
+    bench.publish(3..=3);
+    assert_eq!(*adapter.taken.lock(), 3, "the one that works is kept");
+    // Neither planned nor ever made: it ends at once.
+    let mut bench = Bench::new(Vec::new());
+    bench.write_with(Err("no such name"));
+    bench.apply(Vec::new(), TopicInfo::default());
+    assert!(bench.core.path(bench.topic).bridges[0].is_over());
+}
+
+#[test]
+fn the_writer_of_a_layer_gets_one_hop_and_the_link_none() {
+    let mut bench = Bench::new(vec![
+        bridge(Scope::Node, Target::Layer),
+        bridge(Scope::Node, to_cloud()),
+    ]);
+    let bare = Content::Bare {
+        payload: Bytes::from_static(b"{}"),
+        identity: None,
+    };
+    bench.take(Scope::Node, vec![bare]);
+    assert_eq!(bench.out.frames.lock()[0].hops(), 1, "Redis to Kafka on one flow");
+    assert_eq!(bench.link.submitted[0].2.hops(), 0, "the link adds its own");
+}
+
+#[test]
+fn bare_copies_are_made_of_what_comes_from_anywhere() {
+    let bare = || Target::Node { bare: true };
+    let mut bench = Bench::new(vec![
+        bridge(Scope::Node, bare()),
+        bridge(Scope::Layer, bare()),
+        bridge(Scope::Inter, bare()),
+    ]);
+    bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
+    bench.take(Scope::Layer, vec![Content::Frame(frame(2, 1, "edge-2", 1, 2))]);
+    let origin = Origin {
+        layer: "fog".into(),
+        node: "fog-1".into(),
+        ..Origin::default()
+    };
+    let header = Header::new("imu/data", origin, WriterId([3; 16]), 5, WALL);
+    let from_fog = Frame::new(&header, Bytes::from_static(b"123")).unwrap();
+    bench
+        .core
+        .deliver(bench.now, from_fog.with_hops_and_age(1, 900), &mut bench.link);
+    let sizes: Vec<usize> = bench.out.bare.lock().iter().map(Bytes::len).collect();
+    assert_eq!(sizes, [1, 2, 3]);
+    assert!(bench.out.frames.lock().is_empty());
+}
+
+#[test]
+fn topics_that_nobody_uses_make_room_for_others() {
+    let mut bench = Bench::new(vec![bridge(Scope::Node, to_cloud())]);
+    let used = bench.topic;
+    let mut now = bench.now;
+    let idle: Vec<TopicId> = (1..MAX_TOPICS)
+        .map(|n| bench.core.intern(&format!("t{n}").parse().unwrap(), now).unwrap())
+        .collect();
+    bench.core.forget_unused(now);
+    now += FORGET - Duration::from_secs(1);
+    assert_eq!(bench.core.forget_unused(now), 0);
+    assert!(bench.core.intern(&"new".parse().unwrap(), now).is_none());
+    now += Duration::from_secs(1);
+    assert_eq!(bench.core.forget_unused(now), MAX_TOPICS - 1);
+    assert_eq!(bench.core.topics().map(|(id, _)| id).collect::<Vec<_>>(), [used]);
+    assert_eq!(bench.core.find("t5"), None);
+    for n in 1..MAX_TOPICS {
+        let id = bench.core.intern(&format!("u{n}").parse().unwrap(), now).unwrap();
+        assert!(idle.contains(&id) && bench.core.path(id).bridges.is_empty());
+    }
+    assert!(bench.core.intern(&"one-more".parse().unwrap(), now).is_none());
+    assert_eq!(bench.core.forget_unused(now), 0, "those have just come");
+}
+
+#[test]
+fn a_forgotten_topic_leaves_its_lanes_and_windows_to_others() {
+    let mut bench = Bench::new(vec![bridge(Scope::Node, to_cloud())]);
+    bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
+    let (lane, _, _) = bench.link.submitted[0];
+    bench.link.waiting.clear();
+    bench.apply(Vec::new(), TopicInfo::default());
+    bench.core.drain(bench.now, &mut bench.link);
+    bench.core.forget_unused(bench.now);
+    bench.now += FORGET;
+    assert_eq!(bench.core.forget_unused(bench.now), 1);
+    bench.core.lane_out(lane, 1, 1);
+    bench.topic = bench.core.intern(&"imu/data".parse().unwrap(), bench.now).unwrap();
+    bench.apply(vec![bridge(Scope::Node, to_cloud())], TopicInfo::default());
+    bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
+    assert_eq!(
+        bench.link.submitted.len(),
+        2,
+        "the window of the topic that was is gone"
+    );
+    assert_eq!(bench.link.submitted[1].0, lane);
+    bench.core.lane_out(lane, 1, 1);
+    assert_eq!(bench.core.path(bench.topic).bridges[0].stats.out.messages, 1);
+}
+
+#[test]
+fn a_bridge_takes_the_place_of_one_that_ended_long_ago() {
+    let to = |n: usize| Target::Inter {
+        layer: "cloud".parse().unwrap(),
+        receiver: format!("cloud/cloud-{n}").parse().unwrap(),
+    };
+    let mut bench = Bench::new(vec![bridge(Scope::Node, to(0))]);
+    for n in 1..100 {
+        bench.now += FORGET;
+        bench.apply(vec![bridge(Scope::Node, to(n))], TopicInfo::default());
+        bench.core.drain(bench.now, &mut bench.link);
+    }
+    assert!(bench.core.path(bench.topic).bridges.len() <= 3);
+    bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
+    let (lane, _, _) = bench.link.submitted[0];
+    bench.core.lane_out(lane, 1, 1);
+    let live = bench
+        .core
+        .path(bench.topic)
+        .bridges
+        .iter()
+        .find(|bridge| bridge.target == to(99));
+    assert_eq!(live.unwrap().stats.out.messages, 1);
+}
+
+proptest! {
+    /// Whatever an adapter does with what it took, everything is counted once and nothing that was out comes back.
+    #[test]
+    fn late_drops_keep_the_counts(
+        steps in proptest::collection::vec((0u64..20, 0u64..20, 0u64..5, 0u64..5, any::<bool>()), 1..60),
+    ) {
+        let mut bench = Bench::new(Vec::new());
+        let mut adapters = vec![Arc::new(Adapter::default())];
+        bench.write_with(Ok(&adapters[0]));
+        let (mut next, mut out) = (1, 0);
+        for (publish, delivered, too_large, lifespan, replace) in steps {
+            if publish > 0 {
+                bench.publish(next..=next + publish - 1);
+            }
+            next += publish;
+            for adapter in &adapters {
+                adapter.settle(delivered, too_large, lifespan);
+            }
+            if replace && adapters.len() < 4 {
+                adapters.push(Arc::new(Adapter::default()));
+                bench.write_with(Ok(adapters.last().unwrap()));
+            }
+            let counts = bench.counts();
+            prop_assert_eq!(counts.0, next - 1);
+            prop_assert!(counts.1 >= out);
+            out = counts.1;
+            let queued: u64 = adapters.iter().map(|adapter| adapter.later().queued).sum();
+            prop_assert_eq!(counts.4, queued);
         }
     }
 }

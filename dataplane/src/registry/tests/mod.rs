@@ -1,6 +1,7 @@
 //! The registry as its owner drives it.
 
 mod control;
+mod stored;
 mod sync;
 
 use std::time::Duration;
@@ -23,6 +24,8 @@ fn config(me: &str, epoch: u64, started: Instant) -> RegistryConfig {
         layer_scope: Some(LayerScopeId(9)),
         max_leases: 10_000,
         layer_answers_need_id: true,
+        layer_names: LayerNames::Any,
+        lease_stores: BTreeSet::new(),
         started,
     }
 }

@@ -1,0 +1,167 @@
+//! What the server says of itself, and how its answers are read.
+
+use redis::aio::MultiplexedConnection;
+use redis::{RedisResult, Value};
+
+/// A subscriber is cut off when this many bytes wait for it: room for a few of the largest messages is needed.
+const LEAST_HARD_LIMIT: u64 = 4 * 32 * 1024 * 1024;
+/// The same for the limit that holds for some seconds: two of the largest messages.
+const LEAST_SOFT_LIMIT: u64 = 2 * 16 * 1024 * 1024;
+
+/// What `INFO server` tells.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(super) struct ServerFacts {
+    /// Program and version, such as `redis 7.0.15`.
+    pub(super) version: String,
+    /// Differs after each start of the server.
+    pub(super) run_id: Option<String>,
+}
+
+impl ServerFacts {
+    /// Reads the lines `name:value` of `INFO server`.
+    pub(super) fn parse(info: &str) -> Self {
+        let field = |name: &str| {
+            info.lines()
+                .find_map(|line| line.strip_prefix(name)?.strip_prefix(':'))
+                .map(|value| value.trim().to_owned())
+        };
+        let program = field("server_name").unwrap_or_else(|| "redis".to_owned());
+        let version = field(&format!("{program}_version")).or_else(|| field("redis_version"));
+        Self {
+            version: match version {
+                Some(version) => format!("{program} {version}"),
+                None => program,
+            },
+            run_id: field("run_id"),
+        }
+    }
+}
+
+/// Limits of `client-output-buffer-limit pubsub`, in bytes; 0 = none.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct BufferLimits {
+    hard: u64,
+    soft: u64,
+    soft_seconds: u64,
+}
+
+impl BufferLimits {
+    /// Reads the value of the setting, as the server prints it.
+    pub(super) fn parse(setting: &str) -> Option<Self> {
+        let mut words = setting.split_whitespace().skip_while(|word| *word != "pubsub").skip(1);
+        let mut number = || words.next()?.parse().ok();
+        Some(Self {
+            hard: number()?,
+            soft: number()?,
+            soft_seconds: number()?,
+        })
+    }
+
+    /// What is to be changed, if large messages would get a reader cut off.
+    pub(super) fn complaint(self) -> Option<String> {
+        let low = |limit: u64, least: u64| limit != 0 && limit < least;
+        (low(self.hard, LEAST_HARD_LIMIT) || low(self.soft, LEAST_SOFT_LIMIT)).then(|| {
+            format!(
+                "client-output-buffer-limit is `pubsub {} {} {}`: the server closes readers of large messages; set \
+                 `client-output-buffer-limit pubsub 256mb 128mb 60`",
+                self.hard, self.soft, self.soft_seconds
+            )
+        })
+    }
+}
+
+/// Asks the server who it is. Refused by its access list, the version stays unknown.
+pub(super) async fn facts(connection: &mut MultiplexedConnection) -> RedisResult<ServerFacts> {
+    match redis::cmd("INFO").arg("server").query_async::<String>(connection).await {
+        Ok(info) => Ok(ServerFacts::parse(&info)),
+        Err(error) if is_refusal(&error) => Ok(ServerFacts {
+            version: "redis (version not told)".to_owned(),
+            run_id: None,
+        }),
+        Err(error) => Err(error),
+    }
+}
+
+/// Asks for the buffer limits; `None` where the access list forbids it.
+pub(super) async fn buffer_limits(connection: &mut MultiplexedConnection) -> RedisResult<Option<BufferLimits>> {
+    let mut command = redis::cmd("CONFIG");
+    command.arg("GET").arg("client-output-buffer-limit");
+    match command.query_async::<Value>(connection).await {
+        Ok(value) => Ok(pairs(value)
+            .into_iter()
+            .find_map(|(_, value)| BufferLimits::parse(std::str::from_utf8(&value).ok()?))),
+        Err(error) if is_refusal(&error) => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+/// Whether the server answered, and said no.
+pub(super) fn is_refusal(error: &redis::RedisError) -> bool {
+    !error.is_io_error() && !error.is_connection_dropped() && !error.is_unrecoverable_error()
+}
+
+/// Fields and values of a hash, in either version of the protocol; what is no text is left out.
+pub(super) fn pairs(value: Value) -> Vec<(Vec<u8>, Vec<u8>)> {
+    fn bytes(value: Value) -> Option<Vec<u8>> {
+        match value {
+            Value::BulkString(bytes) => Some(bytes),
+            Value::SimpleString(text) | Value::VerbatimString { text, .. } => Some(text.into_bytes()),
+            _ => None,
+        }
+    }
+    match value {
+        Value::Map(pairs) => pairs
+            .into_iter()
+            .filter_map(|(field, value)| bytes(field).zip(bytes(value)))
+            .collect(),
+        Value::Array(values) => {
+            let mut values = values.into_iter();
+            std::iter::from_fn(|| values.next().zip(values.next()))
+                .filter_map(|(field, value)| bytes(field).zip(bytes(value)))
+                .collect()
+        }
+        _ => Vec::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn redis_and_valkey_tell_their_versions() {
+        let redis = "# Server\r\nredis_version:7.0.15\r\nredis_git_sha1:0\r\nrun_id:abc\r\n";
+        let facts = ServerFacts::parse(redis);
+        assert_eq!(
+            (facts.version.as_str(), facts.run_id.as_deref()),
+            ("redis 7.0.15", Some("abc"))
+        );
+        let valkey = "# Server\r\nredis_version:7.2.4\r\nserver_name:valkey\r\nvalkey_version:9.1.2\r\nrun_id:d\r\n";
+        assert_eq!(ServerFacts::parse(valkey).version, "valkey 9.1.2");
+        assert_eq!(ServerFacts::parse("").version, "redis");
+    }
+
+    #[test]
+    fn low_buffer_limits_are_named() {
+        let default = "normal 0 0 0 slave 268435456 67108864 60 pubsub 33554432 8388608 60";
+        let limits = BufferLimits::parse(default).unwrap();
+        assert!(limits.complaint().unwrap().contains("pubsub 33554432 8388608 60"));
+        for good in ["pubsub 268435456 134217728 60", "normal 0 0 0 pubsub 0 0 0"] {
+            assert_eq!(BufferLimits::parse(good).unwrap().complaint(), None, "{good}");
+        }
+        for low in ["pubsub 268435456 8388608 60", "pubsub 33554432 0 0"] {
+            assert!(BufferLimits::parse(low).unwrap().complaint().is_some(), "{low}");
+        }
+        assert_eq!(BufferLimits::parse("normal 0 0 0"), None);
+        assert_eq!(BufferLimits::parse("pubsub 1 x 2"), None);
+    }
+
+    #[test]
+    fn hashes_are_read_in_both_versions_of_the_protocol() {
+        let text = |text: &str| Value::BulkString(text.as_bytes().to_vec());
+        let expected = vec![(b"a".to_vec(), b"1".to_vec())];
+        assert_eq!(pairs(Value::Map(vec![(text("a"), text("1"))])), expected);
+        assert_eq!(pairs(Value::Array(vec![text("a"), text("1"), text("odd")])), expected);
+        assert!(pairs(Value::Nil).is_empty());
+    }
+}

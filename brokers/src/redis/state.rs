@@ -1,0 +1,434 @@
+//! What is known of the connections and of the scope, and what follows from it: the status, and who may read and write.
+//!
+//! ```text
+//! writer, reader, owner ──► State::change ──► Conditions::assess ──┬─► status
+//!                                                                  ├─► gates of the publishers
+//!                                                                  └─► whether messages are delivered
+//! ```
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use parking_lot::Mutex;
+use tokio::sync::watch;
+
+use super::gate::Gate;
+use crate::port::{BrokerStatus, Health};
+
+/// One TCP connection. Large messages have connections of their own, so that small ones never stand behind them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum Line {
+    PublishSmall,
+    PublishLarge,
+    ReadSmall,
+    ReadLarge,
+}
+
+impl Line {
+    pub(super) const ALL: [Self; 4] = [Self::PublishSmall, Self::PublishLarge, Self::ReadSmall, Self::ReadLarge];
+
+    pub(super) fn publish(large: bool) -> Self {
+        if large { Self::PublishLarge } else { Self::PublishSmall }
+    }
+
+    pub(super) fn read(large: bool) -> Self {
+        if large { Self::ReadLarge } else { Self::ReadSmall }
+    }
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::PublishSmall => "publish",
+            Self::PublishLarge => "publish-large",
+            Self::ReadSmall => "read",
+            Self::ReadLarge => "read-large",
+        }
+    }
+
+    pub(super) fn is_large(self) -> bool {
+        matches!(self, Self::PublishLarge | Self::ReadLarge)
+    }
+
+    pub(super) fn reads(self) -> bool {
+        matches!(self, Self::ReadSmall | Self::ReadLarge)
+    }
+
+    /// Whether it is there from the beginning; the others come with the first large publisher or reader.
+    fn is_core(self) -> bool {
+        !self.is_large()
+    }
+
+    pub(super) fn index(self) -> usize {
+        self as usize
+    }
+}
+
+/// What one connection is doing.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum LineState {
+    /// Nobody needs it.
+    Unused,
+    /// Its first connection is being made.
+    Starting,
+    /// The server answers, and all channels are subscribed.
+    Up,
+    /// The connection stands and the server does not answer.
+    Silent,
+    /// No connection.
+    Away(String),
+    /// The server answered and said no.
+    Refused(String),
+}
+
+/// Whose scope it is, as far as the server told.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Scope {
+    /// A service: the scope is none of its business.
+    Free,
+    /// A flow that has not claimed it yet.
+    Unclaimed,
+    /// Ours.
+    Owned,
+    /// Another flow's, whose name this is.
+    HeldBy(String),
+    /// It was ours and could not be renewed, or could not be claimed.
+    Lost(String),
+}
+
+/// All that the status depends on.
+#[derive(Debug)]
+pub(super) struct Conditions {
+    lines: [LineState; 4],
+    scope: Scope,
+    /// A flow to which this one gives way.
+    pub(super) stand_back: Option<String>,
+    /// Program and version of the server.
+    pub(super) server: String,
+    pub(super) closed: bool,
+    /// How often a reading connection was lost while it was up.
+    interruptions: u64,
+    place: String,
+    was_up: bool,
+    was_owned: bool,
+}
+
+struct Verdict {
+    health: Health,
+    detail: String,
+    scope_open: bool,
+}
+
+impl Conditions {
+    fn new(scope: Scope, place: String) -> Self {
+        let start = |line: Line| {
+            if line.is_core() {
+                LineState::Starting
+            } else {
+                LineState::Unused
+            }
+        };
+        Self {
+            lines: Line::ALL.map(start),
+            scope,
+            stand_back: None,
+            server: String::new(),
+            closed: false,
+            interruptions: 0,
+            place,
+            was_up: false,
+            was_owned: false,
+        }
+    }
+
+    pub(super) fn line(&self, line: Line) -> &LineState {
+        &self.lines[line.index()]
+    }
+
+    pub(super) fn set_line(&mut self, line: Line, state: LineState) {
+        let was_up = matches!(self.line(line), LineState::Up | LineState::Silent);
+        if line.reads() && was_up && matches!(state, LineState::Away(_) | LineState::Refused(_)) {
+            self.interruptions += 1;
+        }
+        self.lines[line.index()] = state;
+        self.was_up |= self.core_is_up();
+    }
+
+    pub(super) fn scope(&self) -> &Scope {
+        &self.scope
+    }
+
+    pub(super) fn set_scope(&mut self, scope: Scope) {
+        self.was_owned |= scope == Scope::Owned;
+        self.scope = scope;
+    }
+
+    /// The server may have lost whose scope it is: until the next claim it is nobody's.
+    pub(super) fn forget_owner(&mut self) {
+        if self.scope == Scope::Owned {
+            self.scope = Scope::Unclaimed;
+        }
+    }
+
+    fn core_is_up(&self) -> bool {
+        let up = |line: &Line| *self.line(*line) == LineState::Up;
+        Line::ALL.iter().filter(|line| line.is_core()).all(up)
+    }
+
+    fn scope_open(&self) -> bool {
+        !self.closed && self.stand_back.is_none() && matches!(self.scope, Scope::Free | Scope::Owned)
+    }
+
+    /// Whether messages for a connection are taken.
+    fn accepts(&self, line: Line) -> bool {
+        self.scope_open()
+            && match self.line(line) {
+                LineState::Up => true,
+                LineState::Starting => self.core_is_up(),
+                _ => false,
+            }
+    }
+
+    fn assess(&self) -> Verdict {
+        let (health, detail) = self.health();
+        Verdict {
+            health,
+            detail,
+            scope_open: self.scope_open(),
+        }
+    }
+
+    fn health(&self) -> (Health, String) {
+        if self.closed {
+            return (Health::Closed, "closed".to_owned());
+        }
+        if let Some(trouble) = self.trouble() {
+            return trouble;
+        }
+        let in_use = |whom: &str| (Health::InUse, format!("scope_in_use: {whom} holds it"));
+        if let Some(whom) = &self.stand_back {
+            return in_use(whom);
+        }
+        match &self.scope {
+            Scope::Unclaimed => {
+                let health = if self.was_owned {
+                    Health::Down
+                } else {
+                    Health::Connecting
+                };
+                (health, format!("claiming the scope at {}", self.place))
+            }
+            Scope::HeldBy(whom) => in_use(whom),
+            Scope::Lost(why) => (Health::Down, why.clone()),
+            Scope::Free | Scope::Owned => (Health::Up, self.server_detail()),
+        }
+    }
+
+    fn server_detail(&self) -> String {
+        match self.interruptions {
+            0 => self.server.clone(),
+            1 => format!("{}; reading was interrupted once", self.server),
+            count => format!("{}; reading was interrupted {count} times", self.server),
+        }
+    }
+
+    /// What is wrong with the connections.
+    fn trouble(&self) -> Option<(Health, String)> {
+        let waiting = if self.was_up { Health::Down } else { Health::Connecting };
+        let place = &self.place;
+        for state in &self.lines {
+            match state {
+                LineState::Refused(why) => return Some((Health::Down, format!("{place}: {why}"))),
+                LineState::Away(why) => return Some((waiting, format!("{place}: {why}"))),
+                LineState::Silent => return Some((waiting, format!("{place} does not answer"))),
+                LineState::Unused | LineState::Starting | LineState::Up => {}
+            }
+        }
+        (!self.core_is_up()).then(|| (waiting, format!("connecting to {place}")))
+    }
+}
+
+/// The conditions, and what follows from them.
+pub(super) struct State {
+    conditions: Mutex<Conditions>,
+    status: watch::Sender<BrokerStatus>,
+    /// Counts changes of the conditions.
+    version: watch::Sender<u64>,
+    gates: [Arc<Gate>; 2],
+    delivers: AtomicBool,
+}
+
+impl State {
+    pub(super) fn new(scope: Scope, place: String, gates: [Arc<Gate>; 2]) -> Self {
+        let conditions = Conditions::new(scope, place);
+        let Verdict { health, detail, .. } = conditions.assess();
+        let since = Instant::now();
+        Self {
+            conditions: Mutex::new(conditions),
+            status: watch::Sender::new(BrokerStatus { health, detail, since }),
+            version: watch::Sender::new(0),
+            gates,
+            delivers: AtomicBool::new(false),
+        }
+    }
+
+    /// Changes the conditions; all that follows is done when this returns.
+    pub(super) fn change(&self, change: impl FnOnce(&mut Conditions)) {
+        let mut conditions = self.conditions.lock();
+        change(&mut conditions);
+        let verdict = conditions.assess();
+        self.delivers.store(verdict.scope_open, Ordering::Release);
+        for (gate, line) in self.gates.iter().zip([Line::PublishSmall, Line::PublishLarge]) {
+            gate.set_open(conditions.accepts(line));
+        }
+        self.tell(verdict);
+        self.version.send_modify(|version| *version += 1);
+    }
+
+    fn tell(&self, verdict: Verdict) {
+        let Verdict { health, detail, .. } = verdict;
+        self.status.send_if_modified(|status| {
+            let turned = status.health != health;
+            if !turned && status.detail == detail {
+                return false;
+            }
+            match health {
+                Health::Up if turned => tracing::info!(detail, "redis is up"),
+                Health::Down | Health::InUse if turned => tracing::warn!(detail, "redis cannot be used"),
+                _ => tracing::debug!(?health, detail, "redis"),
+            }
+            status.health = health;
+            status.detail = detail;
+            if turned {
+                status.since = Instant::now();
+            }
+            true
+        });
+    }
+
+    /// Looks at the conditions.
+    pub(super) fn read<T>(&self, look: impl FnOnce(&Conditions) -> T) -> T {
+        look(&self.conditions.lock())
+    }
+
+    pub(super) fn status(&self) -> watch::Receiver<BrokerStatus> {
+        self.status.subscribe()
+    }
+
+    /// Changes whenever a condition does.
+    pub(super) fn version(&self) -> watch::Receiver<u64> {
+        self.version.subscribe()
+    }
+
+    /// Whether messages are handed to subscribers.
+    pub(super) fn delivers(&self) -> bool {
+        self.delivers.load(Ordering::Acquire)
+    }
+
+    /// Why nothing can be asked of the server, if it is not up.
+    pub(super) fn why_not_up(&self) -> Option<String> {
+        let status = self.status.borrow();
+        (status.health != Health::Up).then(|| status.detail.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn conditions(scope: Scope) -> Conditions {
+        let mut conditions = Conditions::new(scope, "host:1".to_owned());
+        conditions.server = "redis 7".to_owned();
+        conditions
+    }
+
+    fn up(scope: Scope) -> Conditions {
+        let mut conditions = conditions(scope);
+        conditions.set_line(Line::PublishSmall, LineState::Up);
+        conditions.set_line(Line::ReadSmall, LineState::Up);
+        conditions
+    }
+
+    #[test]
+    fn up_needs_both_core_connections() {
+        let mut c = conditions(Scope::Free);
+        assert_eq!(c.health().0, Health::Connecting);
+        c.set_line(Line::PublishSmall, LineState::Up);
+        assert_eq!(c.health().0, Health::Connecting);
+        c.set_line(Line::ReadSmall, LineState::Up);
+        assert_eq!(c.health(), (Health::Up, "redis 7".to_owned()));
+        assert!(c.accepts(Line::PublishSmall) && !c.accepts(Line::PublishLarge));
+        c.set_line(Line::PublishLarge, LineState::Starting);
+        assert_eq!(
+            c.health().0,
+            Health::Up,
+            "a connection that is first needed now takes nothing away"
+        );
+        assert!(c.accepts(Line::PublishLarge));
+        c.set_line(Line::PublishLarge, LineState::Away("refused".to_owned()));
+        assert_eq!(c.health(), (Health::Down, "host:1: refused".to_owned()));
+        assert!(!c.accepts(Line::PublishLarge) && c.accepts(Line::PublishSmall));
+    }
+
+    #[test]
+    fn a_server_that_was_never_there_is_connecting_and_one_that_says_no_is_down() {
+        let mut c = conditions(Scope::Free);
+        c.set_line(Line::ReadSmall, LineState::Away("connection refused".to_owned()));
+        assert_eq!(
+            c.health(),
+            (Health::Connecting, "host:1: connection refused".to_owned())
+        );
+        c.set_line(Line::PublishSmall, LineState::Refused("WRONGPASS".to_owned()));
+        assert_eq!(c.health(), (Health::Down, "host:1: WRONGPASS".to_owned()));
+    }
+
+    #[test]
+    fn a_silent_server_is_down_and_takes_nothing() {
+        let mut c = up(Scope::Free);
+        c.set_line(Line::PublishSmall, LineState::Silent);
+        assert_eq!(c.health().0, Health::Down);
+        assert!(!c.accepts(Line::PublishSmall));
+    }
+
+    #[test]
+    fn a_scope_that_is_not_ours_is_neither_read_nor_written() {
+        for (scope, health) in [
+            (Scope::Unclaimed, Health::Connecting),
+            (Scope::HeldBy("edge/other".to_owned()), Health::InUse),
+            (Scope::Lost("not renewed".to_owned()), Health::Down),
+        ] {
+            let c = up(scope.clone());
+            assert_eq!(c.health().0, health, "{scope:?}");
+            assert!(!c.scope_open() && !c.accepts(Line::PublishSmall), "{scope:?}");
+        }
+        let mut c = up(Scope::Owned);
+        assert_eq!(c.health().0, Health::Up);
+        c.set_scope(Scope::Owned);
+        c.forget_owner();
+        assert_eq!(c.health().0, Health::Down, "the server was restarted");
+        c.set_scope(Scope::Owned);
+        c.stand_back = Some("fog/first".to_owned());
+        assert_eq!(
+            c.health(),
+            (Health::InUse, "scope_in_use: fog/first holds it".to_owned())
+        );
+        assert!(!c.accepts(Line::PublishSmall));
+    }
+
+    #[test]
+    fn interruptions_of_reading_are_counted() {
+        let mut c = up(Scope::Free);
+        for _ in 0..2 {
+            c.set_line(Line::ReadSmall, LineState::Away("reset".to_owned()));
+            c.set_line(Line::ReadSmall, LineState::Away("refused".to_owned()));
+            c.set_line(Line::ReadSmall, LineState::Up);
+        }
+        c.set_line(Line::PublishSmall, LineState::Away("reset".to_owned()));
+        c.set_line(Line::PublishSmall, LineState::Up);
+        assert_eq!(
+            c.health(),
+            (Health::Up, "redis 7; reading was interrupted 2 times".to_owned())
+        );
+        c.closed = true;
+        assert_eq!(c.health().0, Health::Closed);
+    }
+}

@@ -1,0 +1,58 @@
+//! What local advertisements say of a topic.
+
+use blaze_domain::control::DEFAULT_ENCODING;
+use blaze_domain::{Durability, Reliability, Scope, TopicName};
+
+use crate::lane::path::{BareInfo, TopicInfo};
+use crate::registry::{LeaseView, Registry, Terms};
+
+/// What the advertisements of a topic on this flow's own brokers say.
+pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
+    let all: Vec<LeaseView<'_>> = registry.local_advertisers(topic).collect();
+    let of = |scope: Scope| -> Vec<LeaseView<'_>> {
+        let of_scope = all.iter().filter(|lease| lease.key.scope == scope);
+        of_scope.copied().collect()
+    };
+    let offers = || {
+        all.iter().filter_map(|lease| match lease.terms {
+            Terms::Advertise { rate_hz, max_bytes, .. } => Some((*rate_hz, *max_bytes)),
+            Terms::Request { .. } => None,
+        })
+    };
+    TopicInfo {
+        node: bare_info(&of(Scope::Node)),
+        layer: bare_info(&of(Scope::Layer)),
+        max_bytes: offers().filter_map(|(_, bytes)| bytes).max(),
+        rate_hz: offers()
+            .map(|(rate, _)| rate)
+            .sum::<Option<f64>>()
+            .filter(|_| !all.is_empty()),
+    }
+}
+
+/// The header of what comes without one from a scope: where several advertise, nobody knows who of them it was.
+fn bare_info(advertised: &[LeaseView<'_>]) -> BareInfo {
+    let Some(first) = advertised.first() else {
+        return BareInfo::default();
+    };
+    let only = (advertised.len() == 1).then_some(first.key);
+    let qualities = || advertised.iter().map(LeaseView::quality);
+    let kept = qualities().filter(|quality| quality.durability == Durability::TransientLocal);
+    let endless = qualities().any(|quality| quality.lifespan_ms == 0);
+    BareInfo {
+        encoding: qualities()
+            .find_map(|quality| quality.encoding.clone())
+            .unwrap_or_else(|| DEFAULT_ENCODING.to_owned()),
+        service: only.map(|key| key.service.to_string()).unwrap_or_default(),
+        instance: only.map(|key| key.instance.to_string()).unwrap_or_default(),
+        priority: qualities().filter_map(|quality| quality.priority).min(),
+        reliable: qualities().any(|quality| quality.reliability == Reliability::Reliable),
+        depth: kept.map(|quality| quality.depth).max().unwrap_or(0),
+        // 0 = endless, which is the longest.
+        lifespan_ms: if endless {
+            0
+        } else {
+            qualities().map(|quality| quality.lifespan_ms).max().unwrap_or(0)
+        },
+    }
+}

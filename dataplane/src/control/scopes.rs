@@ -1,0 +1,154 @@
+//! What the control core knows of the brokers of its local scopes, and what follows for leases, plans and channels.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Instant;
+
+use blaze_domain::names::ChannelName;
+use blaze_domain::{Scope, TopicName, WhyCode};
+use bytes::Bytes;
+
+use super::{ControlCore, Output};
+use crate::plan::{Bridge, Target};
+use crate::registry::Restored;
+
+/// The local scopes.
+pub(super) const LOCAL: [Scope; 2] = [Scope::Node, Scope::Layer];
+
+/// Whether the broker of a scope can be used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ScopeHealth {
+    /// It answers.
+    #[default]
+    Up,
+    /// It does not: nobody can renew a lease there.
+    Away,
+    /// The scope belongs to another flow: for this one it is as if it were not there.
+    InUse,
+}
+
+impl ScopeHealth {
+    /// The code of `why`, where something is wrong.
+    #[must_use]
+    pub fn fault(self) -> Option<WhyCode> {
+        match self {
+            Self::Up => None,
+            Self::Away => Some(WhyCode::BrokerDown),
+            Self::InUse => Some(WhyCode::ScopeInUse),
+        }
+    }
+}
+
+/// Health of the scopes, and the channels that were asked for on them.
+#[derive(Debug, Default)]
+pub(super) struct Scopes {
+    health: BTreeMap<Scope, ScopeHealth>,
+    /// Channels in use on brokers with a flow's side, with their depth.
+    prepared: BTreeMap<(Scope, TopicName), u32>,
+}
+
+impl Scopes {
+    pub(super) fn health(&self, scope: Scope) -> ScopeHealth {
+        self.health.get(&scope).copied().unwrap_or_default()
+    }
+}
+
+impl ControlCore {
+    /// The broker of a local scope has changed.
+    pub fn set_scope_health(&mut self, now: Instant, scope: Scope, health: ScopeHealth) {
+        let before = self.scopes.health(scope);
+        if before == health {
+            return;
+        }
+        self.scopes.health.insert(scope, health);
+        self.registry.set_renewable(now, scope, health != ScopeHealth::Away);
+        if (before == ScopeHealth::InUse) != (health == ScopeHealth::InUse) {
+            let in_use = health == ScopeHealth::InUse;
+            if in_use {
+                // Whoever had the scope meanwhile may have changed what is kept.
+                self.registry.begin_restore(scope);
+            }
+            let changed = self.registry.set_in_use(now, scope, in_use);
+            self.touch(now, changed);
+            if scope == Scope::Layer {
+                self.outputs.push_back(Output::LayerScope { shared: !in_use });
+            }
+        }
+        // What other flows are told of routes over this scope changes with it.
+        self.touch_all(now);
+    }
+
+    /// Whether the kept leases of a scope are still to be read, so that the flow cannot be ready.
+    #[must_use]
+    pub fn is_reading_leases(&self, scope: Scope) -> bool {
+        self.registry.is_reading(scope) && self.scopes.health(scope) != ScopeHealth::InUse
+    }
+
+    /// Takes the leases that the broker of a scope has kept.
+    pub fn restore_leases(&mut self, now: Instant, scope: Scope, kept: &[(String, Bytes)]) -> Restored {
+        let restored = self.registry.restore(now, scope, kept);
+        self.skipped_leases += restored.skipped;
+        self.touch(now, restored.changed.clone());
+        for topic in &restored.topics {
+            self.update_channels(topic);
+        }
+        self.save_leases();
+        restored
+    }
+
+    /// Hands over what brokers are to change in the leases that they keep.
+    pub(super) fn save_leases(&mut self) {
+        let unsaved = self.registry.take_unsaved();
+        self.outputs.extend(unsaved.into_iter().map(Output::SaveLease));
+    }
+
+    /// Lets brokers make the channels of topics that are leased on them or that a bridge writes, and release the others.
+    pub(super) fn update_channels(&mut self, topic: &TopicName) {
+        for scope in LOCAL {
+            if !self.config.lease_stores.contains(&scope) {
+                continue;
+            }
+            let leased = self.registry.channel_depth(topic, scope);
+            let bridges = self.plans.get(topic).map_or(&[][..], |plan| &plan.bridges);
+            let written = bridges
+                .iter()
+                .filter(|bridge| writes(bridge, scope))
+                .map(depth_of)
+                .max();
+            let wanted = leased.max(written);
+            let key = (scope, topic.clone());
+            if self.scopes.prepared.get(&key).copied() == wanted {
+                continue;
+            }
+            let channel = ChannelName::from(topic);
+            match wanted {
+                Some(depth) => {
+                    self.scopes.prepared.insert(key, depth);
+                    self.outputs.push_back(Output::Prepare { scope, channel, depth });
+                }
+                None => {
+                    self.scopes.prepared.remove(&key);
+                    self.outputs.push_back(Output::Release { scope, channel });
+                }
+            }
+        }
+    }
+
+    /// The same for many topics.
+    pub(super) fn update_channels_of(&mut self, topics: &BTreeSet<TopicName>) {
+        for topic in topics {
+            self.update_channels(topic);
+        }
+    }
+}
+
+fn writes(bridge: &Bridge, scope: Scope) -> bool {
+    match bridge.to {
+        Target::Node { bare } => scope == Scope::Node && !bare,
+        Target::Layer => scope == Scope::Layer,
+        Target::Inter { .. } => false,
+    }
+}
+
+fn depth_of(bridge: &Bridge) -> u32 {
+    if bridge.lane.durable { bridge.lane.depth } else { 0 }
+}

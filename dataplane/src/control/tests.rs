@@ -1,0 +1,275 @@
+//! The control core as a flow with real brokers drives it.
+
+use blaze_domain::LayerKind;
+use serde_json::{Value, json};
+
+use super::*;
+use crate::plan::Bridge;
+
+struct Bench {
+    core: ControlCore,
+    now: Instant,
+    outputs: Vec<Output>,
+}
+
+impl Bench {
+    /// `fog/fog-1` with Redis on its node and Kafka on its layer.
+    fn new() -> Self {
+        let now = Instant::now();
+        let config = ControlConfig {
+            me: "fog/fog-1".parse().unwrap(),
+            kind: LayerKind::Fog,
+            epoch: 1,
+            node_scope: true,
+            layer_scope: Some(LayerScopeId::kafka("")),
+            inter_scope: false,
+            layer_answers_need_id: true,
+            layer_names: LayerNames::Kafka { prefix_bytes: 0 },
+            lease_stores: BTreeSet::from(LOCAL),
+            rules: PlanRules::default(),
+        };
+        Self {
+            core: ControlCore::new(config, now),
+            now,
+            outputs: Vec::new(),
+        }
+    }
+
+    fn ready() -> Self {
+        let mut bench = Self::new();
+        for scope in LOCAL {
+            bench.core.restore_leases(bench.now, scope, &[]);
+        }
+        bench.step(0);
+        assert_eq!(bench.core.state(), FlowState::Ready);
+        bench
+    }
+
+    fn send(&mut self, scope: Scope, json: &Value) {
+        self.core.control(self.now, 0, scope, json.to_string().as_bytes());
+        self.collect();
+    }
+
+    fn step(&mut self, ms: u64) {
+        self.now += Duration::from_millis(ms);
+        self.core.tick(self.now, 0);
+        self.collect();
+    }
+
+    fn collect(&mut self) {
+        self.outputs.extend(std::iter::from_fn(|| self.core.poll()));
+    }
+
+    /// What was asked of brokers' channels since the last call.
+    fn channels(&mut self) -> Vec<String> {
+        let outputs = std::mem::take(&mut self.outputs);
+        let text = |output| match output {
+            Output::Prepare { scope, channel, depth } => Some(format!("+{scope} {channel} {depth}")),
+            Output::Release { scope, channel } => Some(format!("-{scope} {channel}")),
+            _ => None,
+        };
+        outputs.into_iter().filter_map(text).collect()
+    }
+
+    fn bridges(&self, topic: &str) -> Vec<String> {
+        let plan = self.core.plans().get(&topic.parse::<TopicName>().unwrap());
+        let text = |bridge: &Bridge| format!("{}>{:?}", bridge.from, bridge.to);
+        plan.iter().flat_map(|plan| &plan.bridges).map(text).collect()
+    }
+
+    fn routes(&self, topic: &str) -> Vec<(String, String)> {
+        let plan = &self.core.plans()[&topic.parse::<TopicName>().unwrap()];
+        let states = route_states(&self.core.config.me, plan, |scope| self.core.scopes.health(scope));
+        states.into_iter().map(|state| (state.step, state.code)).collect()
+    }
+}
+
+fn lease(op: &str, topic: &str) -> Value {
+    json!({"op": op, "topic": topic, "service": "a", "ttl_s": 0})
+}
+
+#[test]
+fn a_flow_is_starting_until_all_kept_leases_are_read() {
+    let mut bench = Bench::new();
+    bench.step(5000);
+    assert_eq!(bench.core.state(), FlowState::Starting);
+    let value = Bytes::from(lease("advertise", "imu/data").to_string());
+    let kept = [("advertise|imu/data|fog|fog-1|a|0".to_owned(), value)];
+    assert_eq!(bench.core.restore_leases(bench.now, Scope::Node, &kept).restored, 1);
+    assert!(!bench.core.is_reading_leases(Scope::Node) && bench.core.is_reading_leases(Scope::Layer));
+    bench.step(20);
+    assert_eq!(bench.core.state(), FlowState::Starting);
+    let value = Bytes::from(lease("request", "imu/data").to_string());
+    let kept = [("request|imu/data|fog||a|0".to_owned(), value)];
+    bench.core.restore_leases(bench.now, Scope::Layer, &kept);
+    bench.step(20);
+    assert_eq!(bench.core.state(), FlowState::Ready);
+    bench.step(300);
+    assert_eq!(bench.bridges("imu/data"), ["node>Layer"]);
+    let told = bench
+        .outputs
+        .iter()
+        .filter(|output| matches!(output, Output::Publish { .. }));
+    let events: Vec<String> = told.map(|output| format!("{output:?}")).collect();
+    assert!(
+        events.iter().all(|event| event.contains("route_up")),
+        "no refusal, no answer: {events:?}"
+    );
+    assert_eq!(bench.channels(), ["+node imu/data 0", "+layer imu/data 0"]);
+}
+
+#[test]
+fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
+    let mut bench = Bench::new();
+    bench.core.restore_leases(bench.now, Scope::Node, &[]);
+    bench.core.set_scope_health(bench.now, Scope::Layer, ScopeHealth::InUse);
+    bench.step(0);
+    assert_eq!(bench.core.state(), FlowState::Ready);
+    assert!(
+        bench
+            .outputs
+            .iter()
+            .any(|output| matches!(output, Output::LayerScope { shared: false }))
+    );
+    bench.send(Scope::Node, &lease("advertise", "t"));
+    bench.send(Scope::Layer, &lease("request", "t"));
+    bench.step(300);
+    assert_eq!(bench.bridges("t"), [""; 0]);
+
+    bench.outputs.clear();
+    bench.core.set_scope_health(bench.now, Scope::Layer, ScopeHealth::Up);
+    bench.step(300);
+    assert!(
+        bench
+            .outputs
+            .iter()
+            .any(|output| matches!(output, Output::LayerScope { shared: true }))
+    );
+    assert_eq!(bench.bridges("t"), ["node>Layer"]);
+    assert!(
+        bench.core.is_reading_leases(Scope::Layer),
+        "what is kept there may have changed"
+    );
+    bench.core.set_scope_health(bench.now, Scope::Node, ScopeHealth::InUse);
+    bench.step(300);
+    assert_eq!(bench.bridges("t"), [""; 0]);
+}
+
+#[test]
+fn a_channel_is_made_before_the_answer_and_kept_while_it_is_used() {
+    let mut bench = Bench::ready();
+    bench.outputs.clear();
+    let mut advertise = lease("advertise", "map");
+    advertise["durability"] = json!("transient_local");
+    advertise["depth"] = json!(3);
+    advertise["id"] = json!("7");
+    advertise["reply_to"] = json!("blaze/reply/mapper-0");
+    bench.send(Scope::Layer, &advertise);
+    let order: Vec<&str> = bench
+        .outputs
+        .iter()
+        .filter_map(|output| match output {
+            Output::Prepare { depth: 3, .. } => Some("prepare"),
+            Output::SaveLease(lease) if lease.scope == Scope::Layer => Some("save"),
+            Output::Publish {
+                scope: Scope::Layer,
+                channel,
+                ..
+            } if *channel == ChannelName::shared_reply() => Some("answer"),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(order, ["prepare", "save", "answer"], "{:?}", bench.outputs);
+    bench.outputs.clear();
+
+    bench.send(Scope::Node, &lease("request", "map"));
+    bench.step(300);
+    assert_eq!(bench.channels(), ["+node map 0"]);
+    bench.send(Scope::Layer, &lease("withdraw", "map"));
+    assert_eq!(bench.channels(), ["-layer map"]);
+    // Written by a bridge alone it is in use, too.
+    bench.send(Scope::Node, &lease("advertise", "odom"));
+    bench.send(Scope::Layer, &lease("request", "odom"));
+    bench.step(300);
+    assert_eq!(bench.channels(), ["+node odom 0", "+layer odom 0"]);
+    bench.send(Scope::Layer, &lease("withdraw", "odom"));
+    assert_eq!(bench.channels(), [""; 0], "the bridge still writes it");
+    bench.step(300);
+    assert_eq!(bench.channels(), ["-layer odom"]);
+}
+
+#[test]
+fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
+    let mut bench = Bench::ready();
+    // Another node of the layer asks for `imu_data` of this node: only the way over Kafka is between them.
+    let hello = blaze_proto::link::link_control::Hello {
+        layer: "fog".into(),
+        node: "fog-2".into(),
+        kind: blaze_proto::link::link_control::Kind::Fog.into(),
+        epoch: 1,
+        state: blaze_proto::link::link_control::State::Ready.into(),
+        layer_scope_id: LayerScopeId::kafka("").0,
+        registry_version: 1,
+        ..Default::default()
+    };
+    let other: FlowId = "fog/fog-2".parse().unwrap();
+    let entry = blaze_proto::link::link_control::Entry {
+        topic: "imu_data".into(),
+        node_request: Some(Default::default()),
+        ..Default::default()
+    };
+    let delta = blaze_proto::link::link_control::Delta {
+        from_version: 0,
+        to_version: 1,
+        part: 0,
+        parts: 1,
+        entries: vec![entry],
+    };
+    bench.core.link_event(
+        bench.now,
+        LinkEvent::Hello {
+            from: other.clone(),
+            hello: Box::new(hello),
+        },
+    );
+    bench.core.link_event(
+        bench.now,
+        LinkEvent::Control {
+            from: other,
+            body: Body::Delta(delta),
+        },
+    );
+    bench.send(Scope::Node, &lease("advertise", "imu_data"));
+    bench.step(300);
+    assert_eq!(bench.bridges("imu_data"), ["node>Layer"]);
+    bench.send(Scope::Node, &lease("withdraw", "imu_data"));
+    bench.step(300);
+    bench.send(Scope::Layer, &lease("advertise", "imu/data"));
+    bench.send(Scope::Node, &lease("advertise", "imu_data"));
+    bench.step(300);
+    assert_eq!(bench.bridges("imu_data"), [""; 0]);
+    assert_eq!(
+        bench.routes("imu_data"),
+        [("plan".to_owned(), "name_collision".to_owned())]
+    );
+    let blocked = &bench.core.plans()[&"imu_data".parse::<TopicName>().unwrap()].blocked;
+    assert!(blocked[0].detail.contains("imu/data"), "{blocked:?}");
+    bench.send(Scope::Layer, &lease("withdraw", "imu/data"));
+    bench.step(6000);
+    bench.step(300);
+    assert_eq!(bench.bridges("imu_data"), ["node>Layer"], "the name is free");
+}
+
+#[test]
+fn other_flows_are_told_of_brokers_that_are_away() {
+    let mut bench = Bench::ready();
+    bench.send(Scope::Node, &lease("advertise", "t"));
+    bench.send(Scope::Layer, &lease("request", "t"));
+    bench.step(300);
+    let state = |step: &str, code: &str| vec![(step.to_owned(), code.to_owned())];
+    assert_eq!(bench.routes("t"), state("deliver", "ok"));
+    bench.core.set_scope_health(bench.now, Scope::Layer, ScopeHealth::Away);
+    assert_eq!(bench.routes("t"), state("deliver", "broker_down"));
+    bench.core.set_scope_health(bench.now, Scope::Node, ScopeHealth::Away);
+    assert_eq!(bench.routes("t"), state("bridge", "broker_down"));
+}

@@ -1,0 +1,89 @@
+//! The epochs of one flow's lives: the clock in milliseconds, and always larger than the last.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use blaze_domain::FlowId;
+
+use super::plane::wall_ns;
+
+/// Gives a flow its epochs. Clones share them.
+#[derive(Debug, Clone)]
+pub struct Epochs {
+    me: FlowId,
+    state_dir: Option<PathBuf>,
+    first: u64,
+    last: Arc<AtomicU64>,
+}
+
+impl Epochs {
+    /// Begins a life of a flow. Without a directory the clock alone gives the epochs.
+    ///
+    /// # Errors
+    /// The epoch cannot be kept in the directory.
+    pub fn begin(me: &FlowId, state_dir: Option<&Path>) -> io::Result<Self> {
+        let mut epochs = Self {
+            me: me.clone(),
+            state_dir: state_dir.map(Path::to_owned),
+            first: 0,
+            last: Arc::default(),
+        };
+        epochs.first = epochs.next()?;
+        Ok(epochs)
+    }
+
+    /// The epoch that the flow began with. Its brokers know it by this one.
+    #[must_use]
+    pub fn first(&self) -> u64 {
+        self.first
+    }
+
+    fn next(&self) -> io::Result<u64> {
+        let given = match &self.state_dir {
+            Some(dir) => blaze_runtime::state::next_epoch(dir, self.me.layer.as_str(), self.me.node.as_str())?,
+            None => clock_ms(),
+        };
+        Ok(self.after_last(given))
+    }
+
+    /// One for a rebuilt participant: a directory that cannot be written any more does not hold it up.
+    pub(super) fn renew(&self) -> u64 {
+        self.next().unwrap_or_else(|error| {
+            tracing::warn!(%error, "the epoch is not kept");
+            self.after_last(clock_ms())
+        })
+    }
+
+    /// The clock may have been set back.
+    fn after_last(&self, given: u64) -> u64 {
+        let newer = |last: u64| given.max(last + 1);
+        let before = self
+            .last
+            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |last| Some(newer(last)));
+        newer(before.unwrap_or_else(|last| last))
+    }
+}
+
+fn clock_ms() -> u64 {
+    wall_ns() / 1_000_000
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn epochs_grow_and_the_first_one_stays_known() {
+        let directory = tempfile::tempdir().unwrap();
+        let me: FlowId = "edge/robot-1".parse().unwrap();
+        let epochs = Epochs::begin(&me, Some(directory.path())).unwrap();
+        let again = epochs.clone();
+        let (second, third) = (epochs.renew(), again.renew());
+        assert!(epochs.first() < second && second < third);
+        assert_eq!(again.first(), epochs.first());
+        let next_life = Epochs::begin(&me, Some(directory.path())).unwrap();
+        assert!(next_life.first() > third);
+    }
+}

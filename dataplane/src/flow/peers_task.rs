@@ -1,0 +1,286 @@
+//! Flows that share a Kafka broker tell one another that they live, so that two layers never use one.
+//!
+//! ```text
+//! every 500 ms: own Hello ─► blaze/flow/peers ─► Hellos of all ─► Claims ─► stand back, or not
+//! ```
+//!
+//! Of two layers with one broker and one prefix the one whose flow began first has it; the other's flows bridge nothing there
+//! until they have not heard of it for 2.5 s.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use blaze_brokers::{Broker, Content, FlowSide, PublisherOptions, Received, SubscribeOptions, Subscription};
+use blaze_domain::names::ChannelName;
+use blaze_domain::{FlowId, LayerKind};
+use blaze_proto::link::LinkControl;
+use blaze_proto::link::link_control::{Body, Hello, Kind, LayerScope, State};
+use bytes::Bytes;
+use prost::Message as _;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use crate::control::LISTEN;
+use crate::world::LayerScopeId;
+
+/// Between two Hellos.
+const HELLO_EVERY: Duration = Duration::from_millis(500);
+/// A Hello counts this long.
+const LIVE: Duration = Duration::from_millis(2500);
+/// Flows that are followed.
+const MAX_FLOWS: usize = 1024;
+/// Hellos that are taken at once.
+const BATCH: usize = 64;
+
+/// Who else says Hello on the layer broker.
+pub(super) struct Claims {
+    me: FlowId,
+    epoch: u64,
+    others: BTreeMap<FlowId, (u64, Instant)>,
+}
+
+/// Whose a Hello is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Heard {
+    /// Of this flow, or no Hello at all.
+    Nobody,
+    /// Of another flow of the own layer, which shares the broker.
+    Replica,
+    /// Of another layer's flow, which should not be there.
+    Stranger,
+}
+
+impl Claims {
+    pub(super) fn new(me: FlowId, epoch: u64) -> Self {
+        Self {
+            me,
+            epoch,
+            others: BTreeMap::new(),
+        }
+    }
+
+    /// Takes what came on the channel.
+    pub(super) fn hear(&mut self, now: Instant, payload: &[u8]) {
+        let Ok(LinkControl {
+            body: Some(Body::Hello(hello)),
+        }) = LinkControl::decode(payload)
+        else {
+            return;
+        };
+        let Ok(flow) = format!("{}/{}", hello.layer, hello.node).parse::<FlowId>() else {
+            return;
+        };
+        match self.whose(&flow) {
+            // Replicas share the broker on purpose.
+            Heard::Nobody | Heard::Replica => {}
+            Heard::Stranger => {
+                if self.others.len() < MAX_FLOWS || self.others.contains_key(&flow) {
+                    self.others.insert(flow, (hello.epoch, now));
+                }
+            }
+        }
+    }
+
+    fn whose(&self, flow: &FlowId) -> Heard {
+        if *flow == self.me {
+            Heard::Nobody
+        } else if flow.layer == self.me.layer {
+            Heard::Replica
+        } else {
+            Heard::Stranger
+        }
+    }
+
+    /// The flow of another layer that was first, if there is one that lives.
+    pub(super) fn first(&mut self, now: Instant) -> Option<&FlowId> {
+        self.others
+            .retain(|_, (_, heard)| now.saturating_duration_since(*heard) < LIVE);
+        let own = (self.epoch, &self.me);
+        let others = self.others.iter().map(|(flow, (epoch, _))| (*epoch, flow));
+        others.filter(|other| *other < own).min().map(|(_, flow)| flow)
+    }
+}
+
+/// Says Hello on the layer broker and stands back where another layer was first.
+pub(super) struct PeersTask {
+    pub(super) broker: Arc<dyn Broker>,
+    pub(super) side: Arc<dyn FlowSide>,
+    pub(super) channel: ChannelName,
+    pub(super) me: FlowId,
+    pub(super) kind: LayerKind,
+    pub(super) epoch: u64,
+    pub(super) scope: LayerScopeId,
+    /// Is told when this flow has listened long enough to know who was first.
+    pub(super) listened: watch::Sender<bool>,
+    pub(super) stop: CancellationToken,
+}
+
+impl PeersTask {
+    pub(super) async fn run(self) {
+        let mut claims = Claims::new(self.me.clone(), self.epoch);
+        let hello = self.hello();
+        let mut publisher = None;
+        let mut subscription: Option<Subscription> = None;
+        let mut since = Instant::now();
+        let mut standing_back = false;
+        let mut batch = Vec::with_capacity(BATCH);
+        let mut tick = tokio::time::interval(HELLO_EVERY);
+        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        loop {
+            if subscription.is_none() {
+                subscription = self
+                    .broker
+                    .subscribe(&self.channel, SubscribeOptions::default())
+                    .await
+                    .ok();
+                since = Instant::now();
+            }
+            if publisher.is_none() {
+                publisher = self.broker.publisher(&self.channel, PublisherOptions::default()).ok();
+            }
+            let ended = tokio::select! {
+                () = self.stop.cancelled() => return,
+                _ = tick.tick() => {
+                    if let Some(publisher) = &publisher {
+                        // One that waits longer would be followed by a newer one.
+                        publisher.publish_bare(&hello, Some(Instant::now() + HELLO_EVERY));
+                    }
+                    false
+                }
+                ended = receive(&mut subscription, &mut batch) => ended,
+            };
+            let now = Instant::now();
+            for received in batch.drain(..) {
+                if let Content::Bare { payload, .. } = &received.content {
+                    claims.hear(now, payload);
+                }
+            }
+            let first = claims.first(now);
+            if first.is_some() != standing_back {
+                standing_back = first.is_some();
+                match first {
+                    Some(first) => {
+                        tracing::warn!(%first, "another layer's flow uses this Kafka: give each layer a prefix")
+                    }
+                    None => tracing::info!("the Kafka of this layer is free again"),
+                }
+                self.side.stand_back(first.map(ToString::to_string));
+            }
+            if subscription.is_some() && now.saturating_duration_since(since) >= LISTEN {
+                self.listened.send_replace(true);
+            }
+            if ended {
+                subscription = None;
+            }
+        }
+    }
+
+    fn hello(&self) -> Bytes {
+        let kind = match self.kind {
+            LayerKind::Edge => Kind::Edge,
+            LayerKind::Fog => Kind::Fog,
+            LayerKind::Cloud => Kind::Cloud,
+        };
+        let hello = Hello {
+            layer: self.me.layer.to_string(),
+            node: self.me.node.to_string(),
+            kind: kind.into(),
+            epoch: self.epoch,
+            state: State::Ready.into(),
+            layer_scope: LayerScope::Kafka.into(),
+            layer_scope_id: self.scope.0,
+            ..Hello::default()
+        };
+        let message = LinkControl {
+            body: Some(Body::Hello(hello)),
+        };
+        Bytes::from(message.encode_to_vec())
+    }
+}
+
+/// Waits for Hellos; true when the subscription has ended. Never returns without one.
+async fn receive(subscription: &mut Option<Subscription>, batch: &mut Vec<Received>) -> bool {
+    match subscription {
+        Some(subscription) => subscription.receive(batch, BATCH).await == 0,
+        None => std::future::pending().await,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn hello(flow: &str, epoch: u64) -> Vec<u8> {
+        let (layer, node) = flow.split_once('/').unwrap();
+        let hello = Hello {
+            layer: layer.to_owned(),
+            node: node.to_owned(),
+            epoch,
+            ..Hello::default()
+        };
+        LinkControl {
+            body: Some(Body::Hello(hello)),
+        }
+        .encode_to_vec()
+    }
+
+    /// Who is first after these Hellos, seen by `cloud/b` with epoch 10.
+    fn first_of(hellos: &[(&str, u64)]) -> Option<String> {
+        let now = Instant::now();
+        let mut claims = Claims::new("cloud/b".parse().unwrap(), 10);
+        for (flow, epoch) in hellos {
+            claims.hear(now, &hello(flow, *epoch));
+        }
+        claims.first(now).map(ToString::to_string)
+    }
+
+    #[test]
+    fn whoever_began_first_has_the_broker() {
+        assert_eq!(first_of(&[]), None);
+        assert_eq!(first_of(&[("fog/a", 9)]).as_deref(), Some("fog/a"));
+        assert_eq!(first_of(&[("fog/a", 11)]), None);
+        assert_eq!(first_of(&[("fog/a", 9), ("edge/x", 8)]).as_deref(), Some("edge/x"));
+        assert_eq!(
+            first_of(&[("a/z", 10)]).as_deref(),
+            Some("a/z"),
+            "of equal epochs the smaller name"
+        );
+        assert_eq!(first_of(&[("fog/a", 10)]), None);
+        assert_eq!(
+            first_of(&[("cloud/a", 1), ("cloud/b", 2)]),
+            None,
+            "the own layer shares it"
+        );
+    }
+
+    #[test]
+    fn one_that_is_silent_for_2500_ms_is_gone() {
+        let now = Instant::now();
+        let mut claims = Claims::new("cloud/b".parse().unwrap(), 10);
+        claims.hear(now, &hello("fog/a", 9));
+        assert!(claims.first(now + Duration::from_millis(2499)).is_some());
+        claims.hear(now + Duration::from_millis(2499), &hello("fog/a", 9));
+        assert!(claims.first(now + Duration::from_millis(4998)).is_some());
+        assert!(claims.first(now + Duration::from_millis(4999)).is_none());
+        claims.hear(now + Duration::from_secs(6), &hello("fog/a", 12));
+        assert!(
+            claims.first(now + Duration::from_secs(6)).is_none(),
+            "it began anew, after us"
+        );
+    }
+
+    #[test]
+    fn garbage_and_crowds_do_no_harm() {
+        let now = Instant::now();
+        let mut claims = Claims::new("cloud/b".parse().unwrap(), 10);
+        for payload in [&b""[..], b"\xff\xff\xff", b"{}"] {
+            claims.hear(now, payload);
+        }
+        claims.hear(now, &hello("Fog/A", 1));
+        for n in 0..2 * MAX_FLOWS {
+            claims.hear(now, &hello(&format!("fog/n{n}"), 20));
+        }
+        assert!(claims.others.len() == MAX_FLOWS && claims.first(now).is_none());
+    }
+}

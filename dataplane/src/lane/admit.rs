@@ -1,0 +1,168 @@
+//! The way in of a message from a local scope: its identity, its origin, whether it was seen before, its age.
+
+use std::time::Instant;
+
+use blaze_brokers::{Content, Received};
+use blaze_domain::{DropReason, Origin, Scope, WriterId};
+use blaze_proto::{Frame, Header};
+use bytes::Bytes;
+
+use super::core::{DataConfig, DataCore};
+use super::measure::micros;
+use super::path::TopicId;
+use super::window::DuplicateWindow;
+
+/// Where a message stands when it reaches the bridges.
+pub(super) struct Admitted {
+    /// As a broker gets it: with the hop that writing it is, and its age.
+    pub(super) frame: Frame,
+    /// Flows that wrote it so far, this one not among them.
+    pub(super) hops: u32,
+    pub(super) born_here: bool,
+    pub(super) age_us: u64,
+    /// Since it came to this flow.
+    pub(super) here_us: u64,
+}
+
+impl Admitted {
+    pub(super) fn new(frame: Frame, born_here: bool, age_us: u64, here_us: u64) -> Self {
+        let hops = frame.hops();
+        Self {
+            frame: frame.with_hops_and_age(hops.saturating_add(1), age_us),
+            hops,
+            born_here,
+            age_us,
+            here_us,
+        }
+    }
+}
+
+impl DataCore {
+    pub(super) fn check_local(
+        &mut self,
+        now: Instant,
+        wall_ns: u64,
+        topic: TopicId,
+        from: Scope,
+        received: Received,
+    ) -> Result<Admitted, DropReason> {
+        let at = received.at;
+        let waited_us = received.broker_age_us + micros(now.saturating_duration_since(at));
+        let (frame, bare) = match received.content {
+            Content::Malformed { .. } => return Err(DropReason::DecodeError),
+            Content::Frame(frame) => (frame, false),
+            Content::Bare { payload, identity } => (
+                self.wrap(wall_ns.saturating_sub(waited_us * 1000), topic, from, payload, identity)?,
+                true,
+            ),
+        };
+        if frame.topic() != self.path(topic).name.as_str() {
+            return Err(DropReason::DecodeError);
+        }
+        let born_here = frame.hops() == 0;
+        if from == Scope::Node && !born_here {
+            // Only this flow writes to its node scope, and what it writes carries hops.
+            return Err(DropReason::Echo);
+        }
+        let me = &self.config.me;
+        let own_layer = frame.origin_layer() == me.layer.as_str();
+        let own_node = frame.origin_node() == me.node.as_str();
+        let foreign = match from {
+            Scope::Node => !(own_layer && own_node),
+            Scope::Layer | Scope::Inter => born_here && !own_layer,
+        };
+        // Before the window takes the number: a foreign message must not silence the writer whose name it bears.
+        if foreign {
+            return Err(DropReason::ForeignOrigin);
+        }
+        if !self.is_new(topic, &frame) {
+            // What a flow has written carries hops; a publisher that repeats itself does not.
+            return Err(if born_here {
+                DropReason::Duplicate
+            } else {
+                DropReason::Echo
+            });
+        }
+        let mut age_us = frame.age_us().saturating_add(waited_us);
+        if from == Scope::Node && !bare {
+            // One host, one clock: the publisher's time tells what nobody could measure.
+            age_us = age_us.max(wall_ns.saturating_sub(frame.publish_time_ns()) / 1000);
+        }
+        let path = &mut self.topics[topic.0 as usize];
+        let bytes = frame.payload().len() as u64;
+        path.largest_bytes = path.largest_bytes.max(bytes);
+        path.in_rate.add(now, bytes);
+        let here_us = micros(now.saturating_duration_since(at));
+        Ok(Admitted::new(frame, born_here, age_us, here_us))
+    }
+
+    /// Gives a bare payload its header.
+    fn wrap(
+        &mut self,
+        publish_time_ns: u64,
+        topic: TopicId,
+        from: Scope,
+        payload: Bytes,
+        identity: Option<(WriterId, u64)>,
+    ) -> Result<Frame, DropReason> {
+        let config = &self.config;
+        let path = &mut self.topics[topic.0 as usize];
+        let (writer, sequence) = identity.unwrap_or_else(|| {
+            let (writer, sequence) = path
+                .bare
+                .entry(from)
+                .or_insert_with(|| (bare_writer(config, from, path.name.as_str()), 0));
+            *sequence += 1;
+            (*writer, *sequence)
+        });
+        let info = path.info.bare(from);
+        let node = if from == Scope::Node {
+            config.me.node.to_string()
+        } else {
+            String::new()
+        };
+        let origin = Origin {
+            layer: config.me.layer.to_string(),
+            node,
+            service: info.service.clone(),
+            instance: info.instance.clone(),
+            epoch: config.epoch,
+        };
+        let header = Header {
+            encoding: info.encoding.clone(),
+            lifespan_ms: info.lifespan_ms,
+            priority: info.priority,
+            reliable: info.reliable,
+            depth: info.depth,
+            ..Header::new(path.name.as_str(), origin, writer, sequence, publish_time_ns)
+        };
+        Frame::new(&header, payload).map_err(|_| DropReason::TooLarge)
+    }
+
+    pub(super) fn is_new(&mut self, topic: TopicId, frame: &Frame) -> bool {
+        let key = (topic, frame.writer());
+        if let Some(window) = self.windows.get_mut(&key) {
+            return window.insert(frame.sequence());
+        }
+        if self.windows.len() == self.windows.cap().get() {
+            self.evicted_writers += 1;
+        }
+        let mut window = DuplicateWindow::default();
+        window.insert(frame.sequence());
+        self.windows.put(key, window);
+        true
+    }
+}
+
+/// Writer of bare messages that this flow numbers: new at each start of the flow.
+fn bare_writer(config: &DataConfig, from: Scope, topic: &str) -> WriterId {
+    use sha2::{Digest, Sha256};
+    let text = format!(
+        "{from}|{}|{}|{topic}|{}|{}",
+        config.me.layer, config.me.node, config.epoch, config.salt
+    );
+    let digest = Sha256::digest(text.as_bytes());
+    let mut id = [0; 16];
+    id.copy_from_slice(&digest[..16]);
+    WriterId(id)
+}

@@ -1,0 +1,149 @@
+//! Topics and bridges come, go and are forgotten: which has which place in the message path.
+
+use std::collections::HashSet;
+use std::time::Instant;
+
+use blaze_domain::TopicName;
+
+use super::core::{DRAIN, DataCore, FORGET, MAX_TOPICS};
+use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
+use super::writer::NewWriter;
+use crate::link::LaneId;
+use crate::plan::{Bridge, Target, TopicPlan};
+
+impl DataCore {
+    /// Forgets topics that nobody has used for [`FORGET`]; to be called every few seconds. Returns how many.
+    pub fn forget_unused(&mut self, now: Instant) -> usize {
+        let before = self.vacant.len();
+        for (index, path) in self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant) {
+            if !path.is_idle() {
+                path.idle = None;
+                continue;
+            }
+            let since = *path.idle.get_or_insert(now);
+            if now.saturating_duration_since(since) < FORGET {
+                continue;
+            }
+            self.by_name.remove(&path.name);
+            self.free_lanes
+                .extend(path.bridges.iter().filter_map(BridgeState::lane_id));
+            path.bridges = Vec::new();
+            path.bare.clear();
+            path.vacant = true;
+            self.vacant.push(topic_id(index));
+        }
+        let forgotten: HashSet<TopicId> = self.vacant[before..].iter().copied().collect();
+        if !forgotten.is_empty() {
+            let windows = self.windows.iter().map(|(key, _)| *key);
+            let gone: Vec<_> = windows.filter(|(topic, _)| forgotten.contains(topic)).collect();
+            for key in gone {
+                self.windows.pop(&key);
+            }
+        }
+        forgotten.len()
+    }
+
+    /// The number of a topic, given at first use. `None` when there are [`MAX_TOPICS`] already.
+    pub fn intern(&mut self, name: &TopicName, now: Instant) -> Option<TopicId> {
+        if let Some(id) = self.by_name.get(name) {
+            return Some(*id);
+        }
+        let path = TopicPath::new(name.clone(), now);
+        let id = match self.vacant.pop() {
+            Some(id) => {
+                self.topics[id.0 as usize] = path;
+                id
+            }
+            None if self.topics.len() >= MAX_TOPICS => return None,
+            None => {
+                self.topics.push(path);
+                topic_id(self.topics.len() - 1)
+            }
+        };
+        self.by_name.insert(name.clone(), id);
+        Some(id)
+    }
+
+    /// Makes the bridges of a topic equal to its plan. `writer` gives what writes to a local target, for each bridge one of
+    /// its own, or says why it cannot be made: then the bridge has failed. Bridges that are no longer planned drain.
+    pub fn apply(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        info: TopicInfo,
+        plan: &TopicPlan,
+        mut writer: impl FnMut(&Bridge) -> Result<NewWriter, String>,
+    ) {
+        let path = &mut self.topics[topic.0 as usize];
+        path.info = info;
+        for bridge in &mut path.bridges {
+            let planned = plan
+                .bridges
+                .iter()
+                .any(|p| p.from == bridge.from && p.to == bridge.target);
+            match bridge.phase {
+                Phase::Up { .. } if !planned => {
+                    bridge.phase = Phase::Draining { until: now + DRAIN };
+                    self.draining = true;
+                }
+                Phase::Failed { .. } if !planned => bridge.end(now),
+                _ => {}
+            }
+        }
+        for planned in &plan.bridges {
+            let at = self.place_of(now, topic, planned);
+            let bridge = &mut self.topics[topic.0 as usize].bridges[at];
+            bridge.renew(now, planned);
+            if let Sink::Publish { .. } = bridge.sink {
+                bridge.set_writer(now, writer(planned));
+            }
+        }
+    }
+
+    /// Where the bridge is in its topic; it is made where there is none yet.
+    fn place_of(&mut self, now: Instant, topic: TopicId, planned: &Bridge) -> usize {
+        let path = &mut self.topics[topic.0 as usize];
+        let same = |b: &BridgeState| b.from == planned.from && b.target == planned.to;
+        if let Some(at) = path.bridges.iter().position(same) {
+            return at;
+        }
+        let class = path.class(&planned.lane, self.config.large_bytes);
+        let old = path.bridges.iter().position(|bridge| bridge.is_forgotten(now));
+        let at = old.unwrap_or(path.bridges.len());
+        let old_lane = old.and_then(|at| path.bridges[at].lane_id());
+        let sink = match &planned.to {
+            Target::Inter { .. } => {
+                let lane = old_lane.or_else(|| self.free_lanes.pop()).unwrap_or_else(|| {
+                    self.lanes.push((topic, at));
+                    LaneId(u32::try_from(self.lanes.len() - 1).unwrap_or(u32::MAX))
+                });
+                if let Some(place) = self.lanes.get_mut(lane.0 as usize) {
+                    *place = (topic, at);
+                }
+                Sink::Lane { lane, class }
+            }
+            target => {
+                self.free_lanes.extend(old_lane);
+                Sink::Publish {
+                    writer: None,
+                    past: Vec::new(),
+                    bare: is_bare(target),
+                }
+            }
+        };
+        let bridge = BridgeState::new(now, planned, sink);
+        match path.bridges.get_mut(at) {
+            Some(place) => *place = bridge,
+            None => path.bridges.push(bridge),
+        }
+        at
+    }
+}
+
+pub(super) fn topic_id(index: usize) -> TopicId {
+    TopicId(u32::try_from(index).unwrap_or(u32::MAX))
+}
+
+fn is_bare(target: &Target) -> bool {
+    matches!(target, Target::Node { bare: true })
+}

@@ -1,0 +1,95 @@
+//! From a control message to the lease that it makes, and to whoever holds it.
+
+use std::time::{Duration, Instant};
+
+use blaze_domain::control::{Common, ControlError, ControlMessage, ErrorCode, LeaseKind};
+use blaze_domain::{FlowId, LayerName, NodeName, Scope, TopicName};
+
+use super::leases::{Lease, LeaseKey, Terms};
+
+/// Who holds the lease that a message is about.
+pub(super) fn key_of(
+    scope: Scope,
+    me: &FlowId,
+    kind: LeaseKind,
+    common: &Common,
+    pointer: &str,
+) -> Result<LeaseKey, ControlError> {
+    let (layer, node) = holder(scope, me, common, pointer)?;
+    Ok(LeaseKey {
+        scope,
+        kind,
+        layer,
+        node,
+        service: common.service.clone(),
+        instance: common.instance.clone(),
+    })
+}
+
+/// The lease that a message grants or renews; a withdrawal has none.
+pub(super) fn lease_of<'m>(
+    now: Instant,
+    scope: Scope,
+    me: &FlowId,
+    message: &'m ControlMessage,
+    pointer: &str,
+) -> Result<(&'m TopicName, LeaseKey, Lease), ControlError> {
+    let (kind, ttl_s, terms) = match message {
+        ControlMessage::Advertise(message) => (
+            LeaseKind::Advertise,
+            message.ttl_s,
+            Terms::Advertise {
+                rate_hz: message.rate_hz,
+                max_bytes: message.max_bytes,
+                quality: message.quality.clone(),
+            },
+        ),
+        ControlMessage::Request(message) => (
+            LeaseKind::Request,
+            message.ttl_s,
+            Terms::Request {
+                max_rate_hz: message.max_rate_hz,
+                bare: message.bare,
+                from: message.from.clone(),
+                quality: message.quality.clone(),
+            },
+        ),
+        ControlMessage::Withdraw(_) => {
+            let error = ControlError::new(ErrorCode::UnknownOp, pointer, "a withdrawal grants nothing");
+            return Err(error);
+        }
+    };
+    let common = message.common();
+    let lease = Lease {
+        epoch: common.epoch,
+        ttl_s,
+        expires_at: (ttl_s > 0).then(|| now + Duration::from_secs(ttl_s.into())),
+        terms,
+    };
+    Ok((&common.topic, key_of(scope, me, kind, common, pointer)?, lease))
+}
+
+/// Layer and node of whoever speaks: where it was received, unless it says otherwise and may.
+pub(super) fn holder(
+    scope: Scope,
+    me: &FlowId,
+    common: &Common,
+    pointer: &str,
+) -> Result<(LayerName, Option<NodeName>), ControlError> {
+    let mismatch = |field: &str, found: &str, here: &str| {
+        Err(ControlError::new(
+            ErrorCode::SourceMismatch,
+            format!("{pointer}/{field}"),
+            format!("{found} is not the {field} where the message was received, {here}"),
+        ))
+    };
+    match &common.layer {
+        Some(layer) if *layer != me.layer => return mismatch("layer", layer.as_str(), me.layer.as_str()),
+        _ => {}
+    }
+    match (scope, &common.node) {
+        (Scope::Node, Some(node)) if *node != me.node => mismatch("node", node.as_str(), me.node.as_str()),
+        (Scope::Node, _) => Ok((me.layer.clone(), Some(me.node.clone()))),
+        (Scope::Layer | Scope::Inter, node) => Ok((me.layer.clone(), node.clone())),
+    }
+}
