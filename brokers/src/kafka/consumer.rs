@@ -37,6 +37,9 @@ use crate::port::{Content, Received, SubscriptionSender};
 /// How long the thread may sleep: closing waits for that.
 const POLL: Duration = Duration::from_millis(100);
 
+/// How long a reader waits to learn of its topic.
+const LEARN: Duration = Duration::from_secs(1);
+
 type Client = BaseConsumer<ReadContext>;
 
 /// A topic that is to be read.
@@ -230,6 +233,7 @@ impl Consumer {
         kept: Option<&mut dyn FnMut() -> Vec<Received>>,
     ) -> Result<(), Refused> {
         let Some(client) = self.client.lock().clone() else { return Err(Refused::Closed) };
+        self.learn(&client, &source.topic);
         let mut state = self.state.lock();
         if state.closed {
             return Err(Refused::Closed);
@@ -267,6 +271,17 @@ impl Consumer {
         topic.take_in(sender, starts, kept);
         state.topics.insert(Arc::clone(&source.topic), topic);
         Ok(())
+    }
+
+    /// Lets the client ask for a topic that is new to it: by itself it does so once a second.
+    fn learn(&self, client: &Client, topic: &str) {
+        if self.state.lock().topics.contains_key(topic) {
+            return;
+        }
+        // Without an answer it asks again by itself.
+        if let Err(error) = client.fetch_metadata(Some(topic), LEARN) {
+            tracing::debug!(topic, %error, "the reader has not learnt of its topic");
+        }
     }
 
     /// The topics that are read or are to be read.

@@ -15,6 +15,8 @@ use super::settings::Settings;
 /// How long the log is read for an identity that is not there yet.
 const IDENTITY_TURN: Duration = Duration::from_millis(1);
 const IDENTITY_TURNS: usize = 10;
+/// How long to wait before a question is asked again that could not be answered yet.
+const AGAIN: Duration = Duration::from_millis(20);
 
 /// A topic as the server has it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -143,11 +145,14 @@ impl Directory {
     /// Where the partitions of a topic begin and end now. Waits for the answers.
     pub(super) fn marks(&self, topic: &str, partitions: usize, deadline: Instant) -> Result<Vec<Marks>, LookupError> {
         let client = self.client()?;
-        let mark = |partition: usize| {
-            let left = deadline.saturating_duration_since(Instant::now()).max(IDENTITY_TURN);
+        let mark = |partition: usize| loop {
+            let left = deadline.saturating_duration_since(Instant::now());
             let number = i32::try_from(partition).unwrap_or(i32::MAX);
-            let (low, high) = client.fetch_watermarks(topic, number, left)?;
-            Ok(Marks { low, high })
+            match client.fetch_watermarks(topic, number, left.max(IDENTITY_TURN)) {
+                Ok((low, high)) => return Ok(Marks { low, high }),
+                Err(error) if is_passing(&error) && left > AGAIN => std::thread::sleep(AGAIN),
+                Err(error) => return Err(error.into()),
+            }
         };
         (0..partitions).map(mark).collect()
     }
@@ -157,6 +162,18 @@ impl Directory {
         let client = self.client.lock().take();
         drop(client);
     }
+}
+
+/// A topic that was just made has no leader for a moment.
+fn is_passing(error: &KafkaError) -> bool {
+    matches!(
+        error.rdkafka_error_code(),
+        Some(
+            RDKafkaErrorCode::NotLeaderForPartition
+                | RDKafkaErrorCode::LeaderNotAvailable
+                | RDKafkaErrorCode::UnknownTopicOrPartition
+        )
+    )
 }
 
 fn partitions_of(metadata: &Metadata, name: &str) -> Result<usize, LookupError> {

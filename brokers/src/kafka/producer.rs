@@ -33,8 +33,11 @@ use crate::outbox::{Body, Fate, Lane, Outbox, OutboxLimits, Receipt, Waiting};
 
 /// Most bytes that are with librdkafka and not acknowledged; one larger message may be.
 const WINDOW: usize = 1024 * 1024;
-/// Messages that are taken from the outbox at once.
-const BATCH: usize = 256;
+/// Messages that are handed over at once.
+const BATCH: usize = 1024;
+/// Batches that are with librdkafka and not acknowledged. It sends what it has as soon as it looks, in up to five requests
+/// per partition, and then looks all the time for room for a sixth: what it has not it cannot send in dribs.
+const BATCHES: usize = 1;
 /// How long the poll thread may sleep: closing and a fatal error wait for that.
 const POLL: Duration = Duration::from_millis(100);
 /// How often messages that wait are looked at for their deadlines.
@@ -109,15 +112,36 @@ pub(super) enum Delivery {
         topic: Arc<Topic>,
         bytes: usize,
         sent: Instant,
+        /// Ends with the last message of the batch.
+        batch: Arc<Batch>,
     },
     /// A value of a key; told whether the server has it.
     Keyed { done: oneshot::Sender<bool>, sent: Instant },
+}
+
+/// Messages that were handed over together.
+pub(super) struct Batch(Arc<WriteContext>);
+
+impl Batch {
+    fn begin(context: &Arc<WriteContext>) -> Arc<Self> {
+        context.batches.fetch_add(1, Ordering::AcqRel);
+        Arc::new(Self(Arc::clone(context)))
+    }
+}
+
+impl Drop for Batch {
+    fn drop(&mut self) {
+        self.0.batches.fetch_sub(1, Ordering::AcqRel);
+        self.0.room.notify_one();
+    }
 }
 
 /// What the client calls back.
 pub(super) struct WriteContext {
     /// Bytes that are with librdkafka and not acknowledged.
     in_flight: AtomicUsize,
+    /// Batches of which something is.
+    batches: AtomicUsize,
     room: Notify,
     fatal: AtomicBool,
     clock: Arc<Mutex<BrokerClock>>,
@@ -158,13 +182,16 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
                 topic,
                 bytes,
                 sent,
+                batch,
             } => {
                 let fate = match result {
                     Ok(_) => Fate::Delivered,
                     Err((error, _)) => self.0.failed(error, &topic),
                 };
                 receipt.settle(fate);
-                self.0.landed(bytes);
+                self.0.in_flight.fetch_sub(bytes, Ordering::AcqRel);
+                // The feeder may come when the room is counted.
+                drop(batch);
                 sent
             }
             Delivery::Keyed { done, sent } => {
@@ -180,14 +207,6 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
 }
 
 impl WriteContext {
-    fn landed(&self, bytes: usize) {
-        let before = self.in_flight.fetch_sub(bytes, Ordering::AcqRel);
-        // Not at every acknowledgement: the feeder comes once for many.
-        if before - bytes <= WINDOW / 2 {
-            self.room.notify_one();
-        }
-    }
-
     fn failed(&self, error: &KafkaError, topic: &Topic) -> Fate {
         let code = error.rdkafka_error_code();
         if matches!(
@@ -245,6 +264,7 @@ impl Producer {
             client: Mutex::new(None),
             context: Arc::new(WriteContext {
                 in_flight: AtomicUsize::new(0),
+                batches: AtomicUsize::new(0),
                 room: Notify::new(),
                 fatal: AtomicBool::new(false),
                 clock: Arc::clone(clock),
@@ -296,10 +316,10 @@ impl Producer {
     }
 
     async fn feed(&self, stop: CancellationToken) {
-        let mut batch = Vec::with_capacity(BATCH);
+        let mut taken = Vec::with_capacity(BATCH);
         let mut scratch = String::new();
         while !stop.is_cancelled() {
-            self.hand_over(&mut batch, &mut scratch);
+            self.hand_over(&mut taken, &mut scratch);
             let waits = !self.outbox.is_empty();
             tokio::select! {
                 () = stop.cancelled() => break,
@@ -312,8 +332,8 @@ impl Producer {
     }
 
     /// Hands over as much as there is room for.
-    fn hand_over(&self, batch: &mut Vec<Waiting<Target>>, scratch: &mut String) {
-        while self.gate.is_open() {
+    fn hand_over(&self, taken: &mut Vec<Waiting<Target>>, scratch: &mut String) {
+        while self.gate.is_open() && self.context.batches.load(Ordering::Acquire) < BATCHES {
             let in_flight = self.context.in_flight.load(Ordering::Acquire);
             if in_flight >= WINDOW {
                 return;
@@ -322,17 +342,18 @@ impl Producer {
             let is_ready = |to: &Target| to.topic.partitions().is_some() && self.gate.lets(to.topic.stays_open);
             let room = WINDOW - in_flight;
             self.outbox
-                .take_ready(Instant::now(), BATCH, room, in_flight == 0, is_ready, batch);
-            if batch.is_empty() {
+                .take_ready(Instant::now(), BATCH, room, in_flight == 0, is_ready, taken);
+            if taken.is_empty() {
                 return;
             }
-            for waiting in batch.drain(..) {
-                self.send(&client, waiting, scratch);
+            let batch = Batch::begin(&self.context);
+            for waiting in taken.drain(..) {
+                self.send(&client, waiting, &batch, scratch);
             }
         }
     }
 
-    fn send(&self, client: &Client, waiting: Waiting<Target>, scratch: &mut String) {
+    fn send(&self, client: &Client, waiting: Waiting<Target>, batch: &Arc<Batch>, scratch: &mut String) {
         let (bytes, target, sent) = (waiting.size(), Arc::clone(&waiting.to), Instant::now());
         let (payload, key, partition, headers);
         match &waiting.body {
@@ -363,6 +384,7 @@ impl Producer {
             topic: Arc::clone(&target.topic),
             bytes,
             sent,
+            batch: Arc::clone(batch),
         });
         let mut record = BaseRecord::<str, [u8], _>::with_opaque_to(&target.topic.name, delivery).payload(&payload);
         record.key = key.as_deref();
@@ -373,7 +395,7 @@ impl Producer {
             && let Delivery::Message { receipt, .. } = *record.delivery_opaque
         {
             receipt.settle(self.context.failed(&error, &target.topic));
-            self.context.landed(bytes);
+            self.context.in_flight.fetch_sub(bytes, Ordering::AcqRel);
         }
     }
 

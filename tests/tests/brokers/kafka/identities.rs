@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Content, PublishOutcome, Publisher as _, Role, SubscribeOptions};
+use blaze_brokers::{Content, PublishOutcome, Role, SubscribeOptions};
 use blaze_domain::WriterId;
 use blaze_domain::names::ChannelName;
 use blaze_tests::servers::unique_name;

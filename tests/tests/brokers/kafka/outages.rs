@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker as _, Health, Publisher as _, Role};
+use blaze_brokers::{Broker as _, Health, Role};
 
 use super::{Flow, frame, health, open, publish, publisher, reader, start_server};
 

@@ -2,14 +2,14 @@
 
 use std::collections::BTreeMap;
 
-use blaze_brokers::{Broker as _, BrokerError, FlowSide, Health, PublishOutcome, Publisher as _, Role, SubscribeOptions};
+use blaze_brokers::{Broker as _, BrokerError, FlowSide, Health, PublishOutcome, Role, SubscribeOptions};
 use blaze_domain::WriterId;
 use blaze_domain::names::ChannelName;
 use blaze_tests::servers::unique_name;
 use bytes::Bytes;
 
 use super::plain::{delete_topic, make_topic, topic_uuid};
-use super::{Flow, eventually, frame, health, open, publish, publisher, reader, start_server, subscribe};
+use super::{Flow, eventually, frame, health, publish, publisher, reader, start_server, subscribe};
 
 const WITH_KEPT: SubscribeOptions = SubscribeOptions {
     max_messages: 4096,
