@@ -119,7 +119,7 @@ impl Raw {
         );
         edit(&mut header);
         let frame = Frame::new(&header, Bytes::from(sequence.to_string())).unwrap();
-        assert_eq!(self.to.publish(&frame), PublishOutcome::Taken);
+        assert_eq!(self.to.publish(&frame, None), PublishOutcome::Taken);
     }
 }
 
@@ -388,8 +388,8 @@ async fn repeats_and_malformed_messages_are_left_out_and_losses_counted() {
         raw.send(1, sequence, |_| {});
     }
     raw.send(2, 1, |_| {});
-    raw.to.publish_bare(&Bytes::from_static(b"BLZ1 is no frame"));
-    raw.to.publish_bare(&Bytes::from_static(b"bare"));
+    raw.to.publish_bare(&Bytes::from_static(b"BLZ1 is no frame"), None);
+    raw.to.publish_bare(&Bytes::from_static(b"bare"), None);
     let found: Vec<_> = (0..7).map(|_| heard.recv_timeout(DEADLINE).unwrap()).collect();
     let of_first: Vec<_> = found
         .iter()

@@ -82,6 +82,8 @@ struct TopicState {
     readers: Vec<Reader>,
     /// Whether the client reads it now.
     assigned: bool,
+    /// It was not there when its readers came: whatever it will hold came after them, so it is read from its beginning.
+    awaited: bool,
 }
 
 #[derive(Default)]
@@ -239,7 +241,9 @@ impl Consumer {
             return Err(Refused::Closed);
         }
         if let Some(topic) = state.topics.get_mut(&source.topic) {
-            if let (Some(known), Some(found)) = (&topic.uuid, &info.uuid)
+            if topic.awaited {
+                topic.came(info, &self.layer, &client);
+            } else if let (Some(known), Some(found)) = (&topic.uuid, &info.uuid)
                 && known != found
             {
                 topic.made_anew(found.clone(), &self.layer);
@@ -263,6 +267,7 @@ impl Consumer {
                 .collect(),
             readers: Vec::new(),
             assigned: false,
+            awaited: false,
         };
         topic.identify(info.uuid.clone(), &self.layer);
         topic
@@ -271,6 +276,38 @@ impl Consumer {
         topic.take_in(sender, starts, kept);
         state.topics.insert(Arc::clone(&source.topic), topic);
         Ok(())
+    }
+
+    /// Takes a reader in of a topic that is not there yet.
+    pub(super) fn add_awaiting(&self, source: &Source, sender: SubscriptionSender) -> Result<(), Refused> {
+        let mut state = self.state.lock();
+        if state.closed {
+            return Err(Refused::Closed);
+        }
+        tracing::debug!(topic = %source.topic, "the topic is not there yet; it is read as soon as it is");
+        let topic = state
+            .topics
+            .entry(Arc::clone(&source.topic))
+            .or_insert_with(|| TopicState {
+                source: source.clone(),
+                uuid: None,
+                partitions: Vec::new(),
+                readers: Vec::new(),
+                assigned: false,
+                awaited: true,
+            });
+        topic.take_in(sender, Vec::new(), None);
+        Ok(())
+    }
+
+    /// Whether a topic is waited for.
+    pub(super) fn is_awaited(&self, topic: &str) -> bool {
+        self.state.lock().topics.get(topic).is_some_and(|topic| topic.awaited)
+    }
+
+    /// Whether any topic is waited for.
+    pub(super) fn awaits_any(&self) -> bool {
+        self.state.lock().topics.values().any(|topic| topic.awaited)
     }
 
     /// Lets the client ask for a topic that is new to it: by itself it does so once a second.
@@ -370,6 +407,10 @@ impl Consumer {
         if topic.assigned {
             return;
         }
+        if topic.awaited {
+            topic.came(info, &self.layer, &client);
+            return;
+        }
         topic.identify(info.uuid.clone(), &self.layer);
         topic.grow(info.partitions, &self.layer);
         for (number, mark) in marks.iter().enumerate() {
@@ -427,6 +468,17 @@ impl TopicState {
             reader.starts.clear();
         }
         self.identify(Some(uuid), layer);
+    }
+
+    /// What was waited for is there: it is read from its beginning.
+    fn came(&mut self, info: &TopicInfo, layer: &str, client: &Client) {
+        self.identify(info.uuid.clone(), layer);
+        self.grow(info.partitions, layer);
+        self.awaited = false;
+        if let Err(error) = self.assign(client) {
+            tracing::warn!(topic = %self.source.topic, %error, "the topic cannot be read yet");
+            self.awaited = true;
+        }
     }
 
     fn grow(&mut self, partitions: usize, layer: &str) {

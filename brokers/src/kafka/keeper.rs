@@ -62,7 +62,7 @@ fn round(inner: &Inner, turn: usize) -> bool {
     for consumer in inner.consumers() {
         keep_reading(inner, &consumer, &listing, turn);
     }
-    inner.topics.absent(1).is_empty()
+    inner.topics.absent(1).is_empty() && !inner.consumers().iter().any(|consumer| consumer.awaits_any())
 }
 
 fn lost(inner: &Inner, reason: &str) -> bool {
@@ -114,7 +114,18 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
         }
     }
     let lost_position = consumer.take_lost_position();
+    let waiting = topics.iter().filter(|topic| consumer.is_awaited(topic)).count();
+    let mut looks = 0;
     for topic in topics {
+        let awaited = consumer.is_awaited(&topic);
+        if awaited {
+            looks += 1;
+            // A flow's list holds all that there is; a service asks for some of what it waits for, in turn.
+            let listed = listing.topics.iter().any(|(name, _)| **name == *topic);
+            if (inner.flow.is_some() && !listed) || (looks + turn) % waiting.div_ceil(PER_ROUND).max(1) != 0 {
+                continue;
+            }
+        }
         let resume = consumer.is_idle(&topic) && inner.gate.lets(false);
         if !resume && !lost_position {
             continue;

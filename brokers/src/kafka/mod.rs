@@ -344,7 +344,18 @@ impl Inner {
         if consumer.topics().len() >= MAX_CHANNELS {
             return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
         }
-        let info = self.directory.topic(&source.topic, SUBSCRIBE).map_err(refusal)?;
+        let info = match self.directory.topic(&source.topic, SUBSCRIBE) {
+            Ok(info) => info,
+            Err(LookupError::Missing(_)) => {
+                let (sender, subscription) = subscription(options);
+                consumer
+                    .add_awaiting(&source, sender)
+                    .map_err(|error| refused(&error))?;
+                self.bell.ring();
+                return Ok(subscription);
+            }
+            Err(error) => return Err(refusal(error)),
+        };
         let marks = self
             .directory
             .marks(&source.topic, info.partitions, deadline)

@@ -101,7 +101,7 @@ fn check_headers(record: &Record) {
     assert_eq!(record.header("blaze-origin"), "edge/robot-1/imu-driver/0");
     assert_eq!(record.header("blaze-encoding"), "application/json");
     assert_eq!(record.header("blaze-hops"), "2", "one on the link, one on Kafka");
-    assert_eq!(record.header("blaze-reliable"), "1");
+    assert_eq!(record.header("blaze-reliable"), "true");
     let writer = record.header("blaze-writer");
     assert!(writer.len() == 32 && writer.bytes().all(|b| b.is_ascii_hexdigit()), "{writer}");
     assert_eq!(String::from_utf8_lossy(&record.key), writer);
