@@ -299,13 +299,7 @@ impl<C> Outbox<C> {
 
     /// Takes messages in turns of the lanes until `messages` or `bytes` are reached (one message is always taken), and drops
     /// those whose time is over. Returns the bytes taken.
-    pub(crate) fn take(
-        &self,
-        now: Instant,
-        messages: usize,
-        bytes: usize,
-        into: &mut Vec<Waiting<C>>,
-    ) -> usize {
+    pub(crate) fn take(&self, now: Instant, messages: usize, bytes: usize, into: &mut Vec<Waiting<C>>) -> usize {
         self.take_ready(now, messages, bytes, true, |_| true, into)
     }
 
@@ -327,7 +321,9 @@ impl<C> Outbox<C> {
         let first = into.len();
         while into.len() - first < messages {
             let Some(id) = state.turns.pop_front() else { break };
-            let Some(queue) = state.lanes.get_mut(&id) else { continue };
+            let Some(queue) = state.lanes.get_mut(&id) else {
+                continue;
+            };
             if !is_ready(&queue.to) {
                 state.bytes -= queue.drop_overdue(now);
                 not_ready.push(id);
@@ -509,7 +505,10 @@ mod tests {
 
     #[test]
     fn lanes_take_turns_and_limits_stop_a_take() {
-        let outbox = Outbox::new(OutboxLimits { lane_messages: 100, ..SMALL });
+        let outbox = Outbox::new(OutboxLimits {
+            lane_messages: 100,
+            ..SMALL
+        });
         let (a, b) = (outbox.lane("a", None), outbox.lane("b", None));
         for count in 0..20 {
             a.push(bare(count, 10), None);
@@ -581,7 +580,13 @@ mod tests {
         drop(into.pop());
         drop(into.pop().map(Waiting::into_receipt));
         outbox.clear(DropReason::BrokerError);
-        assert_eq!(lane.later(), Later { broker_error: 3, ..Later::default() });
+        assert_eq!(
+            lane.later(),
+            Later {
+                broker_error: 3,
+                ..Later::default()
+            }
+        );
         outbox.close();
         assert_eq!(lane.push(bare(4, 10), None), PublishOutcome::Dropped);
     }

@@ -230,9 +230,8 @@ impl FlowProcess {
     /// Ids of the bridges that are up, sorted.
     #[must_use]
     pub fn bridges_up(&self) -> Vec<String> {
-        let up = |bridge: &Value| {
-            (bridge["state"] == "up").then(|| bridge["id"].as_str().unwrap_or_default().to_owned())
-        };
+        let up =
+            |bridge: &Value| (bridge["state"] == "up").then(|| bridge["id"].as_str().unwrap_or_default().to_owned());
         let mut ids: Vec<String> = self.bridges().iter().filter_map(up).collect();
         ids.sort();
         ids
@@ -268,7 +267,10 @@ impl FlowProcess {
     /// When the process has gone.
     pub fn rss_kib(&self) -> anyhow::Result<u64> {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.id()))?;
-        let line = status.lines().find(|line| line.starts_with("VmRSS:")).context("no VmRSS")?;
+        let line = status
+            .lines()
+            .find(|line| line.starts_with("VmRSS:"))
+            .context("no VmRSS")?;
         Ok(line.split_whitespace().nth(1).context("no number")?.parse()?)
     }
 

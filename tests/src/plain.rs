@@ -77,7 +77,10 @@ impl KafkaReader {
         let until = Instant::now() + within;
         loop {
             let left = until.saturating_duration_since(Instant::now());
-            match self.consumer.poll(left.min(Duration::from_millis(50)).max(Duration::from_millis(1))) {
+            match self
+                .consumer
+                .poll(left.min(Duration::from_millis(50)).max(Duration::from_millis(1)))
+            {
                 Some(Ok(message)) => {
                     let mut headers = BTreeMap::new();
                     for header in message.headers().into_iter().flat_map(|headers| headers.iter()) {

@@ -122,7 +122,7 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
             looks += 1;
             // A flow's list holds all that there is; a service asks for some of what it waits for, in turn.
             let listed = listing.topics.iter().any(|(name, _)| **name == *topic);
-            if (inner.flow.is_some() && !listed) || (looks + turn) % waiting.div_ceil(PER_ROUND).max(1) != 0 {
+            if (inner.flow.is_some() && !listed) || !(looks + turn).is_multiple_of(waiting.div_ceil(PER_ROUND).max(1)) {
                 continue;
             }
         }

@@ -195,11 +195,9 @@ impl KafkaBroker {
             })
             .map_err(|error| error.to_string())?;
         let (gate, stop) = (Arc::clone(&inner.gate), inner.stop.clone());
-        inner
-            .supervisor
-            .spawn("kafka-leases", TaskPolicy::MayEnd, async move {
-                flow.keyed.run(&producer, &gate, &stop).await;
-            });
+        inner.supervisor.spawn("kafka-leases", TaskPolicy::MayEnd, async move {
+            flow.keyed.run(&producer, &gate, &stop).await;
+        });
         Ok(())
     }
 }
@@ -305,7 +303,11 @@ impl Inner {
             if status.health == Health::Closed || (status.health == health && status.detail == detail) {
                 return false;
             }
-            let since = if status.health == health { status.since } else { Instant::now() };
+            let since = if status.health == health {
+                status.since
+            } else {
+                Instant::now()
+            };
             *status = BrokerStatus { health, detail, since };
             true
         });
@@ -354,12 +356,12 @@ impl Inner {
                 self.bell.ring();
                 return Ok(subscription);
             }
-            Err(error) => return Err(refusal(error)),
+            Err(error) => return Err(refusal(&error)),
         };
         let marks = self
             .directory
             .marks(&source.topic, info.partitions, deadline)
-            .map_err(refusal)?;
+            .map_err(|error| refusal(&error))?;
         let mut ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
         let (sender, subscription) = subscription(options);
         if !options.with_kept {
@@ -368,14 +370,15 @@ impl Inner {
                 .map_err(|error| refused(&error))?;
             return Ok(subscription);
         }
-        let mut reader = ReaderToEnd::open(&self.settings, &self.last_error, &source.topic, &marks).map_err(refusal)?;
+        let mut reader = ReaderToEnd::open(&self.settings, &self.last_error, &source.topic, &marks)
+            .map_err(|error| refusal(&error))?;
         loop {
             let starts = reader
                 .read(&ends, deadline, &|| self.is_closed(), |message, payload| {
                     let key = message.key()?;
                     record::is_kept(key).then(|| consumer::receive(channel, message, payload, None, &self.clock))
                 })
-                .map_err(refusal)?;
+                .map_err(|error| refusal(&error))?;
             let mut kept = || -> Vec<Received> { reader.take_latest().into_iter().map(|(_, kept)| kept).collect() };
             match consumer.add(&source, &info, starts, sender.clone(), Some(&mut kept)) {
                 Ok(()) => return Ok(subscription),
@@ -422,7 +425,7 @@ impl Inner {
     }
 }
 
-fn refusal(error: LookupError) -> BrokerError {
+fn refusal(error: &LookupError) -> BrokerError {
     match error {
         LookupError::Closed => BrokerError::Closed,
         LookupError::Missing(_) | LookupError::Away(_) => BrokerError::Away(error.to_string()),

@@ -287,7 +287,10 @@ impl Producer {
 
     fn make_client(&self) -> Result<Arc<Client>, KafkaError> {
         let context = SharedContext(Arc::clone(&self.context));
-        self.settings.producer(self.lot).create_with_context(context).map(Arc::new)
+        self.settings
+            .producer(self.lot)
+            .create_with_context(context)
+            .map(Arc::new)
     }
 
     /// A queue for a publisher.
@@ -338,7 +341,9 @@ impl Producer {
             if in_flight >= WINDOW {
                 return;
             }
-            let Some(client) = self.client.lock().clone() else { return };
+            let Some(client) = self.client.lock().clone() else {
+                return;
+            };
             let is_ready = |to: &Target| to.topic.partitions().is_some() && self.gate.lets(to.topic.stays_open);
             let room = WINDOW - in_flight;
             self.outbox
@@ -363,8 +368,8 @@ impl Producer {
                     Keying::Writer { depth } => depth,
                     Keying::AnswerId => 0,
                 };
-                partition = (depth > 0)
-                    .then(|| record::partition_of(frame.writer(), target.topic.partitions().unwrap_or(1)));
+                partition =
+                    (depth > 0).then(|| record::partition_of(frame.writer(), target.topic.partitions().unwrap_or(1)));
                 key = Some(record::key(frame.writer(), frame.sequence(), depth));
                 headers = Some(record::headers(&frame, scratch));
                 payload = frame.payload().clone();
@@ -408,7 +413,9 @@ impl Producer {
         value: Option<&Bytes>,
         done: oneshot::Sender<bool>,
     ) {
-        let Some(client) = self.client.lock().clone() else { return };
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
         let delivery = Box::new(Delivery::Keyed {
             done,
             sent: Instant::now(),
@@ -457,7 +464,10 @@ impl Producer {
 fn answer_id(payload: &[u8]) -> Option<String> {
     let value: serde_json::Value = serde_json::from_slice(payload).ok()?;
     let answers = value.as_array().map_or(std::slice::from_ref(&value), Vec::as_slice);
-    answers.iter().find_map(|answer| answer.get("id")?.as_str()).map(str::to_owned)
+    answers
+        .iter()
+        .find_map(|answer| answer.get("id")?.as_str())
+        .map(str::to_owned)
 }
 
 #[cfg(test)]

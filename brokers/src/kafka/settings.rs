@@ -285,7 +285,10 @@ mod tests {
             config.create_native_config().unwrap();
         }
         for (reliable, large) in [(false, false), (true, false), (false, true), (true, true)] {
-            settings.producer(Lot { reliable, large }).create_native_config().unwrap();
+            settings
+                .producer(Lot { reliable, large })
+                .create_native_config()
+                .unwrap();
         }
     }
 
@@ -299,7 +302,13 @@ mod tests {
         assert_eq!(config.get("linger.ms"), Some("3"));
         assert_eq!(config.get("client.id"), Some("me"));
         assert_eq!(config.get("message.timeout.ms"), Some("5000"));
-        for key in ["enable.idempotence", "acks", "group.id", "enable.auto.commit", "auto.offset.reset"] {
+        for key in [
+            "enable.idempotence",
+            "acks",
+            "group.id",
+            "enable.auto.commit",
+            "auto.offset.reset",
+        ] {
             match refused(&format!(r#"{{"{key}": "x"}}"#)) {
                 OpenError::Setting { key: found, .. } => assert_eq!(found, format!("kafka.properties.{key}")),
                 other => panic!("{other}"),

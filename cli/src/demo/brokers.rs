@@ -178,7 +178,12 @@ impl Servers {
     fn read(text: &str) -> Result<Self, &'static str> {
         let lines: HashMap<&str, &str> = text
             .lines()
-            .filter_map(|line| line.trim().strip_prefix("export ").unwrap_or(line.trim()).split_once('='))
+            .filter_map(|line| {
+                line.trim()
+                    .strip_prefix("export ")
+                    .unwrap_or(line.trim())
+                    .split_once('=')
+            })
             .map(|(key, value)| (key.trim(), value.trim().trim_matches(['"', '\''])))
             .collect();
         let find = |key: &'static str| lines.get(key).map(|value| (*value).to_owned()).ok_or(key);
@@ -207,7 +212,11 @@ mod tests {
         let text = "# servers\nBLAZE_TEST_REDIS_URL=redis://127.0.0.1:1\nexport BLAZE_TEST_KAFKA_FOG=\"127.0.0.1:2\"\nBLAZE_TEST_KAFKA_CLOUD = 127.0.0.1:3\n";
         let servers = Servers::read(text).unwrap();
         assert_eq!(
-            (servers.redis.as_str(), servers.kafka_fog.as_str(), servers.kafka_cloud.as_str()),
+            (
+                servers.redis.as_str(),
+                servers.kafka_fog.as_str(),
+                servers.kafka_cloud.as_str()
+            ),
             ("redis://127.0.0.1:1", "127.0.0.1:2", "127.0.0.1:3")
         );
         assert_eq!(Servers::read("BLAZE_TEST_REDIS_URL=x"), Err("BLAZE_TEST_KAFKA_FOG"));

@@ -13,8 +13,8 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use blaze_domain::node_file::NodeFile;
 use blaze_domain::ServiceName;
+use blaze_domain::node_file::NodeFile;
 use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, RunningFlow};
 use blaze_runtime::Supervisor;
@@ -188,11 +188,7 @@ async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<N
         let flow = blaze_flow::flow::start_with(flow_options, beginning, supervisor.child(node.name()))
             .await
             .map_err(|error| CliError::Failed(format!("{} does not start: {error:#}", node.name())))?;
-        running.push(RunningNode {
-            node,
-            brokers,
-            flow,
-        });
+        running.push(RunningNode { node, brokers, flow });
     }
     Ok(Nodes {
         running,

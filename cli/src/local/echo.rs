@@ -137,13 +137,28 @@ fn line(message: &Message) -> String {
         .map(String::as_str)
         .collect::<Vec<_>>()
         .join("/");
-    let number = message.sequence().map(|sequence| format!(" #{sequence}")).unwrap_or_default();
+    let number = message
+        .sequence()
+        .map(|sequence| format!(" #{sequence}"))
+        .unwrap_or_default();
     let age = message.age().as_secs_f64() * 1e3;
     let payload = message.payload();
     let shown = match std::str::from_utf8(payload) {
         Ok(text) if text.chars().count() <= SHOWN_BYTES => text.to_owned(),
-        Ok(text) => format!("{} … ({} bytes)", text.chars().take(SHOWN_BYTES).collect::<String>(), payload.len()),
-        Err(_) => format!("{} bytes of {}", payload.len(), if message.encoding().is_empty() { "no text" } else { message.encoding() }),
+        Ok(text) => format!(
+            "{} … ({} bytes)",
+            text.chars().take(SHOWN_BYTES).collect::<String>(),
+            payload.len()
+        ),
+        Err(_) => format!(
+            "{} bytes of {}",
+            payload.len(),
+            if message.encoding().is_empty() {
+                "no text"
+            } else {
+                message.encoding()
+            }
+        ),
     };
     let from = if from.is_empty() { "(no header)" } else { &from };
     format!("{from}{number} {age:.1}ms  {shown}")

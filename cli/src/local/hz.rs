@@ -97,7 +97,10 @@ async fn measure(service: &LocalService, options: &HzOptions, format: Format) ->
     let interruption = interrupted();
     tokio::pin!(interruption);
     let begin = Instant::now();
-    let mut seconds = tokio::time::interval_at(tokio::time::Instant::now() + Duration::from_secs(1), Duration::from_secs(1));
+    let mut seconds = tokio::time::interval_at(
+        tokio::time::Instant::now() + Duration::from_secs(1),
+        Duration::from_secs(1),
+    );
     let mut printed = 0;
     while options.count.is_none_or(|count| printed < count) {
         tokio::select! {
@@ -148,7 +151,10 @@ fn figures(arrivals: &[Arrival], window: Duration) -> Figures {
 fn describe(topic: &str, figures: &Figures, stats: &SubscriptionStats, format: Format) -> Result<String, CliError> {
     if format == Format::Table {
         let Some((shortest, _, longest, deviation)) = figures.gaps else {
-            return Ok(format!("no new messages ({} received, {} lost)", stats.received, stats.lost));
+            return Ok(format!(
+                "no new messages ({} received, {} lost)",
+                stats.received, stats.lost
+            ));
         };
         return Ok(format!(
             "{:.2} Hz  {}/s  gaps {:.1} to {:.1} ms, deviation {:.2} ms  age p50 {} ms  lost {}",

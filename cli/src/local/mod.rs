@@ -99,13 +99,18 @@ fn open(file: &NodeFile) -> Result<(Arc<dyn Broker>, Scope), CliError> {
     let role = Role::Service;
     let memory = || {
         Err(OpenError::InProcess).map_err(|error: OpenError| {
-            CliError::Usage(format!("brokers: {error}. Name a redis or kafka server in the node file."))
+            CliError::Usage(format!(
+                "brokers: {error}. Name a redis or kafka server in the node file."
+            ))
         })
     };
     match (&file.brokers.node, &file.brokers.layer) {
         (Some(NodeBroker::Memory), _) | (None, Some(LayerBroker::Memory)) => memory(),
         (Some(node), _) => Ok((open_node(node, &role).map_err(|e| refused("node", &e))?, Scope::Node)),
-        (None, Some(layer)) => Ok((open_layer(layer, &role).map_err(|e| refused("layer", &e))?, Scope::Layer)),
+        (None, Some(layer)) => Ok((
+            open_layer(layer, &role).map_err(|e| refused("layer", &e))?,
+            Scope::Layer,
+        )),
         (None, None) => Err(CliError::Usage(
             "the node file names neither brokers.node nor brokers.layer: there is no local broker".to_owned(),
         )),

@@ -4,7 +4,9 @@ use std::time::Duration;
 
 use blaze_tests::flow::{FlowProcess, FlowSpec};
 use blaze_tests::plain::{KafkaReader, KafkaWriter, delete_topic};
-use blaze_tests::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis, unique_name};
+use blaze_tests::servers::{
+    KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis, unique_name,
+};
 use blaze_tests::wait;
 use serde_json::json;
 
@@ -98,7 +100,9 @@ fn a_flushed_redis_gets_its_leases_again() -> anyhow::Result<()> {
         SOON,
         || {
             redis.cli(&["HLEN", &hash]).is_ok_and(|count| count.trim() == "1")
-                && redis.cli(&["GET", &owner]).is_ok_and(|value| value.contains("edge/robot-1/"))
+                && redis
+                    .cli(&["GET", &owner])
+                    .is_ok_and(|value| value.contains("edge/robot-1/"))
         },
         || system.robot.tail(),
     )?;
@@ -163,7 +167,9 @@ fn names_that_collide_on_kafka_are_refused() -> anyhow::Result<()> {
     let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
     let replies = KafkaReader::from_end(&system.kafka, &system.topic("blaze/reply"))?;
     let ask = |topic: &str, id: &str| -> anyhow::Result<serde_json::Value> {
-        system.tell_cloud(&json!({"op":"request","topic":topic,"service":"logger","id":id,"reply_to":"blaze/reply/x","ttl_s":0}))?;
+        system.tell_cloud(
+            &json!({"op":"request","topic":topic,"service":"logger","id":id,"reply_to":"blaze/reply/x","ttl_s":0}),
+        )?;
         let answer = replies.next(SOON).ok_or_else(|| anyhow::anyhow!("no answer"))?;
         Ok(serde_json::from_slice(&answer.payload)?)
     };

@@ -31,7 +31,10 @@ fn the_demo_runs_on_redis_and_kafka_with_the_same_verdict() -> anyhow::Result<()
         .map_err(|error| anyhow::anyhow!("{error}: {lines}\n{said}"))?;
     println!("{summary}");
     assert!(output.status.success(), "{summary}\n{said}");
-    assert_eq!((&summary["kind"], &summary["ok"]), (&Value::from("summary"), &Value::from(true)));
+    assert_eq!(
+        (&summary["kind"], &summary["ok"]),
+        (&Value::from("summary"), &Value::from(true))
+    );
     let topics = summary["topics"].as_array().cloned().unwrap_or_default();
     let to_cloud = topics
         .iter()

@@ -4,7 +4,9 @@ use std::time::{Duration, Instant};
 
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::plain::KafkaWriter;
-use blaze_tests::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis, unique_name};
+use blaze_tests::servers::{
+    KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis, unique_name,
+};
 use blaze_tests::wait;
 use serde_json::{Value, json};
 
@@ -40,10 +42,18 @@ impl Rig {
         let domain = free_domain()?;
         let (redis_prefix, kafka_prefix) = (format!("{run}:"), format!("{run}."));
         let specs = [
-            FlowSpec::new("edge", "robot-1").on_redis(&redis.url(), "").joined(domain),
-            FlowSpec::new("cloud", "cloud-1").on_kafka(&kafka.bootstrap(), "").joined(domain),
-            FlowSpec::new("edge", "robot-2").on_redis(&other_redis, &redis_prefix).joined(domain),
-            FlowSpec::new("fog", "fog-1").on_kafka(&other_kafka, &kafka_prefix).joined(domain),
+            FlowSpec::new("edge", "robot-1")
+                .on_redis(&redis.url(), "")
+                .joined(domain),
+            FlowSpec::new("cloud", "cloud-1")
+                .on_kafka(&kafka.bootstrap(), "")
+                .joined(domain),
+            FlowSpec::new("edge", "robot-2")
+                .on_redis(&other_redis, &redis_prefix)
+                .joined(domain),
+            FlowSpec::new("fog", "fog-1")
+                .on_kafka(&other_kafka, &kafka_prefix)
+                .joined(domain),
         ];
         let mut flows = Vec::new();
         for spec in specs {
@@ -92,7 +102,10 @@ fn connect_stream(redis: &str, redis_prefix: &str, topic: &str, kafka: &str, kaf
         .arg(advertise.to_string())
         .exec(&mut connect(redis)?)?;
     let request = json!({"op":"request","topic":topic,"service":"sink","reliability":"reliable","ttl_s":0});
-    KafkaWriter::new(kafka)?.produce(&format!("{kafka_prefix}blaze.flow.control"), request.to_string().as_bytes())
+    KafkaWriter::new(kafka)?.produce(
+        &format!("{kafka_prefix}blaze.flow.control"),
+        request.to_string().as_bytes(),
+    )
 }
 
 fn period() -> Duration {
@@ -126,10 +139,20 @@ fn freeze(
     assert_eq!((twice.len(), reordered), (0, 0), "the other route");
     assert!(!frozen.is_zero(), "the other route went on");
     // The margin beside the factor is what the clock of two busy cores resolves.
-    assert!(frozen <= calm.mul_f64(1.2) + Duration::from_millis(5), "{frozen:?} against {calm:?}");
+    assert!(
+        frozen <= calm.mul_f64(1.2) + Duration::from_millis(5),
+        "{frozen:?} against {calm:?}"
+    );
     for (flow, (before, during)) in rig.flows.iter().zip(before.iter().zip(&during)) {
-        println!("{what}: {} {before} KiB before, {during} KiB while it was frozen", flow.spec.node);
-        assert!(*during <= before + MAX_GROWTH_KIB, "{}: {before} → {during} KiB", flow.spec.node);
+        println!(
+            "{what}: {} {before} KiB before, {during} KiB while it was frozen",
+            flow.spec.node
+        );
+        assert!(
+            *during <= before + MAX_GROWTH_KIB,
+            "{}: {before} → {during} KiB",
+            flow.spec.node
+        );
     }
     Ok(())
 }
@@ -167,13 +190,18 @@ fn a_frozen_kafka_holds_up_nobody_else() -> anyhow::Result<()> {
     assert_eq!((twice, reordered), (vec![], 0));
     let stale = stale(&rig.frozen, thawed.get());
     let bytes: usize = stale.iter().map(|arrival| arrival.bytes).sum();
-    println!("Kafka: {} messages ({bytes} bytes) arrived although older than their lifespan", stale.len());
+    println!(
+        "Kafka: {} messages ({bytes} bytes) arrived although older than their lifespan",
+        stale.len()
+    );
     assert!(bytes <= IN_THE_SOCKET, "{bytes} bytes were stale");
     let counted = dropped(&rig.flows[1]);
     println!("Kafka: cloud-1 counts {counted}");
     let text = counted.to_string();
     assert!(
-        ["lifespan", "queue_full", "broker_error"].iter().any(|reason| text.contains(reason)),
+        ["lifespan", "queue_full", "broker_error"]
+            .iter()
+            .any(|reason| text.contains(reason)),
         "what was dropped has a reason: {counted}"
     );
     Ok(())
@@ -186,6 +214,11 @@ fn a_frozen_redis_holds_up_nobody_else() -> anyhow::Result<()> {
     freeze(&rig, "Redis", || rig.redis.freeze(), || rig.redis.thaw())?;
     let (twice, reordered) = rig.frozen.faults();
     assert_eq!((twice, reordered), (vec![], 0));
-    wait::until("robot-1 is ready again", SOON, || rig.flows[0].admin().ready(), || rig.flows[0].tail())?;
+    wait::until(
+        "robot-1 is ready again",
+        SOON,
+        || rig.flows[0].admin().ready(),
+        || rig.flows[0].tail(),
+    )?;
     Ok(())
 }

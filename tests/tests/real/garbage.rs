@@ -61,7 +61,9 @@ fn hostile_control() -> Vec<Vec<u8>> {
         b"{\"op\":\"advertise\"}".to_vec(),
         b"{\"op\":\"advertise\",\"topic\":1,\"service\":{}}".to_vec(),
         b"{\"op\":\"request\",\"topic\":\"a\",\"service\":\"s\",\"max_rate_hz\":1e999}".to_vec(),
-        json!({"op":"advertise","topic":"x".repeat(60_000),"service":"s"}).to_string().into_bytes(),
+        json!({"op":"advertise","topic":"x".repeat(60_000),"service":"s"})
+            .to_string()
+            .into_bytes(),
         vec![b'a'; 70_000],
         json!(vec![json!({"op":"fly"}); 201]).to_string().into_bytes(),
     ];
@@ -157,7 +159,11 @@ fn garbage_is_counted_and_does_no_harm() -> anyhow::Result<()> {
         vec![("blaze-writer", vec![b'a'; 32]), ("blaze-sequence", b"0".to_vec())],
         vec![("blaze-writer", vec![b'a'; 32]), ("blaze-sequence", b"-1".to_vec())],
         vec![("blaze-writer", vec![b'a'; 32])],
-        vec![("blaze-writer", vec![b'a'; 32]), ("blaze-sequence", b"1".to_vec()), ("blaze-origin", vec![b'/'; 9_000])],
+        vec![
+            ("blaze-writer", vec![b'a'; 32]),
+            ("blaze-sequence", b"1".to_vec()),
+            ("blaze-origin", vec![b'/'; 9_000]),
+        ],
     ];
     for headers in &hostile {
         let headers: Vec<(&str, &[u8])> = headers.iter().map(|(key, value)| (*key, value.as_slice())).collect();
@@ -166,7 +172,10 @@ fn garbage_is_counted_and_does_no_harm() -> anyhow::Result<()> {
     wait::until(
         "every hostile record is counted",
         SOON,
-        || metric_sum(&system.cloud, "blaze_flow_dropped_total", "reason=\"decode_error\"") - before >= hostile.len() as f64,
+        || {
+            metric_sum(&system.cloud, "blaze_flow_dropped_total", "reason=\"decode_error\"") - before
+                >= hostile.len() as f64
+        },
         || system.cloud.tail(),
     )?;
     flowing(&system, &reader)?;
@@ -174,7 +183,11 @@ fn garbage_is_counted_and_does_no_harm() -> anyhow::Result<()> {
     for (flow, memory) in [&system.robot, &system.cloud].into_iter().zip(memory) {
         let now = flow.rss_kib()?;
         println!("{}: {memory} KiB before, {now} KiB after", flow.spec.node);
-        assert!(now <= memory + MAX_GROWTH_KIB, "{}: {memory} → {now} KiB", flow.spec.node);
+        assert!(
+            now <= memory + MAX_GROWTH_KIB,
+            "{}: {memory} → {now} KiB",
+            flow.spec.node
+        );
     }
     Ok(())
 }

@@ -23,14 +23,25 @@ fn redis_publish_reaches_a_kafka_consumer() -> anyhow::Result<()> {
     let _turn = turn();
     let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
     let before = system.robot.why(TOPIC, None)?;
-    assert_eq!(code(&before), ("not_flowing".to_owned(), "no_advertise".to_owned()), "{before}");
+    assert_eq!(
+        code(&before),
+        ("not_flowing".to_owned(), "no_advertise".to_owned()),
+        "{before}"
+    );
 
-    system.tell_robot(&json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","rate_hz":50,"max_bytes":400,
-        "encoding":"application/json","reliability":"reliable","ttl_s":0}))?;
+    system.tell_robot(
+        &json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","rate_hz":50,"max_bytes":400,
+        "encoding":"application/json","reliability":"reliable","ttl_s":0}),
+    )?;
     wait::until(
         "the advertise is known and the request is missing",
         SOON,
-        || system.robot.why(TOPIC, None).is_ok_and(|why| code(&why).1 == "no_request"),
+        || {
+            system
+                .robot
+                .why(TOPIC, None)
+                .is_ok_and(|why| code(&why).1 == "no_request")
+        },
         || format!("{:?}", system.robot.why(TOPIC, None)),
     )?;
     system.tell_cloud(&json!({"op":"request","topic":TOPIC,"service":"logger","reliability":"reliable","ttl_s":0}))?;
@@ -42,12 +53,17 @@ fn redis_publish_reaches_a_kafka_consumer() -> anyhow::Result<()> {
     let mut connection = connect(&system.redis)?;
     for number in 1..=MESSAGES {
         let payload = format!("{{\"n\":{number}}}");
-        redis::cmd("PUBLISH").arg(system.channel(TOPIC)).arg(payload).exec(&mut connection)?;
+        redis::cmd("PUBLISH")
+            .arg(system.channel(TOPIC))
+            .arg(payload)
+            .exec(&mut connection)?;
     }
     let mut last_sequence = first.header("blaze-sequence").parse::<u64>()?;
     let mut number = 0;
     while number < MESSAGES {
-        let record = reader.next(SOON).ok_or_else(|| anyhow::anyhow!("{number} of {MESSAGES} arrived: {}", system.cloud.tail()))?;
+        let record = reader
+            .next(SOON)
+            .ok_or_else(|| anyhow::anyhow!("{number} of {MESSAGES} arrived: {}", system.cloud.tail()))?;
         let Some(found) = numbered(&record) else { continue };
         number += 1;
         assert_eq!(found, number, "in order and once");
@@ -69,10 +85,22 @@ fn redis_publish_reaches_a_kafka_consumer() -> anyhow::Result<()> {
         || system.robot.bridges_up().is_empty(),
         || format!("{:?}", system.robot.bridges()),
     )?;
-    redis::cmd("PUBLISH").arg(system.channel(TOPIC)).arg("{\"n\":0}").exec(&mut connection)?;
-    assert_eq!(reader.next(Duration::from_millis(700)), None, "{:?} after the withdraw", withdrawn.elapsed());
+    redis::cmd("PUBLISH")
+        .arg(system.channel(TOPIC))
+        .arg("{\"n\":0}")
+        .exec(&mut connection)?;
+    assert_eq!(
+        reader.next(Duration::from_millis(700)),
+        None,
+        "{:?} after the withdraw",
+        withdrawn.elapsed()
+    );
     let after = system.robot.why(TOPIC, None)?;
-    assert_eq!(code(&after), ("not_flowing".to_owned(), "no_request".to_owned()), "{after}");
+    assert_eq!(
+        code(&after),
+        ("not_flowing".to_owned(), "no_request".to_owned()),
+        "{after}"
+    );
     Ok(())
 }
 
@@ -103,10 +131,23 @@ fn check_headers(record: &Record) {
     assert_eq!(record.header("blaze-hops"), "2", "one on the link, one on Kafka");
     assert_eq!(record.header("blaze-reliable"), "true");
     let writer = record.header("blaze-writer");
-    assert!(writer.len() == 32 && writer.bytes().all(|b| b.is_ascii_hexdigit()), "{writer}");
+    assert!(
+        writer.len() == 32 && writer.bytes().all(|b| b.is_ascii_hexdigit()),
+        "{writer}"
+    );
     assert_eq!(String::from_utf8_lossy(&record.key), writer);
-    assert!(record.header("blaze-time").parse::<u64>().is_ok_and(|ns| ns > 1_700_000_000_000_000_000));
-    assert!(record.header("blaze-age-us").parse::<u64>().is_ok_and(|us| us < 10_000_000));
+    assert!(
+        record
+            .header("blaze-time")
+            .parse::<u64>()
+            .is_ok_and(|ns| ns > 1_700_000_000_000_000_000)
+    );
+    assert!(
+        record
+            .header("blaze-age-us")
+            .parse::<u64>()
+            .is_ok_and(|us| us < 10_000_000)
+    );
     assert!(!record.header("blaze-epoch").is_empty());
 }
 
@@ -116,8 +157,12 @@ fn a_kafka_producer_reaches_a_bare_redis_subscriber() -> anyhow::Result<()> {
     const COMMANDS: &str = "fleet/commands";
     let _turn = turn();
     let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
-    system.tell_cloud(&json!({"op":"advertise","topic":COMMANDS,"service":"planner","reliability":"reliable","ttl_s":0}))?;
-    system.tell_robot(&json!({"op":"request","topic":COMMANDS,"service":"driver","bare":true,"reliability":"reliable","ttl_s":0}))?;
+    system.tell_cloud(
+        &json!({"op":"advertise","topic":COMMANDS,"service":"planner","reliability":"reliable","ttl_s":0}),
+    )?;
+    system.tell_robot(
+        &json!({"op":"request","topic":COMMANDS,"service":"driver","bare":true,"reliability":"reliable","ttl_s":0}),
+    )?;
     let mut reader = RedisReader::new(&system.redis, &system.channel("blaze/bare/fleet/commands"))?;
     let mut framed = RedisReader::new(&system.redis, &system.channel(COMMANDS))?;
     system.cloud.wait_bridge(COMMANDS, SOON)?;
@@ -130,20 +175,35 @@ fn a_kafka_producer_reaches_a_bare_redis_subscriber() -> anyhow::Result<()> {
         writer.produce(&topic, b"0")?;
         first = reader.next(Duration::from_millis(50))?;
     }
-    assert!(first.is_some(), "nothing arrives: {}\n{}", system.robot.tail(), system.cloud.tail());
+    assert!(
+        first.is_some(),
+        "nothing arrives: {}\n{}",
+        system.robot.tail(),
+        system.cloud.tail()
+    );
     for number in 1..=MESSAGES {
         writer.produce_later(&topic, number.to_string().as_bytes())?;
     }
     let mut number = 0;
     while number < MESSAGES {
-        let payload = reader.next(SOON)?.ok_or_else(|| anyhow::anyhow!("{number} of {MESSAGES} arrived"))?;
+        let payload = reader
+            .next(SOON)?
+            .ok_or_else(|| anyhow::anyhow!("{number} of {MESSAGES} arrived"))?;
         if payload == b"0" {
             continue;
         }
         number += 1;
-        assert_eq!(String::from_utf8_lossy(&payload), number.to_string(), "bare, in order and once");
+        assert_eq!(
+            String::from_utf8_lossy(&payload),
+            number.to_string(),
+            "bare, in order and once"
+        );
     }
-    assert_eq!(framed.next(Duration::from_millis(200))?, None, "nobody asked for frames");
+    assert_eq!(
+        framed.next(Duration::from_millis(200))?,
+        None,
+        "nobody asked for frames"
+    );
     Ok(())
 }
 
@@ -155,11 +215,31 @@ fn wrong_control_messages_get_code_and_pointer() -> anyhow::Result<()> {
     let mut answers = RedisReader::new(&system.redis, &system.channel("blaze/reply/test"))?;
     let wrong = [
         (json!({"op":"fly","topic":"a","service":"s"}), "unknown_op", "/op"),
-        (json!({"op":"advertise","topic":"/a","service":"s"}), "invalid_topic", "/topic"),
-        (json!({"op":"advertise","topic":"blaze/x","service":"s"}), "reserved_topic", "/topic"),
-        (json!({"op":"request","topic":"a","service":"s","max_rate_hz":-1}), "invalid_value", "/max_rate_hz"),
-        (json!({"op":"request","topic":"a","service":"s","layer":"fog"}), "source_mismatch", "/layer"),
-        (json!({"op":"request","topic":"a","service":"s","node":"robot-9"}), "source_mismatch", "/node"),
+        (
+            json!({"op":"advertise","topic":"/a","service":"s"}),
+            "invalid_topic",
+            "/topic",
+        ),
+        (
+            json!({"op":"advertise","topic":"blaze/x","service":"s"}),
+            "reserved_topic",
+            "/topic",
+        ),
+        (
+            json!({"op":"request","topic":"a","service":"s","max_rate_hz":-1}),
+            "invalid_value",
+            "/max_rate_hz",
+        ),
+        (
+            json!({"op":"request","topic":"a","service":"s","layer":"fog"}),
+            "source_mismatch",
+            "/layer",
+        ),
+        (
+            json!({"op":"request","topic":"a","service":"s","node":"robot-9"}),
+            "source_mismatch",
+            "/node",
+        ),
     ];
     for (mut message, code, pointer) in wrong {
         message["id"] = json!("7");
@@ -174,19 +254,34 @@ fn wrong_control_messages_get_code_and_pointer() -> anyhow::Result<()> {
         {"op":"advertise","topic":"//","service":"s","id":"2","reply_to":"blaze/reply/test"}]);
     system.tell_robot(&both)?;
     let (first, second) = (answers.next_json(SOON)?, answers.next_json(SOON)?);
-    assert_eq!((&first["ok"], &first["lease_s"], &first["flow"]), (&json!(true), &json!(15), &json!("edge/robot-1")));
+    assert_eq!(
+        (&first["ok"], &first["lease_s"], &first["flow"]),
+        (&json!(true), &json!(15), &json!("edge/robot-1"))
+    );
     assert_eq!(second["error"]["pointer"], "/1/topic");
 
     // On Kafka all answers share one topic, so a reply without an id would belong to nobody.
     let replies = KafkaReader::from_end(&system.kafka, &system.topic("blaze/reply"))?;
     system.tell_cloud(&json!({"op":"request","topic":"a","service":"s","reply_to":"blaze/reply/me"}))?;
-    let refused = replies.next(SOON).ok_or_else(|| anyhow::anyhow!("no answer on Kafka"))?;
+    let refused = replies
+        .next(SOON)
+        .ok_or_else(|| anyhow::anyhow!("no answer on Kafka"))?;
     let refused: Value = serde_json::from_slice(&refused.payload)?;
-    assert_eq!((&refused["error"]["code"], &refused["error"]["pointer"]), (&json!("invalid_value"), &json!("/id")));
-    system.tell_cloud(&json!({"op":"request","topic":"a","service":"s","id":"9","reply_to":"blaze/reply/me","ttl_s":0}))?;
-    let granted = replies.next(SOON).ok_or_else(|| anyhow::anyhow!("no answer on Kafka"))?;
+    assert_eq!(
+        (&refused["error"]["code"], &refused["error"]["pointer"]),
+        (&json!("invalid_value"), &json!("/id"))
+    );
+    system.tell_cloud(
+        &json!({"op":"request","topic":"a","service":"s","id":"9","reply_to":"blaze/reply/me","ttl_s":0}),
+    )?;
+    let granted = replies
+        .next(SOON)
+        .ok_or_else(|| anyhow::anyhow!("no answer on Kafka"))?;
     assert_eq!(String::from_utf8_lossy(&granted.key), "9", "the record's key is the id");
     let granted: Value = serde_json::from_slice(&granted.payload)?;
-    assert_eq!((&granted["ok"], &granted["id"], &granted["lease_s"]), (&json!(true), &json!("9"), &json!(0)));
+    assert_eq!(
+        (&granted["ok"], &granted["id"], &granted["lease_s"]),
+        (&json!(true), &json!("9"), &json!(0))
+    );
     Ok(())
 }

@@ -23,8 +23,16 @@ fn leases(flow: &FlowProcess) -> Vec<String> {
     let mut found = Vec::new();
     for row in answer["topics"].as_array().into_iter().flatten() {
         for kind in ["advertised", "requested"] {
-            for lease in row[kind].as_array().into_iter().flatten().filter(|lease| lease["local"] == true) {
-                found.push(format!("{kind} {} {} {}", row["topic"], lease["service"], lease["expires_in_s"]));
+            for lease in row[kind]
+                .as_array()
+                .into_iter()
+                .flatten()
+                .filter(|lease| lease["local"] == true)
+            {
+                found.push(format!(
+                    "{kind} {} {} {}",
+                    row["topic"], lease["service"], lease["expires_in_s"]
+                ));
             }
         }
     }
@@ -47,12 +55,20 @@ fn whatever_is_killed_comes_back() -> anyhow::Result<()> {
     let kafka = KafkaServer::start(KafkaOptions::default())?;
     kafka.wait_ready()?;
     let mut system = RobotAndCloud::start(&redis.url(), &kafka.bootstrap())?;
-    system.tell_robot(&json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","rate_hz":50,"max_bytes":400,
-        "reliability":"reliable","lifespan_ms":2000,"ttl_s":0}))?;
+    system.tell_robot(
+        &json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","rate_hz":50,"max_bytes":400,
+        "reliability":"reliable","lifespan_ms":2000,"ttl_s":0}),
+    )?;
     system.tell_cloud(&json!({"op":"request","topic":TOPIC,"service":"logger","reliability":"reliable","ttl_s":0}))?;
     system.robot.wait_bridge(TOPIC, SOON)?;
     system.cloud.wait_bridge(TOPIC, SOON)?;
-    let stream = Stream::start(&system.redis, &system.channel(TOPIC), &system.kafka, &system.topic(TOPIC), 300)?;
+    let stream = Stream::start(
+        &system.redis,
+        &system.channel(TOPIC),
+        &system.kafka,
+        &system.topic(TOPIC),
+        300,
+    )?;
     stream.wait_fresh(SOON)?;
     let bridges = [system.robot.bridges_up(), system.cloud.bridges_up()];
     let held = [leases(&system.robot), leases(&system.cloud)];
@@ -74,7 +90,13 @@ fn whatever_is_killed_comes_back() -> anyhow::Result<()> {
                 "leases are as before",
                 SOON,
                 || [leases(&system.robot), leases(&system.cloud)] == held,
-                || format!("{:?} {:?}, before {held:?}", leases(&system.robot), leases(&system.cloud)),
+                || {
+                    format!(
+                        "{:?} {:?}, before {held:?}",
+                        leases(&system.robot),
+                        leases(&system.cloud)
+                    )
+                },
             )?;
         }
         if round == 1 {
@@ -86,7 +108,11 @@ fn whatever_is_killed_comes_back() -> anyhow::Result<()> {
     println!("resident KiB of robot and cloud flow: {first:?} after the first round, {last:?} after the last");
     let (twice, reordered) = stream.faults();
     let arrivals = stream.arrivals().len() as u64;
-    println!("published {}, arrived {arrivals}, twice {}, reordered {reordered}", stream.published(), twice.len());
+    println!(
+        "published {}, arrived {arrivals}, twice {}, reordered {reordered}",
+        stream.published(),
+        twice.len()
+    );
     assert_eq!(twice, Vec::<u64>::new(), "nothing twice");
     assert_eq!(reordered, 0, "in order");
     for (first, last) in first.into_iter().zip(last) {
@@ -149,7 +175,12 @@ fn leases_outlive_redis_and_then_the_flow() -> anyhow::Result<()> {
     let kafka = blaze_tests::servers::shared_kafka()?;
     let mut system = RobotAndCloud::start(&redis.url(), &kafka)?;
     system.tell_robot(&json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","ttl_s":0}))?;
-    wait::until("the lease is held", SOON, || leases(&system.robot).len() == 1, || system.robot.tail())?;
+    wait::until(
+        "the lease is held",
+        SOON,
+        || leases(&system.robot).len() == 1,
+        || system.robot.tail(),
+    )?;
     let hash = system.channel("blaze:flow:leases");
     redis.kill()?;
     redis.restart()?;
@@ -161,6 +192,14 @@ fn leases_outlive_redis_and_then_the_flow() -> anyhow::Result<()> {
     )?;
     restart_flow(&mut system.robot)?;
     let found: Vec<String> = leases(&system.robot);
-    assert_eq!(found, vec![format!("advertised {} {} {}", json!(TOPIC), json!("imu-driver"), Value::Null)]);
+    assert_eq!(
+        found,
+        vec![format!(
+            "advertised {} {} {}",
+            json!(TOPIC),
+            json!("imu-driver"),
+            Value::Null
+        )]
+    );
     Ok(())
 }

@@ -91,7 +91,10 @@ impl Stream {
     pub(crate) fn wait_fresh(&self, deadline: Duration) -> anyhow::Result<Duration> {
         let begin = Instant::now();
         loop {
-            if self.last().is_some_and(|last| last.at > begin && last.at - last.took > begin) {
+            if self
+                .last()
+                .is_some_and(|last| last.at > begin && last.at - last.took > begin)
+            {
                 return Ok(begin.elapsed());
             }
             anyhow::ensure!(begin.elapsed() < deadline, "nothing new arrives within {deadline:?}");
@@ -106,8 +109,15 @@ impl Stream {
         for arrival in &arrivals {
             *seen.entry(arrival.number).or_default() += 1;
         }
-        let twice = seen.into_iter().filter(|(_, count)| *count > 1).map(|(number, _)| number).collect();
-        let reordered = arrivals.windows(2).filter(|pair| pair[1].number < pair[0].number).count() as u64;
+        let twice = seen
+            .into_iter()
+            .filter(|(_, count)| *count > 1)
+            .map(|(number, _)| number)
+            .collect();
+        let reordered = arrivals
+            .windows(2)
+            .filter(|pair| pair[1].number < pair[0].number)
+            .count() as u64;
         (twice, reordered)
     }
 
@@ -120,7 +130,8 @@ impl Stream {
             .map(|arrival| arrival.took)
             .collect();
         took.sort_unstable();
-        took.get((took.len() * 99 / 100).min(took.len().checked_sub(1)?)).copied()
+        took.get((took.len() * 99 / 100).min(took.len().checked_sub(1)?))
+            .copied()
     }
 }
 

@@ -65,7 +65,10 @@ impl RobotAndCloud {
     /// PUBLISH on the robot's Redis, as `redis-cli publish` does. Gives how many heard it.
     pub(crate) fn publish(&self, channel: &str, payload: &[u8]) -> anyhow::Result<i64> {
         let mut connection = connect(&self.redis)?;
-        Ok(redis::cmd("PUBLISH").arg(self.channel(channel)).arg(payload).query(&mut connection)?)
+        Ok(redis::cmd("PUBLISH")
+            .arg(self.channel(channel))
+            .arg(payload)
+            .query(&mut connection)?)
     }
 
     /// A control message on the robot's Redis.
@@ -121,7 +124,9 @@ impl RedisReader {
 
     /// The next payload as JSON.
     pub(crate) fn next_json(&mut self, within: Duration) -> anyhow::Result<serde_json::Value> {
-        let payload = self.next(within)?.ok_or_else(|| anyhow::anyhow!("nothing came within {within:?}"))?;
+        let payload = self
+            .next(within)?
+            .ok_or_else(|| anyhow::anyhow!("nothing came within {within:?}"))?;
         Ok(serde_json::from_slice(&payload)?)
     }
 }

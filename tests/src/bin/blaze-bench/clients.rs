@@ -124,7 +124,9 @@ impl Source for KafkaSource {
         loop {
             match self.producer.send(record) {
                 Ok(()) => break,
-                Err((error, back)) if error.rdkafka_error_code() == Some(rdkafka::types::RDKafkaErrorCode::QueueFull) => {
+                Err((error, back))
+                    if error.rdkafka_error_code() == Some(rdkafka::types::RDKafkaErrorCode::QueueFull) =>
+                {
                     record = back;
                     self.producer.poll(Duration::from_millis(1));
                 }

@@ -60,7 +60,9 @@ impl Flows {
     }
 
     fn connect(&self, route: &Route<'_>) -> anyhow::Result<()> {
-        let rate = route.rate_hz.map_or(String::new(), |rate| format!("\"rate_hz\":{rate},"));
+        let rate = route
+            .rate_hz
+            .map_or(String::new(), |rate| format!("\"rate_hz\":{rate},"));
         let advertise = format!(
             "{{\"op\":\"advertise\",\"topic\":\"{}\",\"service\":\"bench-source\",{rate}\"max_bytes\":{},\"reliability\":\"reliable\",\"ttl_s\":0}}",
             route.topic, route.bytes

@@ -122,7 +122,11 @@ pub(crate) fn run(
     let sent = sender.sent - first;
     seen.end.store(true, Ordering::Relaxed);
     let latencies = reader.join().map_err(|_| anyhow::anyhow!("the sink panicked"))??;
-    let mut mine: Vec<u32> = latencies.iter().filter(|(number, _)| *number > first).map(|(_, us)| *us).collect();
+    let mut mine: Vec<u32> = latencies
+        .iter()
+        .filter(|(number, _)| *number > first)
+        .map(|(_, us)| *us)
+        .collect();
     mine.sort_unstable();
     let quantile = |q: f64| mine.get(((mine.len() as f64 * q) as usize).min(mine.len().saturating_sub(1)));
     Ok(Figures {
@@ -185,7 +189,9 @@ impl Sender<'_> {
             self.source.flush()?;
             let next = begin + Duration::from_secs_f64(count as f64 / rate);
             // A thread that wakes for every message at 10,000 Hz would measure itself.
-            let pause = next.saturating_duration_since(Instant::now()).max(Duration::from_micros(500));
+            let pause = next
+                .saturating_duration_since(Instant::now())
+                .max(Duration::from_micros(500));
             std::thread::sleep(pause);
         }
         Ok(())
@@ -209,7 +215,10 @@ impl Sender<'_> {
                 self.source.flush()?;
             } else {
                 std::thread::sleep(Duration::from_micros(50));
-                anyhow::ensure!(progress.0.elapsed() < Duration::from_secs(5), "nothing arrives any more");
+                anyhow::ensure!(
+                    progress.0.elapsed() < Duration::from_secs(5),
+                    "nothing arrives any more"
+                );
             }
         }
         Ok(())
