@@ -64,7 +64,7 @@ pub async fn run(options: PublishOptions, format: Format) -> Result<Exit, CliErr
         Format::Table => format!("{} published, {} dropped", sent.published, sent.dropped),
         Format::Json | Format::Yaml => {
             let value = json!({
-                "topic": options.target.topic, "published": sent.published, "dropped": sent.dropped, "route": sent.route,
+                "topic": options.target.topic, "published": sent.published, "dropped": sent.dropped,
             });
             output::format_object(&value, format, |_| Ok(String::new()))?
         }
@@ -76,8 +76,6 @@ pub async fn run(options: PublishOptions, format: Format) -> Result<Exit, CliErr
 struct Sent {
     published: u64,
     dropped: u64,
-    /// Whether a bridge carried the topic when the first message was published.
-    route: bool,
 }
 
 async fn publish(service: &LocalService, options: &PublishOptions) -> Result<Sent, CliError> {
@@ -113,20 +111,16 @@ async fn publish(service: &LocalService, options: &PublishOptions) -> Result<Sen
             },
         )
         .map_err(|error| CliError::Failed(format!("publish {topic}: {error}")))?;
-    let route = route_up(&mut events, options).await;
-    if !route && options.wait > 0.0 {
-        eprintln!("blaze: no bridge carries {topic} yet; publishing all the same (see `blaze why {topic}`)");
-    }
+    route_up(&mut events, options).await;
     let mut sent = tokio::select! {
         sent = feed(options, &publisher) => sent?,
-        stopped = interrupted() => { stopped?; Sent { published: publisher.sequence(), dropped: 0, route } }
+        stopped = interrupted() => { stopped?; Sent { published: publisher.sequence(), dropped: 0 } }
     };
     // What was taken leaves before the lease ends, because a bridge ends with its lease.
     let until = Instant::now() + Duration::from_secs(5);
     while publisher.queued() > 0 && Instant::now() < until {
         tokio::time::sleep(Duration::from_millis(2)).await;
     }
-    sent.route = route;
     sent.dropped += publisher.dropped_later();
     if let Err(error) = lease.withdraw().await {
         eprintln!("blaze: withdraw {topic}: {error}; the lease lapses by itself");
@@ -134,16 +128,15 @@ async fn publish(service: &LocalService, options: &PublishOptions) -> Result<Sen
     Ok(sent)
 }
 
-/// Waits until a bridge carries the topic, at most `--wait`.
-async fn route_up(events: &mut FlowEvents, options: &PublishOptions) -> bool {
+/// Waits until a bridge begins to carry the topic, at most `--wait`. One that carried it before tells nothing.
+async fn route_up(events: &mut FlowEvents, options: &PublishOptions) {
     let wait = Duration::try_from_secs_f64(options.wait).unwrap_or(Duration::ZERO);
     let until = Instant::now() + wait;
     while let Ok(Some(event)) = timeout_at(until, events.next()).await {
         if event.kind == FlowEventKind::RouteUp && event.topic == options.target.topic.as_str() {
-            return true;
+            return;
         }
     }
-    false
 }
 
 async fn feed(options: &PublishOptions, publisher: &Publisher) -> Result<Sent, CliError> {
@@ -160,7 +153,6 @@ async fn feed(options: &PublishOptions, publisher: &Publisher) -> Result<Sent, C
     let mut sent = Sent {
         published: 0,
         dropped: 0,
-        route: false,
     };
     while sent.published + sent.dropped < most {
         let payload = match &mut lines {
