@@ -1,6 +1,10 @@
 //! Rates, latencies and idle cost of the Kafka adapter, against a server: `kafka_rates HOST:PORT [MESSAGES] [LINGER_MS]`.
 
-#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a measurement stops at the first surprise")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    reason = "a measurement stops at the first surprise"
+)]
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -126,7 +130,9 @@ impl Bench {
                 break;
             }
             for message in batch.drain(..) {
-                let Content::Frame(frame) = message.content else { continue };
+                let Content::Frame(frame) = message.content else {
+                    continue;
+                };
                 assert_eq!(frame.sequence(), last + 1);
                 last = frame.sequence();
                 received += 1;
@@ -201,7 +207,9 @@ async fn main() {
     let messages = arguments.next().map_or(300_000, |text| text.parse().expect("a number"));
     let linger = arguments.next().unwrap_or_else(|| "0".to_owned());
     let bench = Bench::open(&bootstrap, &linger).await;
-    if std::env::args().count() < 5 { bench.idle().await; }
+    if std::env::args().count() < 5 {
+        bench.idle().await;
+    }
     bench.latency("small", 400, 50, 500).await;
     bench.latency("image", 1_000_000, 10, 60).await;
     bench.throughput(messages).await;

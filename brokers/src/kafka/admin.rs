@@ -69,10 +69,7 @@ impl Admin {
     }
 
     /// Makes topics, and waits for it. Returns those that could not be made; one that is there already is none of them.
-    pub(super) fn make(
-        &self,
-        topics: &[(Arc<str>, Purpose)],
-    ) -> Result<Vec<(Arc<str>, RDKafkaErrorCode)>, KafkaError> {
+    pub(super) fn make(&self, topics: &[(Arc<str>, Purpose)]) -> Result<Vec<(Arc<str>, RDKafkaErrorCode)>, KafkaError> {
         let new: Vec<NewTopic<'_>> = topics
             .iter()
             .map(|(name, purpose)| {

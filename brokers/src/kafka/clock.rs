@@ -41,7 +41,8 @@ impl BrokerClock {
     }
 
     fn micros(&self, at: Instant) -> i64 {
-        let since = |a: Instant, b: Instant| i64::try_from(a.saturating_duration_since(b).as_micros()).unwrap_or(i64::MAX);
+        let since =
+            |a: Instant, b: Instant| i64::try_from(a.saturating_duration_since(b).as_micros()).unwrap_or(i64::MAX);
         since(at, self.base) - since(self.base, at)
     }
 
@@ -54,7 +55,11 @@ impl BrokerClock {
         let (from, to) = (self.micros(sent), self.micros(now));
         let round_trip_us = to.saturating_sub(from);
         let offset_us = Self::stamp(append_ms).saturating_sub(from.saturating_add(round_trip_us / 2));
-        while self.estimates.back().is_some_and(|last| last.round_trip_us >= round_trip_us) {
+        while self
+            .estimates
+            .back()
+            .is_some_and(|last| last.round_trip_us >= round_trip_us)
+        {
             self.estimates.pop_back();
         }
         self.estimates.push_back(Estimate {

@@ -143,7 +143,9 @@ impl Consumer {
 
     fn run(&self, stop: &CancellationToken) {
         while !stop.is_cancelled() {
-            let Some(client) = self.client.lock().clone() else { break };
+            let Some(client) = self.client.lock().clone() else {
+                break;
+            };
             let next = client.poll(POLL);
             let mut state = self.state.lock();
             let reset = self.follow_identities(&mut state, &client);
@@ -180,7 +182,9 @@ impl Consumer {
         state.identities_seen = changes;
         let mut reset = Vec::new();
         for topic in state.topics.values_mut() {
-            let Some(uuid) = self.identities.of(&topic.source.topic) else { continue };
+            let Some(uuid) = self.identities.of(&topic.source.topic) else {
+                continue;
+            };
             match &topic.uuid {
                 Some(before) if *before == uuid => {}
                 None => topic.identify(Some(uuid), &self.layer),
@@ -198,9 +202,15 @@ impl Consumer {
     }
 
     fn deliver(&self, state: &mut State, client: &Client, message: &BorrowedMessage<'_>) {
-        let Some(topic) = state.topics.get_mut(message.topic()) else { return };
-        let Ok(number) = usize::try_from(message.partition()) else { return };
-        let Some(partition) = topic.partitions.get_mut(number) else { return };
+        let Some(topic) = state.topics.get_mut(message.topic()) else {
+            return;
+        };
+        let Ok(number) = usize::try_from(message.partition()) else {
+            return;
+        };
+        let Some(partition) = topic.partitions.get_mut(number) else {
+            return;
+        };
         let offset = message.offset();
         if offset < partition.next {
             return;
@@ -232,7 +242,9 @@ impl Consumer {
         sender: SubscriptionSender,
         kept: Option<&mut dyn FnMut() -> Vec<Received>>,
     ) -> Result<(), Refused> {
-        let Some(client) = self.client.lock().clone() else { return Err(Refused::Closed) };
+        let Some(client) = self.client.lock().clone() else {
+            return Err(Refused::Closed);
+        };
         self.learn(&client, &source.topic);
         let mut state = self.state.lock();
         if state.closed {
@@ -306,7 +318,9 @@ impl Consumer {
 
     /// Forgets readers that have gone, and topics without any.
     pub(super) fn sweep(&self) {
-        let Some(client) = self.client.lock().clone() else { return };
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
         let mut state = self.state.lock();
         let mut empty = Vec::new();
         for (name, topic) in &mut state.topics {
@@ -322,9 +336,13 @@ impl Consumer {
 
     /// A topic has so many partitions: those that are new are read from their beginning.
     pub(super) fn note_partitions(&self, topic: &str, partitions: usize) {
-        let Some(client) = self.client.lock().clone() else { return };
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
         let mut state = self.state.lock();
-        let Some(topic) = state.topics.get_mut(topic) else { return };
+        let Some(topic) = state.topics.get_mut(topic) else {
+            return;
+        };
         if topic.assigned && partitions > topic.partitions.len() {
             topic.grow(partitions, &self.layer);
             topic.reassign(&client);
@@ -333,9 +351,13 @@ impl Consumer {
 
     /// Looks whether the positions of a topic are on the server, and moves those that are not to what is nearest.
     pub(super) fn check_positions(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
-        let Some(client) = self.client.lock().clone() else { return };
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
         let mut state = self.state.lock();
-        let Some(topic) = state.topics.get_mut(topic) else { return };
+        let Some(topic) = state.topics.get_mut(topic) else {
+            return;
+        };
         if !topic.assigned || topic.uuid != info.uuid {
             return;
         }
@@ -355,7 +377,9 @@ impl Consumer {
 
     /// Stops reading, but for what stays open.
     pub(super) fn stand_back(&self) {
-        let Some(client) = self.client.lock().clone() else { return };
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
         let mut state = self.state.lock();
         for topic in state.topics.values_mut().filter(|topic| !topic.source.stays_open) {
             topic.unassign(&client);
@@ -364,9 +388,13 @@ impl Consumer {
 
     /// Reads a topic again, from its end: what was written meanwhile was another's.
     pub(super) fn resume(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
-        let Some(client) = self.client.lock().clone() else { return };
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
         let mut state = self.state.lock();
-        let Some(topic) = state.topics.get_mut(topic) else { return };
+        let Some(topic) = state.topics.get_mut(topic) else {
+            return;
+        };
         if topic.assigned {
             return;
         }

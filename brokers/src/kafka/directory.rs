@@ -110,7 +110,10 @@ impl Directory {
 
     /// The identity of the cluster, if it is known soon.
     pub(super) fn cluster(&self) -> Option<String> {
-        self.client().ok()?.client().fetch_cluster_id(Duration::from_millis(200))
+        self.client()
+            .ok()?
+            .client()
+            .fetch_cluster_id(Duration::from_millis(200))
     }
 
     /// Looks a topic up. Waits for the answer.

@@ -86,7 +86,11 @@ impl FlowState {
 
     /// Makes what is missing. Returns whether something was made, or why what is needed first could not be made.
     pub(super) fn keep_topics(&self, inner: &Inner, listing: &Listing) -> Result<bool, String> {
-        let there: HashSet<Arc<str>> = listing.topics.iter().map(|(name, _)| Arc::from(name.as_str())).collect();
+        let there: HashSet<Arc<str>> = listing
+            .topics
+            .iter()
+            .map(|(name, _)| Arc::from(name.as_str()))
+            .collect();
         let missing = self.missing(&there);
         *self.listed.lock() = there;
         if !missing.is_empty() {
@@ -151,7 +155,9 @@ impl FlowState {
     fn keep_last_values(&self, inner: &Inner) {
         let to_check: Vec<Arc<str>> = {
             let prepared = self.prepared.lock();
-            let open = prepared.iter().filter(|(_, prepared)| prepared.depth > 0 && !prepared.keeps);
+            let open = prepared
+                .iter()
+                .filter(|(_, prepared)| prepared.depth > 0 && !prepared.keeps);
             open.filter(|(_, prepared)| prepared.topic.partitions().is_some())
                 .map(|(name, _)| Arc::clone(name))
                 .collect()
@@ -187,7 +193,10 @@ impl FlowState {
     fn write_all_leases(&self) {
         let mirror = self.mirror.lock().clone();
         if !mirror.is_empty() {
-            tracing::info!(leases = mirror.len(), "the topic of leases was made anew: all are written again");
+            tracing::info!(
+                leases = mirror.len(),
+                "the topic of leases was made anew: all are written again"
+            );
         }
         for (key, value) in mirror {
             self.keyed.put(&self.leases, None, key, Some(value));
@@ -197,15 +206,13 @@ impl FlowState {
     fn load(&self, inner: &Inner) -> Result<Vec<(String, Bytes)>, BrokerError> {
         let deadline = Instant::now() + LOAD;
         let name = &self.leases.name;
-        let info = inner.directory.topic(name, LOAD).map_err(away)?;
-        let marks = inner.directory.marks(name, info.partitions, deadline).map_err(away)?;
-        let mut reader = ReaderToEnd::open(&inner.settings, &inner.last_error, name, &marks).map_err(away)?;
+        let info = inner.directory.topic(name, LOAD)?;
+        let marks = inner.directory.marks(name, info.partitions, deadline)?;
+        let mut reader = ReaderToEnd::open(&inner.settings, &inner.last_error, name, &marks)?;
         let ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
-        reader
-            .read(&ends, deadline, &|| inner.is_closed(), |_, payload| {
-                Some(Bytes::copy_from_slice(payload))
-            })
-            .map_err(away)?;
+        reader.read(&ends, deadline, &|| inner.is_closed(), |_, payload| {
+            Some(Bytes::copy_from_slice(payload))
+        })?;
         let leases: Vec<(String, Bytes)> = reader
             .take_latest()
             .into_iter()
@@ -218,13 +225,6 @@ impl FlowState {
             }
         }
         Ok(leases)
-    }
-}
-
-fn away(error: super::directory::LookupError) -> BrokerError {
-    match error {
-        super::directory::LookupError::Closed => BrokerError::Closed,
-        other => BrokerError::Away(other.to_string()),
     }
 }
 
@@ -282,7 +282,9 @@ impl FlowSide for KafkaFlowSide {
         if mirror.len() < MAX_LEASES || mirror.contains_key(key) {
             mirror.insert(key.to_owned(), value.clone());
         }
-        self.state.keyed.put(&self.state.leases, None, key.to_owned(), Some(value));
+        self.state
+            .keyed
+            .put(&self.state.leases, None, key.to_owned(), Some(value));
     }
 
     fn remove_lease(&self, key: &str) {
@@ -292,9 +294,13 @@ impl FlowSide for KafkaFlowSide {
     }
 
     fn forget_writer(&self, channel: &ChannelName, writer: WriterId) {
-        let Ok(name) = self.inner.names.topic(channel) else { return };
+        let Ok(name) = self.inner.names.topic(channel) else {
+            return;
+        };
         let prepared = self.state.prepared.lock();
-        let Some(Prepared { topic, depth, .. }) = prepared.get(&name) else { return };
+        let Some(Prepared { topic, depth, .. }) = prepared.get(&name) else {
+            return;
+        };
         // A topic that is not there keeps nothing.
         let Some(partitions) = topic.partitions() else { return };
         let partition = Some(record::partition_of(writer, partitions));

@@ -62,7 +62,9 @@ pub(super) struct Identities {
 impl Identities {
     /// Looks at one line of the log.
     pub(super) fn read_log(&self, line: &str) {
-        let Some((topic, uuid)) = parse_change(line) else { return };
+        let Some((topic, uuid)) = parse_change(line) else {
+            return;
+        };
         let mut known = self.known.lock();
         if known.len() >= MAX_KNOWN && !known.contains_key(topic) {
             known.clear();
@@ -98,7 +100,9 @@ mod tests {
     #[test]
     fn identities_come_from_the_log() {
         let identities = Identities::default();
-        identities.read_log("[thrd:main]: Topic fog.imu.data changed id from AAAAAAAAAAAAAAAAAAAAAA to a+b/cdefghijklmnopqrst");
+        identities.read_log(
+            "[thrd:main]: Topic fog.imu.data changed id from AAAAAAAAAAAAAAAAAAAAAA to a+b/cdefghijklmnopqrst",
+        );
         let uuid = identities.of("fog.imu.data").unwrap();
         assert_eq!(uuid.as_str(), "a-b_cdefghijklmnopqrst");
         assert_eq!(identities.changes(), 1);

@@ -94,15 +94,16 @@ mod tests {
 
     fn topic(prefix: &str, channel: &str) -> Result<String, BrokerError> {
         let names = Names::new(prefix).unwrap();
-        names
-            .topic(&channel.parse().unwrap())
-            .map(|topic| topic.to_string())
+        names.topic(&channel.parse().unwrap()).map(|topic| topic.to_string())
     }
 
     #[test]
     fn channels_become_topics() {
         assert_eq!(topic("", "imu/data").unwrap(), "imu.data");
-        assert_eq!(topic("edge-1.", "blaze/flow/control").unwrap(), "edge-1.blaze.flow.control");
+        assert_eq!(
+            topic("edge-1.", "blaze/flow/control").unwrap(),
+            "edge-1.blaze.flow.control"
+        );
         assert_eq!(topic("fog/", "a").unwrap(), "fog.a");
         assert_eq!(&*Names::new("x.").unwrap().leases(), "x.blaze.flow.leases");
     }
@@ -112,7 +113,10 @@ mod tests {
         assert!(Names::new("a:").is_err());
         let longest = "t".repeat(200);
         assert!(topic(&"p".repeat(49), &longest).is_ok());
-        assert!(matches!(topic(&"p".repeat(50), &longest), Err(BrokerError::Name { .. })));
+        assert!(matches!(
+            topic(&"p".repeat(50), &longest),
+            Err(BrokerError::Name { .. })
+        ));
     }
 
     #[test]

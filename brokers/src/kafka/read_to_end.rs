@@ -73,7 +73,10 @@ impl<T> ReaderToEnd<T> {
                 return Err(LookupError::Closed);
             }
             if Instant::now() >= deadline {
-                return Err(LookupError::Away(format!("{} could not be read to its end in time", self.topic)));
+                return Err(LookupError::Away(format!(
+                    "{} could not be read to its end in time",
+                    self.topic
+                )));
             }
             match self.client.poll(TURN) {
                 None => {}
@@ -143,7 +146,11 @@ impl<T> Default for Latest<T> {
 }
 
 impl<T> Latest<T> {
-    fn apply(&mut self, message: &BorrowedMessage<'_>, make: &mut impl FnMut(&BorrowedMessage<'_>, &[u8]) -> Option<T>) {
+    fn apply(
+        &mut self,
+        message: &BorrowedMessage<'_>,
+        make: &mut impl FnMut(&BorrowedMessage<'_>, &[u8]) -> Option<T>,
+    ) {
         let Some(key) = message.key() else { return };
         let made = message.payload().map(|payload| (payload.len(), make(message, payload)));
         // A payload that is left out leaves what was there before.

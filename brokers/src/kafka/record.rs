@@ -76,11 +76,8 @@ fn read_header<'a>(
 
 fn read_field(header: &mut Header, name: &str, value: Option<&[u8]>) -> Result<(), FrameError> {
     match name {
-        "blaze-version" => {
-            if text("blaze-version", value)? != VERSION {
-                return field("blaze-version", "is not 1");
-            }
-        }
+        "blaze-version" if text("blaze-version", value)? == VERSION => {}
+        "blaze-version" => return field("blaze-version", "is not 1"),
         "blaze-origin" => read_origin(&mut header.origin, text("blaze-origin", value)?)?,
         "blaze-epoch" => header.origin.epoch = number("blaze-epoch", value)?,
         "blaze-sequence" => header.sequence = number("blaze-sequence", value)?,

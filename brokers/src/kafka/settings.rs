@@ -211,7 +211,12 @@ impl Settings {
     pub(super) fn producer(&self, lot: Lot) -> ClientConfig {
         let timeout = lot.longest_wait().as_millis().to_string();
         self.with(
-            &[("linger.ms", "0"), ("queue.buffering.max.kbytes", "65536")],
+            &[
+                ("linger.ms", "0"),
+                // All that is handed over at once fits one request: of a second one it would wait busily for the first.
+                ("batch.size", "4194304"),
+                ("queue.buffering.max.kbytes", "65536"),
+            ],
             &[
                 ("enable.idempotence", "true"),
                 ("acks", "all"),
@@ -285,7 +290,10 @@ mod tests {
             config.create_native_config().unwrap();
         }
         for (reliable, large) in [(false, false), (true, false), (false, true), (true, true)] {
-            settings.producer(Lot { reliable, large }).create_native_config().unwrap();
+            settings
+                .producer(Lot { reliable, large })
+                .create_native_config()
+                .unwrap();
         }
     }
 
@@ -299,7 +307,13 @@ mod tests {
         assert_eq!(config.get("linger.ms"), Some("3"));
         assert_eq!(config.get("client.id"), Some("me"));
         assert_eq!(config.get("message.timeout.ms"), Some("5000"));
-        for key in ["enable.idempotence", "acks", "group.id", "enable.auto.commit", "auto.offset.reset"] {
+        for key in [
+            "enable.idempotence",
+            "acks",
+            "group.id",
+            "enable.auto.commit",
+            "auto.offset.reset",
+        ] {
             match refused(&format!(r#"{{"{key}": "x"}}"#)) {
                 OpenError::Setting { key: found, .. } => assert_eq!(found, format!("kafka.properties.{key}")),
                 other => panic!("{other}"),

@@ -56,14 +56,24 @@ fn a_frame_survives_its_headers() {
         let Content::Frame(found) = read_pairs(&written(&frame), b"payload") else {
             panic!("no frame");
         };
-        let expected = Frame::new(&Header { hops: 2, age_us: 77, ..header }, frame.payload().clone()).unwrap();
+        let expected = Frame::new(
+            &Header {
+                hops: 2,
+                age_us: 77,
+                ..header
+            },
+            frame.payload().clone(),
+        )
+        .unwrap();
         assert_eq!(found, expected);
     }
 }
 
 #[test]
 fn headers_are_as_the_contract_says() {
-    let frame = Frame::new(&full_header(), Bytes::new()).unwrap().with_hops_and_age(1, 2);
+    let frame = Frame::new(&full_header(), Bytes::new())
+        .unwrap()
+        .with_hops_and_age(1, 2);
     let shown: Vec<String> = written(&frame)
         .into_iter()
         .map(|(key, value)| format!("{key}={}", String::from_utf8(value).unwrap()))

@@ -10,9 +10,7 @@ use blaze_tests::servers::unique_name;
 use sha2::{Digest as _, Sha256};
 
 use super::plain::{PlainProducer, delete_topic, make_topic, topic_uuid};
-use super::{
-    Flow, eventually, frame, health, open, publish, publisher, reader, start_server, subscribe,
-};
+use super::{Flow, eventually, frame, health, open, publish, publisher, reader, start_server, subscribe};
 
 fn bare_writer(layer: &str, uuid: &str, partition: i32) -> WriterId {
     let hash = Sha256::digest(format!("kafka|{layer}|{uuid}|{partition}"));
@@ -47,7 +45,11 @@ async fn bare_records_have_the_identity_of_their_place() {
         for partition in 0..3 {
             let first = if partition == 1 { 2 } else { 1 };
             let expected = vec![(first, "one".to_owned()), (first + 1, "two".to_owned())];
-            assert_eq!(found.get(&bare_writer(layer, &uuid, partition)), Some(&expected), "{partition}");
+            assert_eq!(
+                found.get(&bare_writer(layer, &uuid, partition)),
+                Some(&expected),
+                "{partition}"
+            );
         }
         assert!(reader.is_silent().await);
     }
@@ -97,11 +99,18 @@ async fn broken_headers_are_reported_and_what_follows_arrives() {
         &[("blaze-writer", &b"\xff\xfe"[..]), ("blaze-sequence", b"1")][..],
         &[("blaze-writer", writer), ("blaze-sequence", b"0")],
         &[("blaze-writer", writer)],
-        &[("blaze-writer", writer), ("blaze-sequence", b"1"), ("blaze-encoding", &[b'x'; 70_000])],
+        &[
+            ("blaze-writer", writer),
+            ("blaze-sequence", b"1"),
+            ("blaze-encoding", &[b'x'; 70_000]),
+        ],
     ] {
         plain.write_with_headers(channel.as_str(), headers, "12345");
         let content = reader.next().await.content;
-        assert!(matches!(content, Content::Malformed { bytes: 5, .. }), "{headers:?}: {content:?}");
+        assert!(
+            matches!(content, Content::Malformed { bytes: 5, .. }),
+            "{headers:?}: {content:?}"
+        );
     }
     plain.write_with_headers(channel.as_str(), &[("anything", b"\xff")], "bare");
     assert_eq!(&reader.next_bare().await.0[..], b"bare");

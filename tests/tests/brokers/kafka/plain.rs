@@ -26,12 +26,18 @@ fn admin(server: &KafkaServer) -> AdminClient<DefaultClientContext> {
 pub(crate) async fn make_topic(server: &KafkaServer, name: &str, partitions: i32, settings: &[(&str, &str)]) {
     let topic = NewTopic::new(name, partitions, TopicReplication::Fixed(1));
     let topic = settings.iter().fold(topic, |topic, (key, value)| topic.set(key, value));
-    let made = admin(server).create_topics([&topic], &AdminOptions::new()).await.unwrap();
+    let made = admin(server)
+        .create_topics([&topic], &AdminOptions::new())
+        .await
+        .unwrap();
     assert_eq!(made, [Ok(name.to_owned())]);
 }
 
 pub(crate) async fn delete_topic(server: &KafkaServer, name: &str) {
-    let deleted = admin(server).delete_topics(&[name], &AdminOptions::new()).await.unwrap();
+    let deleted = admin(server)
+        .delete_topics(&[name], &AdminOptions::new())
+        .await
+        .unwrap();
     assert_eq!(deleted, [Ok(name.to_owned())]);
 }
 
@@ -58,7 +64,10 @@ impl PlainProducer {
                 value: Some(*value),
             })
         });
-        let record = BaseRecord::<str, str>::to(topic).partition(0).headers(headers).payload(value);
+        let record = BaseRecord::<str, str>::to(topic)
+            .partition(0)
+            .headers(headers)
+            .payload(value);
         self.0.send(record).map_err(|(error, _)| error).unwrap();
         self.0.flush(TIMEOUT).unwrap();
     }
@@ -74,14 +83,19 @@ pub(crate) fn topic_uuid(server: &KafkaServer, topic: &str) -> String {
     body.extend([0, 0, 0, 0]);
     let mut stream = TcpStream::connect(server.bootstrap()).unwrap();
     stream.set_read_timeout(Some(TIMEOUT)).unwrap();
-    stream.write_all(&u32::try_from(body.len()).unwrap().to_be_bytes()).unwrap();
+    stream
+        .write_all(&u32::try_from(body.len()).unwrap().to_be_bytes())
+        .unwrap();
     stream.write_all(&body).unwrap();
     let mut length = [0; 4];
     stream.read_exact(&mut length).unwrap();
     let mut answer = vec![0; u32::from_be_bytes(length) as usize];
     stream.read_exact(&mut answer).unwrap();
     // The identity follows the topic's name.
-    let name = answer.windows(topic.len()).position(|window| window == topic.as_bytes()).unwrap();
+    let name = answer
+        .windows(topic.len())
+        .position(|window| window == topic.as_bytes())
+        .unwrap();
     base64(&answer[name + topic.len()..][..16])
 }
 

@@ -25,7 +25,10 @@ async fn leases(side: &dyn FlowSide) -> BTreeMap<String, String> {
 }
 
 fn map(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
-    pairs.iter().map(|(key, value)| ((*key).to_owned(), (*value).to_owned())).collect()
+    pairs
+        .iter()
+        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
+        .collect()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -38,7 +41,10 @@ async fn leases_survive_the_flow_the_server_and_their_topic() {
     }
     flow.side.remove_lease("c");
     let expected = map(&[("a", "3"), ("b", "2")]);
-    eventually("the leases are there", async || leases(flow.side.as_ref()).await == expected).await;
+    eventually("the leases are there", async || {
+        leases(flow.side.as_ref()).await == expected
+    })
+    .await;
     server.kill().unwrap();
     health(&flow.broker, Health::Down).await;
     assert!(matches!(flow.side.load_leases().await, Err(BrokerError::Away(_))));
@@ -46,7 +52,10 @@ async fn leases_survive_the_flow_the_server_and_their_topic() {
     flow.side.remove_lease("b");
     server.restart().unwrap();
     let expected = map(&[("a", "3"), ("d", "5")]);
-    eventually("what changed meanwhile is there", async || leases(flow.side.as_ref()).await == expected).await;
+    eventually("what changed meanwhile is there", async || {
+        leases(flow.side.as_ref()).await == expected
+    })
+    .await;
     flow.broker.close().await;
     let flow = Flow::open(&server).await;
     assert_eq!(leases(flow.side.as_ref()).await, expected);
@@ -82,7 +91,10 @@ async fn prepared_topics_are_made_again_until_they_are_released() {
     delete_topic(&server, channel.as_str()).await;
     let other = flow.channel("other", 0).await;
     let missing = flow.broker.subscribe(&channel, SubscribeOptions::default()).await;
-    assert!(matches!(missing, Err(BrokerError::Away(_))), "made again though released, and {other} was made");
+    assert!(
+        matches!(missing, Err(BrokerError::Away(_))),
+        "made again though released, and {other} was made"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -94,7 +106,8 @@ async fn names_that_collide_or_are_too_long_are_refused() {
     let other: ChannelName = format!("{stem}_data").parse().unwrap();
     flow.side.prepare(&one, 0).unwrap();
     assert!(matches!(flow.side.prepare(&other, 0), Err(BrokerError::Name { .. })));
-    let long = blaze_brokers::kafka::KafkaBroker::open(&super::section(&server, &"p".repeat(60)), &Role::Service).unwrap();
+    let long =
+        blaze_brokers::kafka::KafkaBroker::open(&super::section(&server, &"p".repeat(60)), &Role::Service).unwrap();
     let channel: ChannelName = "t".repeat(200).parse().unwrap();
     assert!(matches!(
         long.publisher(&channel, blaze_brokers::PublisherOptions::default()),
@@ -156,7 +169,12 @@ async fn a_flow_that_stands_back_reads_and_writes_nothing_but_where_flows_meet()
     health(&flow.broker, Health::InUse).await;
     assert_eq!(flow.broker.status().borrow().detail, "scope_in_use: cloud/server-9");
     assert_eq!(user.publish(&frame(&channel, 1, 1), None), PublishOutcome::Dropped);
-    assert!(flow.broker.subscribe(&channel, SubscribeOptions::default()).await.is_err());
+    assert!(
+        flow.broker
+            .subscribe(&channel, SubscribeOptions::default())
+            .await
+            .is_err()
+    );
     publish(others.as_ref(), &frame(&channel, 2, 1));
     let hello = Bytes::from_static(b"hello");
     assert_eq!(meeting.publish_bare(&hello, None), PublishOutcome::Taken);
