@@ -424,11 +424,15 @@ impl Consumer {
     }
 
     /// Reads a topic again, from its end: what was written meanwhile was another's.
-    pub(super) fn resume(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
+    /// `lets` is asked under the lock that [`Consumer::stand_back`] takes: who stands back meanwhile reads nothing.
+    pub(super) fn resume(&self, topic: &str, info: &TopicInfo, marks: &[Marks], lets: impl FnOnce() -> bool) {
         let Some(client) = self.client.lock().clone() else {
             return;
         };
         let mut state = self.state.lock();
+        if !lets() {
+            return;
+        }
         let Some(topic) = state.topics.get_mut(topic) else {
             return;
         };

@@ -206,15 +206,13 @@ impl FlowState {
     fn load(&self, inner: &Inner) -> Result<Vec<(String, Bytes)>, BrokerError> {
         let deadline = Instant::now() + LOAD;
         let name = &self.leases.name;
-        let info = inner.directory.topic(name, LOAD).map_err(away)?;
-        let marks = inner.directory.marks(name, info.partitions, deadline).map_err(away)?;
-        let mut reader = ReaderToEnd::open(&inner.settings, &inner.last_error, name, &marks).map_err(away)?;
+        let info = inner.directory.topic(name, LOAD)?;
+        let marks = inner.directory.marks(name, info.partitions, deadline)?;
+        let mut reader = ReaderToEnd::open(&inner.settings, &inner.last_error, name, &marks)?;
         let ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
-        reader
-            .read(&ends, deadline, &|| inner.is_closed(), |_, payload| {
-                Some(Bytes::copy_from_slice(payload))
-            })
-            .map_err(away)?;
+        reader.read(&ends, deadline, &|| inner.is_closed(), |_, payload| {
+            Some(Bytes::copy_from_slice(payload))
+        })?;
         let leases: Vec<(String, Bytes)> = reader
             .take_latest()
             .into_iter()
@@ -227,13 +225,6 @@ impl FlowState {
             }
         }
         Ok(leases)
-    }
-}
-
-fn away(error: super::directory::LookupError) -> BrokerError {
-    match error {
-        super::directory::LookupError::Closed => BrokerError::Closed,
-        other => BrokerError::Away(other.to_string()),
     }
 }
 

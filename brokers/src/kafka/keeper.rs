@@ -136,7 +136,7 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
             Ok((info, marks))
         });
         match looked {
-            Ok((info, marks)) if resume => consumer.resume(&topic, &info, &marks),
+            Ok((info, marks)) if resume => consumer.resume(&topic, &info, &marks, || inner.gate.lets(false)),
             Ok((info, marks)) => consumer.check_positions(&topic, &info, &marks),
             Err(error) => {
                 tracing::debug!(%topic, %error, "could not be looked at");

@@ -188,12 +188,13 @@ impl KafkaBroker {
             .spawn_thread("kafka-keeper", TaskPolicy::MayEnd, move || keeper::run(&keeper))
             .map_err(|error| error.to_string())?;
         let Some(flow) = inner.flow.clone() else { return Ok(()) };
-        let producer = inner
-            .producer(Lot {
-                reliable: true,
-                large: false,
-            })
-            .map_err(|error| error.to_string())?;
+        // A new producer needs up to a second for its number: what is surely used gets it beforehand.
+        let small = |reliable| {
+            let lot = Lot { reliable, large: false };
+            inner.producer(lot).map_err(|error| error.to_string())
+        };
+        small(false)?;
+        let producer = small(true)?;
         let (gate, stop) = (Arc::clone(&inner.gate), inner.stop.clone());
         inner.supervisor.spawn("kafka-leases", TaskPolicy::MayEnd, async move {
             flow.keyed.run(&producer, &gate, &stop).await;
@@ -324,8 +325,9 @@ impl Inner {
                 producer.clear();
             }
         }
+        // Only this change shows at once; that the scope is ours again shows with the server's next answer.
         let status = self.status.borrow().clone();
-        if matches!(status.health, Health::Up | Health::InUse) {
+        if back && matches!(status.health, Health::Up | Health::InUse) {
             self.set_server(true, status.detail);
         }
         self.bell.ring();
@@ -356,12 +358,9 @@ impl Inner {
                 self.bell.ring();
                 return Ok(subscription);
             }
-            Err(error) => return Err(refusal(&error)),
+            Err(error) => return Err(error.into()),
         };
-        let marks = self
-            .directory
-            .marks(&source.topic, info.partitions, deadline)
-            .map_err(|error| refusal(&error))?;
+        let marks = self.directory.marks(&source.topic, info.partitions, deadline)?;
         let mut ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
         let (sender, subscription) = subscription(options);
         if !options.with_kept {
@@ -370,15 +369,12 @@ impl Inner {
                 .map_err(|error| refused(&error))?;
             return Ok(subscription);
         }
-        let mut reader = ReaderToEnd::open(&self.settings, &self.last_error, &source.topic, &marks)
-            .map_err(|error| refusal(&error))?;
+        let mut reader = ReaderToEnd::open(&self.settings, &self.last_error, &source.topic, &marks)?;
         loop {
-            let starts = reader
-                .read(&ends, deadline, &|| self.is_closed(), |message, payload| {
-                    let key = message.key()?;
-                    record::is_kept(key).then(|| consumer::receive(channel, message, payload, None, &self.clock))
-                })
-                .map_err(|error| refusal(&error))?;
+            let starts = reader.read(&ends, deadline, &|| self.is_closed(), |message, payload| {
+                let key = message.key()?;
+                record::is_kept(key).then(|| consumer::receive(channel, message, payload, None, &self.clock))
+            })?;
             let mut kept = || -> Vec<Received> { reader.take_latest().into_iter().map(|(_, kept)| kept).collect() };
             match consumer.add(&source, &info, starts, sender.clone(), Some(&mut kept)) {
                 Ok(()) => return Ok(subscription),
@@ -419,16 +415,18 @@ impl Inner {
             consumer.close();
         }
         for producer in self.producers() {
-            producer.clear();
+            producer.end();
         }
         self.set_status(Health::Closed, "closed".to_owned());
     }
 }
 
-fn refusal(error: &LookupError) -> BrokerError {
-    match error {
-        LookupError::Closed => BrokerError::Closed,
-        LookupError::Missing(_) | LookupError::Away(_) => BrokerError::Away(error.to_string()),
+impl From<LookupError> for BrokerError {
+    fn from(error: LookupError) -> Self {
+        match error {
+            LookupError::Closed => Self::Closed,
+            LookupError::Missing(_) | LookupError::Away(_) => Self::Away(error.to_string()),
+        }
     }
 }
 

@@ -19,11 +19,12 @@ use parking_lot::Mutex;
 use rdkafka::ClientContext;
 use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
-use rdkafka::message::{DeliveryResult, Message as _, Timestamp};
+use rdkafka::message::{DeliveryResult, Message as _, OwnedHeaders, Timestamp};
 use rdkafka::producer::{BaseProducer, BaseRecord, NoCustomPartitioner, Producer as _, ProducerContext};
 use tokio::sync::{Notify, oneshot};
 use tokio_util::sync::CancellationToken;
 
+use super::bell::Bell;
 use super::clock::BrokerClock;
 use super::context::{self, LastError};
 use super::record;
@@ -35,11 +36,15 @@ use crate::outbox::{Body, Fate, Lane, Outbox, OutboxLimits, Receipt, Waiting};
 const WINDOW: usize = 1024 * 1024;
 /// Messages that are handed over at once.
 const BATCH: usize = 1024;
-/// Batches that are with librdkafka and not acknowledged. It sends what it has as soon as it looks, in up to five requests
-/// per partition, and then looks all the time for room for a sixth: what it has not it cannot send in dribs.
-const BATCHES: usize = 1;
-/// How long the poll thread may sleep: closing and a fatal error wait for that.
-const POLL: Duration = Duration::from_millis(100);
+/// With so many bytes in flight, what comes waits until less are. librdkafka sends what it has as soon as it looks, but of one
+/// partition no more while five messages are not acknowledged, and until then it looks without a pause: what it has not it
+/// need not look for, and goes in one request.
+const CROWD: usize = 64 * 1024;
+/// How long the poll thread is with the client while something is in flight: closing waits for that. The client library
+/// ends each such visit with up to a millisecond of busy waiting.
+const POLL: Duration = Duration::from_millis(200);
+/// How often the poll thread looks for errors while nothing is.
+const IDLE: Duration = Duration::from_millis(500);
 /// How often messages that wait are looked at for their deadlines.
 const EXPIRY: Duration = Duration::from_millis(100);
 /// How long to wait before a client is made again that could not be made.
@@ -116,7 +121,11 @@ pub(super) enum Delivery {
         batch: Arc<Batch>,
     },
     /// A value of a key; told whether the server has it.
-    Keyed { done: oneshot::Sender<bool>, sent: Instant },
+    Keyed {
+        done: oneshot::Sender<bool>,
+        sent: Instant,
+        batch: Arc<Batch>,
+    },
 }
 
 /// Messages that were handed over together.
@@ -125,6 +134,7 @@ pub(super) struct Batch(Arc<WriteContext>);
 impl Batch {
     fn begin(context: &Arc<WriteContext>) -> Arc<Self> {
         context.batches.fetch_add(1, Ordering::AcqRel);
+        context.bell.ring();
         Arc::new(Self(Arc::clone(context)))
     }
 }
@@ -142,6 +152,8 @@ pub(super) struct WriteContext {
     in_flight: AtomicUsize,
     /// Batches of which something is.
     batches: AtomicUsize,
+    /// Wakes the poll thread.
+    bell: Bell,
     room: Notify,
     fatal: AtomicBool,
     clock: Arc<Mutex<BrokerClock>>,
@@ -194,7 +206,11 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
                 drop(batch);
                 sent
             }
-            Delivery::Keyed { done, sent } => {
+            Delivery::Keyed {
+                done,
+                sent,
+                batch: _batch,
+            } => {
                 // Nobody waits any more when the broker is closed.
                 let _ = done.send(result.is_ok());
                 sent
@@ -265,6 +281,7 @@ impl Producer {
             context: Arc::new(WriteContext {
                 in_flight: AtomicUsize::new(0),
                 batches: AtomicUsize::new(0),
+                bell: Bell::default(),
                 room: Notify::new(),
                 fatal: AtomicBool::new(false),
                 clock: Arc::clone(clock),
@@ -313,6 +330,12 @@ impl Producer {
         self.outbox.close();
     }
 
+    /// Lets the poll thread look whether it is over.
+    pub(super) fn end(&self) {
+        self.clear();
+        self.context.bell.ring();
+    }
+
     /// Whether everything that was taken has been settled.
     pub(super) fn is_drained(&self) -> bool {
         self.outbox.is_empty() && self.context.in_flight.load(Ordering::Acquire) == 0
@@ -336,9 +359,9 @@ impl Producer {
 
     /// Hands over as much as there is room for.
     fn hand_over(&self, taken: &mut Vec<Waiting<Target>>, scratch: &mut String) {
-        while self.gate.is_open() && self.context.batches.load(Ordering::Acquire) < BATCHES {
+        while self.gate.is_open() {
             let in_flight = self.context.in_flight.load(Ordering::Acquire);
-            if in_flight >= WINDOW {
+            if in_flight >= CROWD {
                 return;
             }
             let Some(client) = self.client.lock().clone() else {
@@ -352,13 +375,109 @@ impl Producer {
                 return;
             }
             let batch = Batch::begin(&self.context);
-            for waiting in taken.drain(..) {
-                self.send(&client, waiting, &batch, scratch);
+            // All at once, as librdkafka begins to send what it has with the first.
+            let ready: Vec<Ready> = taken
+                .drain(..)
+                .map(|waiting| Ready::new(waiting, &batch, scratch))
+                .collect();
+            drop(batch);
+            for ready in ready {
+                self.send(&client, ready);
             }
         }
     }
 
-    fn send(&self, client: &Client, waiting: Waiting<Target>, batch: &Arc<Batch>, scratch: &mut String) {
+    fn send(&self, client: &Client, ready: Ready) {
+        let (topic, bytes) = (ready.topic, ready.bytes);
+        let mut record =
+            BaseRecord::<str, [u8], _>::with_opaque_to(&topic.name, ready.delivery).payload(&ready.payload);
+        record.key = ready.key.as_deref();
+        record.partition = ready.partition;
+        record.headers = ready.headers;
+        self.context.in_flight.fetch_add(bytes, Ordering::AcqRel);
+        if let Err((error, record)) = client.send(record)
+            && let Delivery::Message { receipt, .. } = *record.delivery_opaque
+        {
+            receipt.settle(self.context.failed(&error, &topic));
+            self.context.in_flight.fetch_sub(bytes, Ordering::AcqRel);
+        }
+    }
+
+    /// Writes the value of a key, or takes it away; `done` is told whether the server has it.
+    pub(super) fn send_keyed(
+        &self,
+        topic: &str,
+        partition: Option<i32>,
+        key: &str,
+        value: Option<&Bytes>,
+        done: oneshot::Sender<bool>,
+    ) {
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
+        let delivery = Box::new(Delivery::Keyed {
+            done,
+            sent: Instant::now(),
+            batch: Batch::begin(&self.context),
+        });
+        let mut record = BaseRecord::<str, [u8], _>::with_opaque_to(topic, delivery).key(key);
+        record.partition = partition;
+        record.payload = value.map(|value| &value[..]);
+        // What is refused is dropped here with its `done`, which tells as well.
+        if let Err((error, _)) = client.send(record) {
+            tracing::debug!(topic, key, %error, "a value was not taken");
+        }
+    }
+
+    /// Runs the callbacks until the end, and makes the client anew after a fatal error.
+    fn poll(&self, stop: &CancellationToken) {
+        while !stop.is_cancelled() {
+            let client = self.client.lock().clone();
+            if let Some(client) = &client {
+                if self.context.batches.load(Ordering::Acquire) > 0 {
+                    client.poll(POLL);
+                } else {
+                    self.context.bell.wait(IDLE);
+                    client.poll(Duration::ZERO);
+                }
+                let fatal = client.client().fatal_error();
+                if fatal.is_none() && !self.context.fatal.load(Ordering::Acquire) {
+                    continue;
+                }
+                let reason = fatal.map_or_else(|| "unknown".to_owned(), |(code, text)| format!("{code}: {text}"));
+                tracing::warn!(producer = self.lot.as_str(), reason, "the Kafka producer is made anew");
+            }
+            self.context.fatal.store(false, Ordering::Release);
+            // What the old client held fails as it is dropped, and is not sent again.
+            *self.client.lock() = None;
+            drop(client);
+            match self.make_client() {
+                Ok(client) => *self.client.lock() = Some(client),
+                Err(error) => {
+                    self.context.last_error.note(error.to_string());
+                    std::thread::sleep(REMAKE);
+                }
+            }
+            self.wake();
+        }
+        let client = self.client.lock().take();
+        drop(client);
+    }
+}
+
+/// A message as the client takes it.
+struct Ready {
+    topic: Arc<Topic>,
+    bytes: usize,
+    payload: Bytes,
+    key: Option<String>,
+    partition: Option<i32>,
+    headers: Option<OwnedHeaders>,
+    delivery: Box<Delivery>,
+}
+
+impl Ready {
+    fn new(waiting: Waiting<Target>, batch: &Arc<Batch>, scratch: &mut String) -> Self {
         let (bytes, target, sent) = (waiting.size(), Arc::clone(&waiting.to), Instant::now());
         let (payload, key, partition, headers);
         match &waiting.body {
@@ -384,79 +503,23 @@ impl Producer {
                 payload = bytes.clone();
             }
         }
+        let topic = Arc::clone(&target.topic);
         let delivery = Box::new(Delivery::Message {
             receipt: waiting.into_receipt(),
-            topic: Arc::clone(&target.topic),
+            topic: Arc::clone(&topic),
             bytes,
             sent,
             batch: Arc::clone(batch),
         });
-        let mut record = BaseRecord::<str, [u8], _>::with_opaque_to(&target.topic.name, delivery).payload(&payload);
-        record.key = key.as_deref();
-        record.partition = partition;
-        record.headers = headers;
-        self.context.in_flight.fetch_add(bytes, Ordering::AcqRel);
-        if let Err((error, record)) = client.send(record)
-            && let Delivery::Message { receipt, .. } = *record.delivery_opaque
-        {
-            receipt.settle(self.context.failed(&error, &target.topic));
-            self.context.in_flight.fetch_sub(bytes, Ordering::AcqRel);
+        Self {
+            topic,
+            bytes,
+            payload,
+            key,
+            partition,
+            headers,
+            delivery,
         }
-    }
-
-    /// Writes the value of a key, or takes it away; `done` is told whether the server has it.
-    pub(super) fn send_keyed(
-        &self,
-        topic: &str,
-        partition: Option<i32>,
-        key: &str,
-        value: Option<&Bytes>,
-        done: oneshot::Sender<bool>,
-    ) {
-        let Some(client) = self.client.lock().clone() else {
-            return;
-        };
-        let delivery = Box::new(Delivery::Keyed {
-            done,
-            sent: Instant::now(),
-        });
-        let mut record = BaseRecord::<str, [u8], _>::with_opaque_to(topic, delivery).key(key);
-        record.partition = partition;
-        record.payload = value.map(|value| &value[..]);
-        // What is refused is dropped here with its `done`, which tells as well.
-        if let Err((error, _)) = client.send(record) {
-            tracing::debug!(topic, key, %error, "a value was not taken");
-        }
-    }
-
-    /// Runs the callbacks until the end, and makes the client anew after a fatal error.
-    fn poll(&self, stop: &CancellationToken) {
-        while !stop.is_cancelled() {
-            let client = self.client.lock().clone();
-            if let Some(client) = &client {
-                client.poll(POLL);
-                let fatal = client.client().fatal_error();
-                if fatal.is_none() && !self.context.fatal.load(Ordering::Acquire) {
-                    continue;
-                }
-                let reason = fatal.map_or_else(|| "unknown".to_owned(), |(code, text)| format!("{code}: {text}"));
-                tracing::warn!(producer = self.lot.as_str(), reason, "the Kafka producer is made anew");
-            }
-            self.context.fatal.store(false, Ordering::Release);
-            // What the old client held fails as it is dropped, and is not sent again.
-            *self.client.lock() = None;
-            drop(client);
-            match self.make_client() {
-                Ok(client) => *self.client.lock() = Some(client),
-                Err(error) => {
-                    self.context.last_error.note(error.to_string());
-                    std::thread::sleep(REMAKE);
-                }
-            }
-            self.wake();
-        }
-        let client = self.client.lock().take();
-        drop(client);
     }
 }
 

@@ -74,17 +74,10 @@ fn read_header<'a>(
     Ok(Some(header))
 }
 
-fn check_version(found: &str) -> Result<(), FrameError> {
-    if found == VERSION {
-        Ok(())
-    } else {
-        field("blaze-version", "is not 1")
-    }
-}
-
 fn read_field(header: &mut Header, name: &str, value: Option<&[u8]>) -> Result<(), FrameError> {
     match name {
-        "blaze-version" => check_version(text("blaze-version", value)?)?,
+        "blaze-version" if text("blaze-version", value)? == VERSION => {}
+        "blaze-version" => return field("blaze-version", "is not 1"),
         "blaze-origin" => read_origin(&mut header.origin, text("blaze-origin", value)?)?,
         "blaze-epoch" => header.origin.epoch = number("blaze-epoch", value)?,
         "blaze-sequence" => header.sequence = number("blaze-sequence", value)?,

@@ -211,7 +211,12 @@ impl Settings {
     pub(super) fn producer(&self, lot: Lot) -> ClientConfig {
         let timeout = lot.longest_wait().as_millis().to_string();
         self.with(
-            &[("linger.ms", "0"), ("queue.buffering.max.kbytes", "65536")],
+            &[
+                ("linger.ms", "0"),
+                // All that is handed over at once fits one request: of a second one it would wait busily for the first.
+                ("batch.size", "4194304"),
+                ("queue.buffering.max.kbytes", "65536"),
+            ],
             &[
                 ("enable.idempotence", "true"),
                 ("acks", "all"),

@@ -68,6 +68,7 @@ pub(crate) async fn health(broker: &dyn Broker, health: Health) -> Duration {
 pub(crate) struct Flow {
     pub(crate) broker: KafkaBroker,
     pub(crate) side: Arc<dyn FlowSide>,
+    bootstrap: String,
 }
 
 impl Flow {
@@ -75,14 +76,21 @@ impl Flow {
         let broker = open(server, &flow_role());
         health(&broker, Health::Up).await;
         let side = broker.flow_side().unwrap();
-        Self { broker, side }
+        let bootstrap = server.bootstrap();
+        Self {
+            broker,
+            side,
+            bootstrap,
+        }
     }
 
     /// A channel of a new name, which the server has when this returns.
     pub(crate) async fn channel(&self, stem: &str, depth: u32) -> ChannelName {
         let channel: ChannelName = unique_name(stem).parse().unwrap();
         self.side.prepare(&channel, depth).unwrap();
-        drop(subscribe(&self.broker, &channel, SubscribeOptions::default()).await);
+        let bootstrap = self.bootstrap.clone();
+        let topic = channel.as_str().replace('/', ".");
+        eventually("the topic is made", async || plain::has_topic(&bootstrap, &topic)).await;
         channel
     }
 }

@@ -122,3 +122,21 @@ async fn a_client_may_come_before_its_server_and_its_topic() {
     super::eventually("it is written", async || publisher.later().queued == 0).await;
     assert_eq!(publisher.later().dropped(), 0);
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn closing_does_not_wait_for_a_frozen_server() {
+    let server = start_server();
+    let flow = Flow::open(&server).await;
+    let channel = flow.channel("closing", 0).await;
+    let mut reader = reader(&flow.broker, &channel).await;
+    let publisher = publisher(&flow.broker, &channel, 0);
+    server.freeze().unwrap();
+    publish(publisher.as_ref(), &frame(&channel, 1, 1));
+    let start = Instant::now();
+    flow.broker.close().await;
+    assert!(start.elapsed() < Duration::from_secs(5), "{:?}", start.elapsed());
+    assert_eq!(flow.broker.status().borrow().health, Health::Closed);
+    assert!(reader.is_silent().await);
+    let later = publisher.later();
+    assert_eq!((later.queued, later.broker_error), (0, 1));
+}

@@ -8,6 +8,7 @@ use blaze_tests::servers::KafkaServer;
 use rdkafka::ClientConfig;
 use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, TopicReplication};
 use rdkafka::client::DefaultClientContext;
+use rdkafka::consumer::{BaseConsumer, Consumer as _};
 use rdkafka::message::{Header, OwnedHeaders};
 use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
 
@@ -31,6 +32,16 @@ pub(crate) async fn make_topic(server: &KafkaServer, name: &str, partitions: i32
         .await
         .unwrap();
     assert_eq!(made, [Ok(name.to_owned())]);
+}
+
+/// Whether the server has a topic.
+pub(crate) fn has_topic(bootstrap: &str, name: &str) -> bool {
+    let client: BaseConsumer = ClientConfig::new().set("bootstrap.servers", bootstrap).create().unwrap();
+    let metadata = client.fetch_metadata(Some(name), TIMEOUT).unwrap();
+    metadata
+        .topics()
+        .iter()
+        .any(|topic| topic.name() == name && topic.error().is_none() && !topic.partitions().is_empty())
 }
 
 pub(crate) async fn delete_topic(server: &KafkaServer, name: &str) {
