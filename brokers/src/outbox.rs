@@ -355,10 +355,12 @@ impl<C> Outbox<C> {
                     counts: Some(Arc::clone(&queue.counts)),
                 });
             }
-            state.end_turn(id);
             if full {
+                // It keeps its place: one that is too large for what is left is the first of the next take.
+                state.turns.push_front(id);
                 break;
             }
+            state.end_turn(id);
         }
         for id in not_ready {
             state.end_turn(id);

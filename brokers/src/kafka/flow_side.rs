@@ -22,6 +22,20 @@ use super::record;
 use super::topics::Topic;
 use crate::port::{BrokerError, FlowSide};
 
+/// What the server refused to make is asked for again after this.
+const TRY_AGAIN: Duration = Duration::from_secs(10);
+
+/// What a round has made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Made {
+    /// Topics that the flow itself needs: until they are listed there is nothing else to do.
+    Needed,
+    /// Topics of services, for the first time.
+    Topics,
+    /// Nothing, or what was asked for in the round before.
+    Nothing,
+}
+
 /// How long reading all leases may take.
 const LOAD: Duration = Duration::from_secs(10);
 /// Leases that are remembered at most, to write them again.
@@ -49,7 +63,9 @@ pub(super) struct FlowState {
     /// Names of the server's topics, as they were last listed.
     listed: Mutex<HashSet<Arc<str>>>,
     /// Topics that could not be made, told once.
-    refused: Mutex<HashMap<Arc<str>, RDKafkaErrorCode>>,
+    refused: Mutex<HashMap<Arc<str>, (RDKafkaErrorCode, Instant)>>,
+    /// What was asked to be made in the last round.
+    asked: Mutex<HashSet<Arc<str>>>,
     admin: Mutex<Option<Arc<Admin>>>,
 }
 
@@ -65,6 +81,7 @@ impl FlowState {
             stood_back: Mutex::default(),
             listed: Mutex::default(),
             refused: Mutex::default(),
+            asked: Mutex::default(),
             admin: Mutex::default(),
         }
     }
@@ -84,8 +101,9 @@ impl FlowState {
         Ok(Arc::clone(admin.insert(Arc::new(made))))
     }
 
-    /// Makes what is missing. Returns whether something was made, or why what is needed first could not be made.
-    pub(super) fn keep_topics(&self, inner: &Inner, listing: &Listing) -> Result<bool, String> {
+    /// Makes what is missing. Fails where what the flow itself needs could not be made; a topic of a service that cannot be
+    /// made holds up nobody else, and is tried again after a while.
+    pub(super) fn keep_topics(&self, inner: &Inner, listing: &Listing) -> Result<Made, String> {
         let there: HashSet<Arc<str>> = listing
             .topics
             .iter()
@@ -93,16 +111,34 @@ impl FlowState {
             .collect();
         let missing = self.missing(&there);
         *self.listed.lock() = there;
+        let needs = missing.iter().any(|(name, _)| self.is_needed(name));
         if !missing.is_empty() {
-            let refused = self.admin(inner)?.make(&missing).map_err(|error| error.to_string())?;
-            self.note_refused(&missing, &refused)?;
+            match self.admin(inner)?.make(&missing) {
+                Ok(refused) => self.note_refused(&missing, &refused)?,
+                Err(error) if needs => return Err(error.to_string()),
+                Err(error) => tracing::warn!(%error, topics = missing.len(), "topics could not be made, trying on"),
+            }
             if missing.iter().any(|(name, _)| *name == self.leases.name) {
                 self.write_all_leases();
             }
         }
+        let asked: HashSet<Arc<str>> = missing.into_iter().map(|(name, _)| name).collect();
+        let before = std::mem::replace(&mut *self.asked.lock(), asked.clone());
+        if needs {
+            return Ok(Made::Needed);
+        }
         self.keep_last_values(inner);
         self.follow_leases_topic(inner);
-        Ok(!missing.is_empty())
+        Ok(if asked.is_subset(&before) {
+            Made::Nothing
+        } else {
+            Made::Topics
+        })
+    }
+
+    /// Whether the flow itself cannot do without a topic.
+    fn is_needed(&self, name: &Arc<str>) -> bool {
+        *name == self.leases.name || self.reserved.contains(name)
     }
 
     fn missing(&self, there: &HashSet<Arc<str>>) -> Vec<(Arc<str>, Purpose)> {
@@ -122,8 +158,12 @@ impl FlowState {
             .chain(reserved)
             .chain(wanted)
             .filter(|(name, _)| !there.contains(*name))
-            // An impossible name stays one.
-            .filter(|(name, _)| refused.get(*name) != Some(&RDKafkaErrorCode::InvalidTopic))
+            .filter(|(name, _)| match refused.get(*name) {
+                // An impossible name stays one; what the server did not want may come to be wanted.
+                Some((RDKafkaErrorCode::InvalidTopic, _)) => false,
+                Some((_, at)) => self.is_needed(name) || at.elapsed() >= TRY_AGAIN,
+                None => true,
+            })
             .map(|(name, purpose)| (Arc::clone(name), purpose))
             .collect()
     }
@@ -141,10 +181,11 @@ impl FlowState {
         }
         let mut needed = Ok(());
         for (name, code) in refused {
-            if known.insert(Arc::clone(name), *code) != Some(*code) {
+            let before = known.insert(Arc::clone(name), (*code, Instant::now()));
+            if before.is_none_or(|(before, _)| before != *code) {
                 tracing::warn!(topic = %name, %code, "the topic could not be made");
             }
-            if *name == self.leases.name || self.reserved.contains(name) {
+            if self.is_needed(name) {
                 needed = Err(format!("topic {name} could not be made: {code}"));
             }
         }
@@ -191,15 +232,16 @@ impl FlowState {
     }
 
     fn write_all_leases(&self) {
-        let mirror = self.mirror.lock().clone();
+        // Locked until all are handed over: a lease that is removed meanwhile must not be overtaken by its old value.
+        let mirror = self.mirror.lock();
         if !mirror.is_empty() {
             tracing::info!(
                 leases = mirror.len(),
                 "the topic of leases was made anew: all are written again"
             );
         }
-        for (key, value) in mirror {
-            self.keyed.put(&self.leases, None, key, Some(value));
+        for (key, value) in mirror.iter() {
+            self.keyed.put(&self.leases, None, key.clone(), Some(value.clone()));
         }
     }
 

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use super::Inner;
 use super::consumer::Consumer;
 use super::directory::Listing;
+use super::flow_side::Made;
 
 /// How long the server has for an answer.
 const ANSWER: Duration = Duration::from_secs(1);
@@ -49,12 +50,10 @@ fn round(inner: &Inner, turn: usize) -> bool {
     if let Some(flow) = &inner.flow {
         match flow.keep_topics(inner, &listing) {
             Err(reason) => return lost(inner, &reason),
-            // They are there when the server lists them.
-            Ok(true) => {
-                inner.bell.ring();
-                return false;
-            }
-            Ok(false) => {}
+            Ok(Made::Needed) => return false,
+            // They are there when the server lists them: the next round comes at once.
+            Ok(Made::Topics) => inner.bell.ring(),
+            Ok(Made::Nothing) => {}
         }
     }
     note_topics(inner, &listing);

@@ -344,6 +344,9 @@ impl Producer {
     async fn feed(&self, stop: CancellationToken) {
         let mut taken = Vec::with_capacity(BATCH);
         let mut scratch = String::new();
+        // Made once: one that begins anew with each message would never end where there are many.
+        let mut expiry = tokio::time::interval(EXPIRY);
+        expiry.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         while !stop.is_cancelled() {
             self.hand_over(&mut taken, &mut scratch);
             let waits = !self.outbox.is_empty();
@@ -351,7 +354,7 @@ impl Producer {
                 () = stop.cancelled() => break,
                 () = self.outbox.filled() => {}
                 () = self.context.room.notified() => {}
-                () = tokio::time::sleep(EXPIRY), if waits => self.outbox.expire(Instant::now()),
+                _ = expiry.tick(), if waits => self.outbox.expire(Instant::now()),
             }
         }
         self.clear();

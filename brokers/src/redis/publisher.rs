@@ -65,7 +65,12 @@ impl RedisPublisher {
         } else if payload_bytes > MAX_PAYLOAD_BYTES {
             PublishOutcome::TooLarge
         } else {
-            self.lane.push(body, deadline)
+            let outcome = self.lane.push(body, deadline);
+            if !self.gate.is_open() {
+                // It closed between the two: what slipped in after it was emptied is dropped here.
+                self.gate.outbox.clear(DropReason::BrokerError);
+            }
+            outcome
         }
     }
 }

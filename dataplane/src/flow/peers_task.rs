@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, Content, FlowSide, PublisherOptions, Received, SubscribeOptions, Subscription};
+use blaze_brokers::{Broker, Content, FlowSide, Health, PublisherOptions, Received, SubscribeOptions, Subscription};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{FlowId, LayerKind};
 use blaze_proto::link::LinkControl;
@@ -92,6 +92,13 @@ impl Claims {
         }
     }
 
+    /// The broker is away: that nothing is heard says nothing of who lives.
+    pub(super) fn excuse(&mut self, now: Instant) {
+        for (_, heard) in self.others.values_mut() {
+            *heard = now;
+        }
+    }
+
     /// The flow of another layer that was first, if there is one that lives.
     pub(super) fn first(&mut self, now: Instant) -> Option<&FlowId> {
         self.others
@@ -155,6 +162,10 @@ impl PeersTask {
                 if let Content::Bare { payload, .. } = &received.content {
                     claims.hear(now, payload);
                 }
+            }
+            let health = self.broker.status().borrow().health;
+            if !matches!(health, Health::Up | Health::InUse) {
+                claims.excuse(now);
             }
             let first = claims.first(now);
             if first.is_some() != standing_back {

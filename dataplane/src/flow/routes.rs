@@ -178,7 +178,9 @@ impl Routes {
             reliable: lane.reliable,
             large,
         };
-        if let Some(held) = held.filter(|held| held.options == options) {
+        // While the one that it had holds messages, another could overtake it: the reconcile tries again.
+        let keeps = |held: &NewWriter| held.options == options || held.publisher.later().queued > 0;
+        if let Some(held) = held.filter(keeps) {
             return Ok(held);
         }
         let broker = self.brokers.of(scope).ok_or("the scope has no broker")?;

@@ -36,7 +36,10 @@ pub(crate) async fn make_topic(server: &KafkaServer, name: &str, partitions: i32
 
 /// Whether the server has a topic.
 pub(crate) fn has_topic(bootstrap: &str, name: &str) -> bool {
-    let client: BaseConsumer = ClientConfig::new().set("bootstrap.servers", bootstrap).create().unwrap();
+    let client: BaseConsumer = ClientConfig::new()
+        .set("bootstrap.servers", bootstrap)
+        .create()
+        .unwrap();
     let metadata = client.fetch_metadata(Some(name), TIMEOUT).unwrap();
     metadata
         .topics()
