@@ -5,9 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use super::Inner;
 use super::consumer::Consumer;
 use super::directory::Listing;
+use super::inner::Inner;
 
 /// How long the server has for an answer.
 const ANSWER: Duration = Duration::from_secs(1);
