@@ -8,31 +8,29 @@
 //! what lies at or behind the end that it saw when it subscribed. A topic that was made anew has another identity, which
 //! this client learns before it gets a record of it: it is then read from its beginning, for all its readers.
 
+mod topic;
+
 use std::collections::HashMap;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use blaze_domain::WriterId;
 use blaze_domain::names::ChannelName;
-use blaze_proto::FrameError;
 use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
-use bytes::Bytes;
 use parking_lot::Mutex;
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
-use rdkafka::message::{BorrowedMessage, Headers as _, Message as _, Timestamp};
-use rdkafka::{Offset, TopicPartitionList};
+use rdkafka::message::{BorrowedMessage, Message as _};
 use tokio_util::sync::CancellationToken;
 
 use super::clock::BrokerClock;
 use super::context::{LastError, ReadContext};
 use super::directory::{Marks, TopicInfo};
-use super::identity::{Identities, TopicUuid};
-use super::record;
+use super::identity::Identities;
+use super::receive::receive;
 use super::settings::Settings;
-use crate::port::{Content, Received, SubscriptionSender};
+use crate::port::{Received, SubscriptionSender};
+use topic::{Partition, Reader, TopicState};
 
 /// How long the thread may sleep: closing waits for that.
 const POLL: Duration = Duration::from_millis(100);
@@ -60,30 +58,6 @@ pub(super) enum Refused {
     Failed(String),
     /// The broker was closed.
     Closed,
-}
-
-struct Partition {
-    /// Offset of the next record.
-    next: i64,
-    /// Writer of its bare records, where the topic has an identity.
-    bare_writer: Option<WriterId>,
-}
-
-struct Reader {
-    sender: SubscriptionSender,
-    /// Where it begins, per partition; partitions that came later from their beginning.
-    starts: Vec<i64>,
-}
-
-struct TopicState {
-    source: Source,
-    uuid: Option<TopicUuid>,
-    partitions: Vec<Partition>,
-    readers: Vec<Reader>,
-    /// Whether the client reads it now.
-    assigned: bool,
-    /// It was not there when its readers came: whatever it will hold came after them, so it is read from its beginning.
-    awaited: bool,
 }
 
 #[derive(Default)]
@@ -471,151 +445,8 @@ impl Consumer {
     }
 }
 
-impl TopicState {
-    fn take_in(
-        &mut self,
-        sender: SubscriptionSender,
-        starts: Vec<i64>,
-        kept: Option<&mut dyn FnMut() -> Vec<Received>>,
-    ) {
-        for received in kept.into_iter().flat_map(|kept| kept()) {
-            sender.send(received);
-        }
-        self.readers.push(Reader { sender, starts });
-    }
-
-    fn identify(&mut self, uuid: Option<TopicUuid>, layer: &str) {
-        for (number, partition) in self.partitions.iter_mut().enumerate() {
-            partition.bare_writer = uuid.as_ref().map(|uuid| uuid.bare_writer(layer, number));
-        }
-        self.uuid = uuid;
-    }
-
-    /// Another topic has this name now: nothing of it was seen.
-    fn made_anew(&mut self, uuid: TopicUuid, layer: &str) {
-        for partition in &mut self.partitions {
-            partition.next = 0;
-        }
-        for reader in &mut self.readers {
-            reader.starts.clear();
-        }
-        self.identify(Some(uuid), layer);
-    }
-
-    /// What was waited for is there: it is read from its beginning.
-    fn came(&mut self, info: &TopicInfo, layer: &str, client: &Client) {
-        self.identify(info.uuid.clone(), layer);
-        self.grow(info.partitions, layer);
-        self.awaited = false;
-        if let Err(error) = self.assign(client) {
-            tracing::warn!(topic = %self.source.topic, %error, "the topic cannot be read yet");
-            self.awaited = true;
-        }
-    }
-
-    fn grow(&mut self, partitions: usize, layer: &str) {
-        for number in self.partitions.len()..partitions {
-            self.partitions.push(Partition {
-                next: 0,
-                bare_writer: self.uuid.as_ref().map(|uuid| uuid.bare_writer(layer, number)),
-            });
-        }
-    }
-
-    fn list(&self) -> Result<TopicPartitionList, KafkaError> {
-        let mut list = TopicPartitionList::new();
-        for (number, partition) in (0..).zip(&self.partitions) {
-            list.add_partition_offset(&self.source.topic, number, Offset::Offset(partition.next))?;
-        }
-        Ok(list)
-    }
-
-    fn assign(&mut self, client: &Client) -> Result<(), KafkaError> {
-        client.incremental_assign(&self.list()?)?;
-        self.assigned = true;
-        Ok(())
-    }
-
-    fn unassign(&mut self, client: &Client) {
-        if !std::mem::take(&mut self.assigned) {
-            return;
-        }
-        // Not the list of now: the partitions may have become more since.
-        let assigned = client.assignment().map(|assigned| {
-            let mut list = TopicPartitionList::new();
-            for element in assigned.elements_for_topic(&self.source.topic) {
-                list.add_partition(&self.source.topic, element.partition());
-            }
-            list
-        });
-        if let Err(error) = assigned.and_then(|list| client.incremental_unassign(&list)) {
-            tracing::debug!(topic = %self.source.topic, %error, "could not be left");
-        }
-    }
-
-    /// Reads on at the positions of now.
-    fn reassign(&mut self, client: &Client) {
-        self.unassign(client);
-        if let Err(error) = self.assign(client) {
-            tracing::warn!(topic = %self.source.topic, %error, "the topic cannot be read");
-        }
-    }
-}
-
 fn forget(state: &mut State, client: &Client, topic: &str) {
     if let Some(mut topic) = state.topics.remove(topic) {
         topic.unassign(client);
     }
-}
-
-/// A record as it goes to readers.
-pub(super) fn receive(
-    channel: &ChannelName,
-    message: &BorrowedMessage<'_>,
-    payload: &[u8],
-    identity: Option<(WriterId, u64)>,
-    clock: &Mutex<BrokerClock>,
-) -> Received {
-    let at = Instant::now();
-    let broker_age_us = match message.timestamp() {
-        Timestamp::LogAppendTime(appended) => clock.lock().age_us(appended, at),
-        Timestamp::CreateTime(_) | Timestamp::NotAvailable => 0,
-    };
-    let payload = Bytes::copy_from_slice(payload);
-    let content = if channel.is_reserved() {
-        Content::Bare { payload, identity }
-    } else {
-        content_of(channel, message, payload, identity)
-    };
-    Received {
-        content,
-        at,
-        broker_age_us,
-    }
-}
-
-fn content_of(
-    channel: &ChannelName,
-    message: &BorrowedMessage<'_>,
-    payload: Bytes,
-    identity: Option<(WriterId, u64)>,
-) -> Content {
-    let Some(headers) = message.headers() else {
-        return Content::Bare { payload, identity };
-    };
-    let bytes = payload.len();
-    let read = || {
-        let headers = (0..headers.count())
-            .filter_map(|at| headers.try_get(at))
-            .map(|header| (header.key, header.value));
-        record::read(channel, headers, payload, identity)
-    };
-    // The client library panics over a header's name that is not UTF-8.
-    catch_unwind(AssertUnwindSafe(read)).unwrap_or(Content::Malformed {
-        error: FrameError::Field {
-            field: "headers",
-            reason: "have a name that is not UTF-8",
-        },
-        bytes,
-    })
 }

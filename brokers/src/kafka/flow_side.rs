@@ -11,10 +11,10 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use rdkafka::error::RDKafkaErrorCode;
 
-use super::Inner;
 use super::admin::{Admin, Purpose};
 use super::directory::Listing;
 use super::identity::TopicUuid;
+use super::inner::Inner;
 use super::keyed::KeyedWriter;
 use super::names::{RESERVED, collide};
 use super::read_to_end::ReaderToEnd;

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use super::Inner;
 use super::consumer::Consumer;
 use super::directory::Listing;
 use super::flow_side::Made;
+use super::inner::Inner;
 
 /// How long the server has for an answer.
 const ANSWER: Duration = Duration::from_secs(1);

@@ -10,7 +10,8 @@ use parking_lot::Mutex;
 use tokio::sync::{Notify, oneshot};
 use tokio_util::sync::CancellationToken;
 
-use super::producer::{Gate, Producer};
+use super::gate::Gate;
+use super::producer::Producer;
 use super::topics::Topic;
 
 /// Values that wait at most; those beyond are dropped and counted.

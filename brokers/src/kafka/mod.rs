@@ -16,19 +16,21 @@ mod consumer;
 mod context;
 mod directory;
 mod flow_side;
+mod gate;
 mod identity;
+mod inner;
 mod keeper;
 mod keyed;
 mod names;
 mod producer;
 mod read_to_end;
+mod receive;
 mod record;
 mod settings;
 mod topics;
 
-use std::collections::HashMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
@@ -39,7 +41,6 @@ use blaze_proto::Frame;
 use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rdkafka::message::Message as _;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -47,26 +48,20 @@ use crate::open::OpenError;
 use crate::outbox::{Body, Lane};
 use crate::port::{
     Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome, Publisher,
-    PublisherOptions, Received, Role, SubscribeOptions, Subscription, subscription,
+    PublisherOptions, Role, SubscribeOptions, Subscription,
 };
 use bell::Bell;
 use clock::BrokerClock;
-use consumer::{Consumer, Refused, Source};
 use context::LastError;
-use directory::{Directory, LookupError};
+use directory::Directory;
 use flow_side::{FlowState, KafkaFlowSide};
+use gate::Gate;
+use inner::{Inner, Once};
 use names::Names;
-use producer::{Gate, Keying, Producer, Target};
-use read_to_end::ReaderToEnd;
+use producer::{Keying, Target};
 use settings::{Lot, Settings};
 use topics::Topics;
 
-/// Channels that one client reads at most.
-const MAX_CHANNELS: usize = 10_000;
-/// How long subscribing may take.
-const SUBSCRIBE: Duration = Duration::from_secs(5);
-/// How long reading what is kept for late joiners may take.
-const SUBSCRIBE_KEPT: Duration = Duration::from_secs(15);
 /// How long closing waits for what was taken.
 const DRAIN: Duration = Duration::from_secs(1);
 /// How long closing waits for threads and tasks beyond that.
@@ -77,51 +72,6 @@ const DRAIN_TURN: Duration = Duration::from_millis(2);
 /// A client of a Kafka cluster.
 pub struct KafkaBroker {
     inner: Arc<Inner>,
-}
-
-/// Which of a kind there is one of.
-#[derive(Default)]
-struct Clients {
-    producers: HashMap<Lot, Arc<Producer>>,
-    consumers: HashMap<bool, Arc<Consumer>>,
-}
-
-/// Known after the first answer.
-#[derive(Default)]
-struct Once(Mutex<Option<String>>);
-
-impl Once {
-    fn get_or_init_with(&self, make: impl FnOnce() -> Option<String>) -> Option<String> {
-        let mut known = self.0.lock();
-        if known.is_none() {
-            *known = make();
-        }
-        known.clone()
-    }
-}
-
-/// What threads, tasks and publishers share.
-struct Inner {
-    settings: Settings,
-    names: Names,
-    /// Layer of the flow; empty for a service.
-    layer: String,
-    /// The topic that a service asks for to see whether the server answers.
-    probe: Arc<str>,
-    directory: Directory,
-    topics: Topics,
-    gate: Arc<Gate>,
-    clock: Arc<Mutex<BrokerClock>>,
-    last_error: Arc<LastError>,
-    clients: Mutex<Clients>,
-    flow: Option<Arc<FlowState>>,
-    cluster: Once,
-    status: watch::Sender<BrokerStatus>,
-    was_up: AtomicBool,
-    closed: AtomicBool,
-    bell: Bell,
-    supervisor: Supervisor,
-    stop: CancellationToken,
 }
 
 impl KafkaBroker {
@@ -207,234 +157,6 @@ impl Drop for KafkaBroker {
     fn drop(&mut self) {
         self.inner.begin_close();
         self.inner.end();
-    }
-}
-
-impl Inner {
-    fn is_closed(&self) -> bool {
-        self.closed.load(Ordering::Acquire)
-    }
-
-    fn consumers(&self) -> Vec<Arc<Consumer>> {
-        self.clients.lock().consumers.values().cloned().collect()
-    }
-
-    fn producers(&self) -> Vec<Arc<Producer>> {
-        self.clients.lock().producers.values().cloned().collect()
-    }
-
-    fn producer(&self, lot: Lot) -> Result<Arc<Producer>, BrokerError> {
-        let mut clients = self.clients.lock();
-        if self.is_closed() {
-            return Err(BrokerError::Closed);
-        }
-        if let Some(producer) = clients.producers.get(&lot) {
-            return Ok(Arc::clone(producer));
-        }
-        let producer = Producer::start(
-            lot,
-            &self.settings,
-            &self.gate,
-            &self.clock,
-            &self.last_error,
-            &self.supervisor,
-            &self.stop,
-        )
-        .map_err(BrokerError::Away)?;
-        clients.producers.insert(lot, Arc::clone(&producer));
-        Ok(producer)
-    }
-
-    fn consumer(&self, large: bool) -> Result<Arc<Consumer>, BrokerError> {
-        let mut clients = self.clients.lock();
-        if self.is_closed() {
-            return Err(BrokerError::Closed);
-        }
-        if let Some(consumer) = clients.consumers.get(&large) {
-            return Ok(Arc::clone(consumer));
-        }
-        let consumer = Consumer::start(
-            large,
-            &self.layer,
-            &self.settings,
-            &self.clock,
-            &self.last_error,
-            &self.supervisor,
-            &self.stop,
-        )
-        .map_err(BrokerError::Away)?;
-        clients.consumers.insert(large, Arc::clone(&consumer));
-        Ok(consumer)
-    }
-
-    fn wake_writers(&self) {
-        for producer in self.producers() {
-            producer.wake();
-        }
-        if let Some(flow) = &self.flow {
-            flow.keyed.wake();
-        }
-    }
-
-    /// The server answers, or does not.
-    fn set_server(&self, answers: bool, detail: String) {
-        let was_up = self.was_up.swap(answers, Ordering::AcqRel);
-        if answers && !was_up {
-            tracing::info!(detail, "Kafka answers");
-            self.wake_writers();
-        } else if !answers && was_up {
-            tracing::warn!(detail, "Kafka does not answer");
-        }
-        let taken = self.flow.as_ref().and_then(|flow| flow.stood_back.lock().clone());
-        let (health, detail) = match (answers, taken) {
-            (true, None) => (Health::Up, detail),
-            (true, Some(whom)) => (Health::InUse, format!("scope_in_use: {whom}")),
-            (false, _) => (Health::Down, detail),
-        };
-        self.set_status(health, detail);
-    }
-
-    fn set_status(&self, health: Health, detail: String) {
-        self.status.send_if_modified(|status| {
-            // Down is what was up before.
-            let health = match (status.health, health) {
-                (Health::Connecting, Health::Down) => Health::Connecting,
-                (_, health) => health,
-            };
-            if status.health == Health::Closed || (status.health == health && status.detail == detail) {
-                return false;
-            }
-            let since = if status.health == health {
-                status.since
-            } else {
-                Instant::now()
-            };
-            *status = BrokerStatus { health, detail, since };
-            true
-        });
-    }
-
-    /// Another flow was first, or has gone.
-    fn stand_back(&self, back: bool) {
-        self.gate.set_stood_back(back);
-        if back {
-            for consumer in self.consumers() {
-                consumer.stand_back();
-            }
-            for producer in self.producers() {
-                producer.clear();
-            }
-        }
-        // Only this change shows at once; that the scope is ours again shows with the server's next answer.
-        let status = self.status.borrow().clone();
-        if back && matches!(status.health, Health::Up | Health::InUse) {
-            self.set_server(true, status.detail);
-        }
-        self.bell.ring();
-        self.wake_writers();
-    }
-
-    /// Subscribes, and waits for the server meanwhile.
-    fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError> {
-        let source = Source {
-            channel: channel.clone(),
-            topic: self.names.topic(channel)?,
-            stays_open: names::stays_open(channel),
-        };
-        self.check_subscribe(&source)?;
-        let wait = if options.with_kept { SUBSCRIBE_KEPT } else { SUBSCRIBE };
-        let deadline = Instant::now() + wait;
-        let consumer = self.consumer(options.large)?;
-        if consumer.topics().len() >= MAX_CHANNELS {
-            return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
-        }
-        let info = match self.directory.topic(&source.topic, SUBSCRIBE) {
-            Ok(info) => info,
-            Err(LookupError::Missing(_)) => {
-                let (sender, subscription) = subscription(options);
-                consumer
-                    .add_awaiting(&source, sender)
-                    .map_err(|error| refused(&error))?;
-                self.bell.ring();
-                return Ok(subscription);
-            }
-            Err(error) => return Err(error.into()),
-        };
-        let marks = self.directory.marks(&source.topic, info.partitions, deadline)?;
-        let mut ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
-        let (sender, subscription) = subscription(options);
-        if !options.with_kept {
-            consumer
-                .add(&source, &info, ends, sender, None)
-                .map_err(|error| refused(&error))?;
-            return Ok(subscription);
-        }
-        let mut reader = ReaderToEnd::open(&self.settings, &self.last_error, &source.topic, &marks)?;
-        loop {
-            let starts = reader.read(&ends, deadline, &|| self.is_closed(), |message, payload| {
-                let key = message.key()?;
-                record::is_kept(key).then(|| consumer::receive(channel, message, payload, None, &self.clock))
-            })?;
-            let mut kept = || -> Vec<Received> { reader.take_latest().into_iter().map(|(_, kept)| kept).collect() };
-            match consumer.add(&source, &info, starts, sender.clone(), Some(&mut kept)) {
-                Ok(()) => return Ok(subscription),
-                Err(Refused::Behind(next)) => ends = next,
-                Err(error) => return Err(refused(&error)),
-            }
-        }
-    }
-
-    fn check_subscribe(&self, source: &Source) -> Result<(), BrokerError> {
-        let status = self.status.borrow().clone();
-        match status.health {
-            Health::Closed => Err(BrokerError::Closed),
-            Health::Up => Ok(()),
-            Health::InUse if source.stays_open => Ok(()),
-            Health::InUse | Health::Connecting | Health::Down => Err(BrokerError::Away(status.detail)),
-        }
-    }
-
-    /// Takes nothing more.
-    fn begin_close(&self) {
-        self.closed.store(true, Ordering::Release);
-        for producer in self.producers() {
-            producer.close_outbox();
-        }
-    }
-
-    fn is_drained(&self) -> bool {
-        self.producers().iter().all(|producer| producer.is_drained())
-            && self.flow.as_ref().is_none_or(|flow| flow.keyed.is_drained())
-    }
-
-    /// Ends readers, threads and tasks, without waiting for them.
-    fn end(&self) {
-        self.stop.cancel();
-        self.bell.ring();
-        for consumer in self.consumers() {
-            consumer.close();
-        }
-        for producer in self.producers() {
-            producer.end();
-        }
-        self.set_status(Health::Closed, "closed".to_owned());
-    }
-}
-
-impl From<LookupError> for BrokerError {
-    fn from(error: LookupError) -> Self {
-        match error {
-            LookupError::Closed => Self::Closed,
-            LookupError::Missing(_) | LookupError::Away(_) => Self::Away(error.to_string()),
-        }
-    }
-}
-
-fn refused(error: &Refused) -> BrokerError {
-    match error {
-        Refused::Closed => BrokerError::Closed,
-        Refused::Failed(reason) => BrokerError::Away(reason.clone()),
-        Refused::Behind(_) => BrokerError::Away("the topic moves too fast".to_owned()),
     }
 }
 

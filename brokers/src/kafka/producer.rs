@@ -8,6 +8,9 @@
 //!
 //! Little is with librdkafka because from there nothing can be taken back: it has no deadline of a message's own.
 
+mod delivery;
+mod ready;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -16,21 +19,20 @@ use blaze_domain::DropReason;
 use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rdkafka::ClientContext;
-use rdkafka::config::RDKafkaLogLevel;
-use rdkafka::error::{KafkaError, RDKafkaErrorCode};
-use rdkafka::message::{DeliveryResult, Message as _, OwnedHeaders, Timestamp};
-use rdkafka::producer::{BaseProducer, BaseRecord, NoCustomPartitioner, Producer as _, ProducerContext};
+use rdkafka::error::KafkaError;
+use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
 use tokio::sync::{Notify, oneshot};
 use tokio_util::sync::CancellationToken;
 
 use super::bell::Bell;
 use super::clock::BrokerClock;
-use super::context::{self, LastError};
-use super::record;
+use super::context::LastError;
+use super::gate::Gate;
 use super::settings::{Lot, Settings};
-use super::topics::Topic;
-use crate::outbox::{Body, Fate, Lane, Outbox, OutboxLimits, Receipt, Waiting};
+use crate::outbox::{Lane, Outbox, OutboxLimits, Waiting};
+use delivery::{Batch, Delivery, SharedContext, WriteContext};
+use ready::Ready;
+pub(super) use ready::{Keying, Target};
 
 /// Most bytes that are with librdkafka and not acknowledged; one larger message may be.
 const WINDOW: usize = 1024 * 1024;
@@ -55,200 +57,6 @@ const LIMITS: OutboxLimits = OutboxLimits {
     lane_bytes: 32 * 1024 * 1024,
     total_bytes: 64 * 1024 * 1024,
 };
-
-/// When nothing may be handed over.
-#[derive(Debug, Default)]
-pub(super) struct Gate {
-    up: AtomicBool,
-    stood_back: AtomicBool,
-}
-
-impl Gate {
-    /// The server answers, or does not.
-    pub(super) fn set_up(&self, up: bool) {
-        self.up.store(up, Ordering::Release);
-    }
-
-    /// The scope belongs to another flow, or to us.
-    pub(super) fn set_stood_back(&self, stood_back: bool) {
-        self.stood_back.store(stood_back, Ordering::Release);
-    }
-
-    /// Whether the scope belongs to another flow.
-    pub(super) fn is_stood_back(&self) -> bool {
-        self.stood_back.load(Ordering::Acquire)
-    }
-
-    /// Whether the server answers.
-    pub(super) fn is_open(&self) -> bool {
-        self.up.load(Ordering::Acquire)
-    }
-
-    /// Whether a topic is used now.
-    pub(super) fn lets(&self, stays_open: bool) -> bool {
-        stays_open || !self.is_stood_back()
-    }
-}
-
-/// How a record gets its key.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Keying {
-    /// Its writer; and its place, where the topic keeps the last `depth` of each. Bare payloads have none.
-    Writer {
-        /// What the topic keeps of each writer.
-        depth: u32,
-    },
-    /// The `id` of the answer that it is.
-    AnswerId,
-}
-
-/// Where a lane's messages go.
-#[derive(Debug)]
-pub(super) struct Target {
-    pub(super) topic: Arc<Topic>,
-    pub(super) keying: Keying,
-}
-
-/// What comes back from librdkafka with the acknowledgement.
-pub(super) enum Delivery {
-    /// A message of a publisher.
-    Message {
-        receipt: Receipt,
-        topic: Arc<Topic>,
-        bytes: usize,
-        sent: Instant,
-        /// Ends with the last message of the batch.
-        batch: Arc<Batch>,
-    },
-    /// A value of a key; told whether the server has it.
-    Keyed {
-        done: oneshot::Sender<bool>,
-        sent: Instant,
-        batch: Arc<Batch>,
-    },
-}
-
-/// Messages that were handed over together.
-pub(super) struct Batch(Arc<WriteContext>);
-
-impl Batch {
-    fn begin(context: &Arc<WriteContext>) -> Arc<Self> {
-        context.batches.fetch_add(1, Ordering::AcqRel);
-        context.bell.ring();
-        Arc::new(Self(Arc::clone(context)))
-    }
-}
-
-impl Drop for Batch {
-    fn drop(&mut self) {
-        self.0.batches.fetch_sub(1, Ordering::AcqRel);
-        self.0.room.notify_one();
-    }
-}
-
-/// What the client calls back.
-pub(super) struct WriteContext {
-    /// Bytes that are with librdkafka and not acknowledged.
-    in_flight: AtomicUsize,
-    /// Batches of which something is.
-    batches: AtomicUsize,
-    /// Wakes the poll thread.
-    bell: Bell,
-    room: Notify,
-    fatal: AtomicBool,
-    clock: Arc<Mutex<BrokerClock>>,
-    last_error: Arc<LastError>,
-}
-
-/// One client calls back, but its successor goes on with the same numbers.
-struct SharedContext(Arc<WriteContext>);
-
-impl ClientContext for SharedContext {
-    fn log(&self, level: RDKafkaLogLevel, facility: &str, line: &str) {
-        context::log(level, facility, line);
-    }
-
-    fn error(&self, error: KafkaError, reason: &str) {
-        if error.rdkafka_error_code() == Some(RDKafkaErrorCode::Fatal) {
-            self.0.fatal.store(true, Ordering::Release);
-        }
-        self.0.last_error.note(format!("{error}: {reason}"));
-    }
-}
-
-impl ProducerContext<NoCustomPartitioner> for SharedContext {
-    type DeliveryOpaque = Box<Delivery>;
-
-    fn delivery(&self, result: &DeliveryResult<'_>, delivery: Box<Delivery>) {
-        let now = Instant::now();
-        let appended = match result {
-            Ok(message) => match message.timestamp() {
-                Timestamp::LogAppendTime(at) => Some(at),
-                Timestamp::CreateTime(_) | Timestamp::NotAvailable => None,
-            },
-            Err(_) => None,
-        };
-        let sent = match *delivery {
-            Delivery::Message {
-                receipt,
-                topic,
-                bytes,
-                sent,
-                batch,
-            } => {
-                let fate = match result {
-                    Ok(_) => Fate::Delivered,
-                    Err((error, _)) => self.0.failed(error, &topic),
-                };
-                receipt.settle(fate);
-                self.0.in_flight.fetch_sub(bytes, Ordering::AcqRel);
-                // The feeder may come when the room is counted.
-                drop(batch);
-                sent
-            }
-            Delivery::Keyed {
-                done,
-                sent,
-                batch: _batch,
-            } => {
-                // Nobody waits any more when the broker is closed.
-                let _ = done.send(result.is_ok());
-                sent
-            }
-        };
-        if let Some(appended) = appended {
-            self.0.clock.lock().acknowledged(sent, now, appended);
-        }
-    }
-}
-
-impl WriteContext {
-    fn failed(&self, error: &KafkaError, topic: &Topic) -> Fate {
-        let code = error.rdkafka_error_code();
-        if matches!(
-            code,
-            Some(
-                RDKafkaErrorCode::UnknownTopic
-                    | RDKafkaErrorCode::UnknownPartition
-                    | RDKafkaErrorCode::UnknownTopicOrPartition
-            )
-        ) {
-            topic.vanished();
-        }
-        if matches!(code, Some(RDKafkaErrorCode::Fatal)) {
-            self.fatal.store(true, Ordering::Release);
-        }
-        tracing::debug!(topic = %topic.name, %error, "a message was not taken");
-        Fate::Dropped(reason_of(code))
-    }
-}
-
-fn reason_of(code: Option<RDKafkaErrorCode>) -> DropReason {
-    match code {
-        Some(RDKafkaErrorCode::MessageSizeTooLarge | RDKafkaErrorCode::MessageBatchTooLarge) => DropReason::TooLarge,
-        _ => DropReason::BrokerError,
-    }
-}
 
 type Client = BaseProducer<SharedContext>;
 
@@ -465,99 +273,5 @@ impl Producer {
         }
         let client = self.client.lock().take();
         drop(client);
-    }
-}
-
-/// A message as the client takes it.
-struct Ready {
-    topic: Arc<Topic>,
-    bytes: usize,
-    payload: Bytes,
-    key: Option<String>,
-    partition: Option<i32>,
-    headers: Option<OwnedHeaders>,
-    delivery: Box<Delivery>,
-}
-
-impl Ready {
-    fn new(waiting: Waiting<Target>, batch: &Arc<Batch>, scratch: &mut String) -> Self {
-        let (bytes, target, sent) = (waiting.size(), Arc::clone(&waiting.to), Instant::now());
-        let (payload, key, partition, headers);
-        match &waiting.body {
-            Body::Frame(frame) => {
-                let frame = Waiting::<Target>::aged(frame, waiting.since, sent);
-                let depth = match target.keying {
-                    Keying::Writer { depth } => depth,
-                    Keying::AnswerId => 0,
-                };
-                partition =
-                    (depth > 0).then(|| record::partition_of(frame.writer(), target.topic.partitions().unwrap_or(1)));
-                key = Some(record::key(frame.writer(), frame.sequence(), depth));
-                headers = Some(record::headers(&frame, scratch));
-                payload = frame.payload().clone();
-            }
-            Body::Bare(bytes) => {
-                partition = None;
-                key = match target.keying {
-                    Keying::Writer { .. } => None,
-                    Keying::AnswerId => answer_id(bytes),
-                };
-                headers = None;
-                payload = bytes.clone();
-            }
-        }
-        let topic = Arc::clone(&target.topic);
-        let delivery = Box::new(Delivery::Message {
-            receipt: waiting.into_receipt(),
-            topic: Arc::clone(&topic),
-            bytes,
-            sent,
-            batch: Arc::clone(batch),
-        });
-        Self {
-            topic,
-            bytes,
-            payload,
-            key,
-            partition,
-            headers,
-            delivery,
-        }
-    }
-}
-
-/// The record key of an answer: clients look for theirs by it.
-fn answer_id(payload: &[u8]) -> Option<String> {
-    let value: serde_json::Value = serde_json::from_slice(payload).ok()?;
-    let answers = value.as_array().map_or(std::slice::from_ref(&value), Vec::as_slice);
-    answers
-        .iter()
-        .find_map(|answer| answer.get("id")?.as_str())
-        .map(str::to_owned)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn answers_have_their_id_as_the_key() {
-        for (payload, id) in [
-            (r#"{"id":"7","ok":true}"#, Some("7")),
-            (r#"[{"ok":true},{"id":"8"},{"id":"9"}]"#, Some("8")),
-            (r#"{"id":7}"#, None),
-            ("[]", None),
-            ("no JSON", None),
-        ] {
-            assert_eq!(answer_id(payload.as_bytes()).as_deref(), id, "{payload}");
-        }
-    }
-
-    #[test]
-    fn a_gate_lets_only_the_meeting_place_through_while_the_scope_is_anothers() {
-        let gate = Gate::default();
-        assert!(gate.lets(false) && !gate.is_open());
-        gate.set_stood_back(true);
-        assert!(!gate.lets(false) && gate.lets(true));
     }
 }

@@ -22,15 +22,33 @@ use blaze_domain::{Origin, WriterId};
 use blaze_proto::{Frame, Header};
 use blaze_tests::servers::{KafkaOptions, KafkaServer, unique_name};
 use bytes::Bytes;
-use tokio::sync::watch;
+use tokio::sync::{Mutex, MutexGuard, watch};
 
 /// Long, because it is only spent where something is broken.
 pub(crate) const DEADLINE: Duration = Duration::from_secs(40);
 /// How long silence must last to count as silence.
 pub(crate) const SILENCE: Duration = Duration::from_millis(500);
 
-pub(crate) fn start_server() -> KafkaServer {
-    KafkaServer::start(KafkaOptions::default()).unwrap()
+/// A server of a test's own. There is one at a time: each takes most of a small machine.
+pub(crate) struct Server {
+    server: KafkaServer,
+    _turn: MutexGuard<'static, ()>,
+}
+
+impl std::ops::Deref for Server {
+    type Target = KafkaServer;
+    fn deref(&self) -> &KafkaServer {
+        &self.server
+    }
+}
+
+pub(crate) async fn start_server() -> Server {
+    static TURN: Mutex<()> = Mutex::const_new(());
+    let turn = TURN.lock().await;
+    Server {
+        server: KafkaServer::start(KafkaOptions::default()).unwrap(),
+        _turn: turn,
+    }
 }
 
 pub(crate) fn section(server: &KafkaServer, prefix: &str) -> Section {

@@ -41,7 +41,7 @@ fn wrong_options_exit_with_2_and_say_which() {
         (&["--listen", "192.0.2.1"], "--listen 192.0.2.1"),
         (&["--only", "fog-1", "--listen", "192.0.2.1"], "--listen 192.0.2.1"),
         (&["--peer", "x"], "--peer"),
-        (&["--brokers", "real"], "--brokers"),
+        (&["--brokers", "redis"], "--brokers"),
         (&["-o", "yaml"], "YAML"),
     ] {
         let (code, told) = demo(arguments);

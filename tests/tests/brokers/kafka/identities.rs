@@ -19,7 +19,7 @@ fn bare_writer(layer: &str, uuid: &str, partition: i32) -> WriterId {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn bare_records_have_the_identity_of_their_place() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let service = open(&server, &Role::Service);
     health(&service, blaze_brokers::Health::Up).await;
@@ -57,7 +57,7 @@ async fn bare_records_have_the_identity_of_their_place() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_topic_made_anew_is_read_from_its_beginning() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let name = unique_name("anew");
     make_topic(&server, &name, 1, &[]).await;
@@ -89,7 +89,7 @@ async fn a_topic_made_anew_is_read_from_its_beginning() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn broken_headers_are_reported_and_what_follows_arrives() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let channel = flow.channel("hostile", 0).await;
     let mut reader = reader(&flow.broker, &channel).await;
@@ -126,7 +126,7 @@ async fn broken_headers_are_reported_and_what_follows_arrives() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_writer_stays_in_order_on_several_partitions() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let name = unique_name("spread");
     make_topic(&server, &name, 4, &[("cleanup.policy", "compact")]).await;
@@ -149,7 +149,7 @@ async fn a_writer_stays_in_order_on_several_partitions() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_is_larger_than_the_topic_allows_is_counted_as_that() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let name = unique_name("narrow");
     make_topic(&server, &name, 1, &[("max.message.bytes", "2000")]).await;
@@ -166,7 +166,7 @@ async fn what_is_larger_than_the_topic_allows_is_counted_as_that() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn ages_count_what_a_message_lay_on_the_server() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let channel = flow.channel("age", 1).await;
     let publisher = publisher(&flow.broker, &channel, 1);

@@ -11,7 +11,7 @@ const SHOWS: Duration = Duration::from_secs(2);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn nothing_reliable_is_lost_or_repeated_by_a_killed_server() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let service = open(&server, &Role::Service);
     health(&service, Health::Up).await;
@@ -49,7 +49,7 @@ async fn nothing_reliable_is_lost_or_repeated_by_a_killed_server() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_frozen_server_shows_and_nothing_reliable_is_lost() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let channel = flow.channel("frozen", 0).await;
     let mut reader = reader(&flow.broker, &channel).await;
@@ -81,7 +81,7 @@ async fn a_frozen_server_shows_and_nothing_reliable_is_lost() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_is_over_its_time_while_the_server_is_away_is_dropped() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let channel = flow.channel("lifespan", 0).await;
     let mut reader = reader(&flow.broker, &channel).await;
@@ -102,7 +102,7 @@ async fn what_is_over_its_time_while_the_server_is_away_is_dropped() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_client_may_come_before_its_server_and_its_topic() {
-    let server = start_server();
+    let server = start_server().await;
     server.kill().unwrap();
     let service = open(&server, &Role::Service);
     let channel = blaze_tests::servers::unique_name("early").parse().unwrap();
@@ -125,7 +125,7 @@ async fn a_client_may_come_before_its_server_and_its_topic() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn closing_does_not_wait_for_a_frozen_server() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let channel = flow.channel("closing", 0).await;
     let mut reader = reader(&flow.broker, &channel).await;

@@ -6,23 +6,26 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use blaze_brokers::conformance::{Capabilities, Fixture, run_all};
 use blaze_brokers::{Broker, Role};
-use blaze_tests::servers::KafkaServer;
 
-use super::{Flow, Prepared, open, start_server};
+use super::{Flow, Prepared, Server, eventually, open, start_server};
 
 struct Kafka {
-    server: KafkaServer,
+    server: Server,
     flow: Flow,
+    /// They stay.
+    threads_of_flow: Vec<String>,
 }
 
-/// Threads of the adapter and of its client library, beside those of the flow's client, which stays.
+/// Threads of the adapter, and the main one of each client of the client library.
 fn threads() -> Vec<String> {
     let tasks = std::fs::read_dir("/proc/self/task").unwrap();
     let names = tasks.filter_map(|task| std::fs::read_to_string(task.ok()?.path().join("comm")).ok());
-    names
+    let mut names: Vec<String> = names
         .map(|name| name.trim().to_owned())
-        .filter(|name| name.starts_with("rdk:") || name.starts_with("kafka-") || name.starts_with("admin client"))
-        .collect()
+        .filter(|name| name == "rdk:main" || name.starts_with("kafka-"))
+        .collect();
+    names.sort_unstable();
+    names
 }
 
 #[async_trait]
@@ -52,29 +55,28 @@ impl Fixture for Kafka {
     }
 
     async fn leftovers(&self) -> Vec<String> {
-        // Threads end a moment after their tasks. The flow's client has: keeper, admin, sender; and librdkafka's own.
+        // Threads end a moment after their tasks.
         let until = Instant::now() + Duration::from_secs(5);
-        loop {
-            let services: Vec<String> = threads()
-                .into_iter()
-                .filter(|name| name.starts_with("kafka-read") || name == "kafka-send")
-                .collect();
-            let keepers = threads().iter().filter(|name| *name == "kafka-keeper").count();
-            if services.is_empty() && keepers <= 1 {
-                return Vec::new();
-            }
+        while threads() != self.threads_of_flow {
             if Instant::now() > until {
                 return threads();
             }
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
+        Vec::new()
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 4)]
 async fn kafka_follows_the_rules() {
-    let server = start_server();
+    let server = start_server().await;
+    eventually("the clients of other tests are gone", async || threads().is_empty()).await;
     let flow = Flow::open(&server).await;
-    let failures = run_all(&Kafka { server, flow }).await;
+    let fixture = Kafka {
+        server,
+        flow,
+        threads_of_flow: threads(),
+    };
+    let failures = run_all(&fixture).await;
     assert!(failures.is_empty(), "{failures:#?}");
 }

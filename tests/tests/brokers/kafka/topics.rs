@@ -33,7 +33,7 @@ fn map(pairs: &[(&str, &str)]) -> BTreeMap<String, String> {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn leases_survive_the_flow_the_server_and_their_topic() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     assert_eq!(leases(flow.side.as_ref()).await, map(&[]));
     for (key, value) in [("a", "1"), ("b", "2"), ("a", "3"), ("c", "4")] {
@@ -69,7 +69,7 @@ async fn leases_survive_the_flow_the_server_and_their_topic() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn prepared_topics_are_made_again_until_they_are_released() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let channel = flow.channel("again", 0).await;
     let mut reader = reader(&flow.broker, &channel).await;
@@ -98,7 +98,7 @@ async fn prepared_topics_are_made_again_until_they_are_released() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn names_that_collide_or_are_too_long_are_refused() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     let stem = unique_name("imu").replace('-', "");
     let one: ChannelName = format!("{stem}/data").parse().unwrap();
@@ -116,7 +116,7 @@ async fn names_that_collide_or_are_too_long_are_refused() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_forgotten_writer_leaves_nothing_for_late_joiners() {
-    let server = start_server();
+    let server = start_server().await;
     let flow = Flow::open(&server).await;
     // It was made for something else before.
     let name = unique_name("kept");
@@ -156,7 +156,7 @@ async fn a_forgotten_writer_leaves_nothing_for_late_joiners() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_flow_that_stands_back_reads_and_writes_nothing_but_where_flows_meet() {
-    let server = start_server();
+    let server = start_server().await;
     let (flow, other) = (Flow::open(&server).await, Flow::open(&server).await);
     let channel = flow.channel("mine", 0).await;
     let peers: ChannelName = "blaze/flow/peers".parse().unwrap();

@@ -1,0 +1,126 @@
+//! One topic that is read: where it stands, and who reads it.
+
+use blaze_domain::WriterId;
+use rdkafka::consumer::Consumer as _;
+use rdkafka::error::KafkaError;
+use rdkafka::{Offset, TopicPartitionList};
+
+use super::{Client, Source};
+use crate::kafka::directory::TopicInfo;
+use crate::kafka::identity::TopicUuid;
+use crate::port::{Received, SubscriptionSender};
+
+pub(super) struct Partition {
+    /// Offset of the next record.
+    pub(super) next: i64,
+    /// Writer of its bare records, where the topic has an identity.
+    pub(super) bare_writer: Option<WriterId>,
+}
+
+pub(super) struct Reader {
+    pub(super) sender: SubscriptionSender,
+    /// Where it begins, per partition; partitions that came later from their beginning.
+    pub(super) starts: Vec<i64>,
+}
+
+pub(super) struct TopicState {
+    pub(super) source: Source,
+    pub(super) uuid: Option<TopicUuid>,
+    pub(super) partitions: Vec<Partition>,
+    pub(super) readers: Vec<Reader>,
+    /// Whether the client reads it now.
+    pub(super) assigned: bool,
+    /// It was not there when its readers came: whatever it will hold came after them, so it is read from its beginning.
+    pub(super) awaited: bool,
+}
+
+impl TopicState {
+    pub(super) fn take_in(
+        &mut self,
+        sender: SubscriptionSender,
+        starts: Vec<i64>,
+        kept: Option<&mut dyn FnMut() -> Vec<Received>>,
+    ) {
+        for received in kept.into_iter().flat_map(|kept| kept()) {
+            sender.send(received);
+        }
+        self.readers.push(Reader { sender, starts });
+    }
+
+    pub(super) fn identify(&mut self, uuid: Option<TopicUuid>, layer: &str) {
+        for (number, partition) in self.partitions.iter_mut().enumerate() {
+            partition.bare_writer = uuid.as_ref().map(|uuid| uuid.bare_writer(layer, number));
+        }
+        self.uuid = uuid;
+    }
+
+    /// Another topic has this name now: nothing of it was seen.
+    pub(super) fn made_anew(&mut self, uuid: TopicUuid, layer: &str) {
+        for partition in &mut self.partitions {
+            partition.next = 0;
+        }
+        for reader in &mut self.readers {
+            reader.starts.clear();
+        }
+        self.identify(Some(uuid), layer);
+    }
+
+    /// What was waited for is there: it is read from its beginning.
+    pub(super) fn came(&mut self, info: &TopicInfo, layer: &str, client: &Client) {
+        self.identify(info.uuid.clone(), layer);
+        self.grow(info.partitions, layer);
+        self.awaited = false;
+        if let Err(error) = self.assign(client) {
+            tracing::warn!(topic = %self.source.topic, %error, "the topic cannot be read yet");
+            self.awaited = true;
+        }
+    }
+
+    pub(super) fn grow(&mut self, partitions: usize, layer: &str) {
+        for number in self.partitions.len()..partitions {
+            self.partitions.push(Partition {
+                next: 0,
+                bare_writer: self.uuid.as_ref().map(|uuid| uuid.bare_writer(layer, number)),
+            });
+        }
+    }
+
+    fn list(&self) -> Result<TopicPartitionList, KafkaError> {
+        let mut list = TopicPartitionList::new();
+        for (number, partition) in (0..).zip(&self.partitions) {
+            list.add_partition_offset(&self.source.topic, number, Offset::Offset(partition.next))?;
+        }
+        Ok(list)
+    }
+
+    pub(super) fn assign(&mut self, client: &Client) -> Result<(), KafkaError> {
+        client.incremental_assign(&self.list()?)?;
+        self.assigned = true;
+        Ok(())
+    }
+
+    pub(super) fn unassign(&mut self, client: &Client) {
+        if !std::mem::take(&mut self.assigned) {
+            return;
+        }
+        // Not the list of now: the partitions may have become more since.
+        let assigned = client.assignment().map(|assigned| {
+            let mut list = TopicPartitionList::new();
+            for element in assigned.elements_for_topic(&self.source.topic) {
+                list.add_partition(&self.source.topic, element.partition());
+            }
+            list
+        });
+        if let Err(error) = assigned.and_then(|list| client.incremental_unassign(&list)) {
+            tracing::debug!(topic = %self.source.topic, %error, "could not be left");
+        }
+    }
+
+    /// Reads on at the positions of now.
+    pub(super) fn reassign(&mut self, client: &Client) {
+        self.unassign(client);
+        if let Err(error) = self.assign(client) {
+            tracing::warn!(topic = %self.source.topic, %error, "the topic cannot be read");
+        }
+    }
+}

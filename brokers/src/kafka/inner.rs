@@ -1,0 +1,313 @@
+//! What threads, tasks and publishers of one broker share.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use blaze_domain::names::ChannelName;
+use blaze_runtime::supervisor::Supervisor;
+use parking_lot::Mutex;
+use rdkafka::message::Message as _;
+use tokio::sync::watch;
+use tokio_util::sync::CancellationToken;
+
+use super::bell::Bell;
+use super::clock::BrokerClock;
+use super::consumer::{Consumer, Refused, Source};
+use super::context::LastError;
+use super::directory::{Directory, LookupError};
+use super::flow_side::FlowState;
+use super::gate::Gate;
+use super::names::{self, Names};
+use super::producer::Producer;
+use super::read_to_end::ReaderToEnd;
+use super::receive::receive;
+use super::record;
+use super::settings::{Lot, Settings};
+use super::topics::Topics;
+use crate::port::{BrokerError, BrokerStatus, Health, Received, SubscribeOptions, Subscription, subscription};
+
+/// Channels that one client reads at most.
+const MAX_CHANNELS: usize = 10_000;
+/// How long subscribing may take.
+const SUBSCRIBE: Duration = Duration::from_secs(5);
+/// How long reading what is kept for late joiners may take.
+const SUBSCRIBE_KEPT: Duration = Duration::from_secs(15);
+
+/// Which of a kind there is one of.
+#[derive(Default)]
+pub(super) struct Clients {
+    pub(super) producers: HashMap<Lot, Arc<Producer>>,
+    pub(super) consumers: HashMap<bool, Arc<Consumer>>,
+}
+
+/// Known after the first answer.
+#[derive(Default)]
+pub(super) struct Once(Mutex<Option<String>>);
+
+impl Once {
+    pub(super) fn get_or_init_with(&self, make: impl FnOnce() -> Option<String>) -> Option<String> {
+        let mut known = self.0.lock();
+        if known.is_none() {
+            *known = make();
+        }
+        known.clone()
+    }
+}
+
+/// What threads, tasks and publishers share.
+pub(super) struct Inner {
+    pub(super) settings: Settings,
+    pub(super) names: Names,
+    /// Layer of the flow; empty for a service.
+    pub(super) layer: String,
+    /// The topic that a service asks for to see whether the server answers.
+    pub(super) probe: Arc<str>,
+    pub(super) directory: Directory,
+    pub(super) topics: Topics,
+    pub(super) gate: Arc<Gate>,
+    pub(super) clock: Arc<Mutex<BrokerClock>>,
+    pub(super) last_error: Arc<LastError>,
+    pub(super) clients: Mutex<Clients>,
+    pub(super) flow: Option<Arc<FlowState>>,
+    pub(super) cluster: Once,
+    pub(super) status: watch::Sender<BrokerStatus>,
+    pub(super) was_up: AtomicBool,
+    pub(super) closed: AtomicBool,
+    pub(super) bell: Bell,
+    pub(super) supervisor: Supervisor,
+    pub(super) stop: CancellationToken,
+}
+
+impl Inner {
+    pub(super) fn is_closed(&self) -> bool {
+        self.closed.load(Ordering::Acquire)
+    }
+
+    pub(super) fn consumers(&self) -> Vec<Arc<Consumer>> {
+        self.clients.lock().consumers.values().cloned().collect()
+    }
+
+    pub(super) fn producers(&self) -> Vec<Arc<Producer>> {
+        self.clients.lock().producers.values().cloned().collect()
+    }
+
+    pub(super) fn producer(&self, lot: Lot) -> Result<Arc<Producer>, BrokerError> {
+        let mut clients = self.clients.lock();
+        if self.is_closed() {
+            return Err(BrokerError::Closed);
+        }
+        if let Some(producer) = clients.producers.get(&lot) {
+            return Ok(Arc::clone(producer));
+        }
+        let producer = Producer::start(
+            lot,
+            &self.settings,
+            &self.gate,
+            &self.clock,
+            &self.last_error,
+            &self.supervisor,
+            &self.stop,
+        )
+        .map_err(BrokerError::Away)?;
+        clients.producers.insert(lot, Arc::clone(&producer));
+        Ok(producer)
+    }
+
+    pub(super) fn consumer(&self, large: bool) -> Result<Arc<Consumer>, BrokerError> {
+        let mut clients = self.clients.lock();
+        if self.is_closed() {
+            return Err(BrokerError::Closed);
+        }
+        if let Some(consumer) = clients.consumers.get(&large) {
+            return Ok(Arc::clone(consumer));
+        }
+        let consumer = Consumer::start(
+            large,
+            &self.layer,
+            &self.settings,
+            &self.clock,
+            &self.last_error,
+            &self.supervisor,
+            &self.stop,
+        )
+        .map_err(BrokerError::Away)?;
+        clients.consumers.insert(large, Arc::clone(&consumer));
+        Ok(consumer)
+    }
+
+    pub(super) fn wake_writers(&self) {
+        for producer in self.producers() {
+            producer.wake();
+        }
+        if let Some(flow) = &self.flow {
+            flow.keyed.wake();
+        }
+    }
+
+    /// The server answers, or does not.
+    pub(super) fn set_server(&self, answers: bool, detail: String) {
+        let was_up = self.was_up.swap(answers, Ordering::AcqRel);
+        if answers && !was_up {
+            tracing::info!(detail, "Kafka answers");
+            self.wake_writers();
+        } else if !answers && was_up {
+            tracing::warn!(detail, "Kafka does not answer");
+        }
+        let taken = self.flow.as_ref().and_then(|flow| flow.stood_back.lock().clone());
+        let (health, detail) = match (answers, taken) {
+            (true, None) => (Health::Up, detail),
+            (true, Some(whom)) => (Health::InUse, format!("scope_in_use: {whom}")),
+            (false, _) => (Health::Down, detail),
+        };
+        self.set_status(health, detail);
+    }
+
+    fn set_status(&self, health: Health, detail: String) {
+        self.status.send_if_modified(|status| {
+            // Down is what was up before.
+            let health = match (status.health, health) {
+                (Health::Connecting, Health::Down) => Health::Connecting,
+                (_, health) => health,
+            };
+            if status.health == Health::Closed || (status.health == health && status.detail == detail) {
+                return false;
+            }
+            let since = if status.health == health {
+                status.since
+            } else {
+                Instant::now()
+            };
+            *status = BrokerStatus { health, detail, since };
+            true
+        });
+    }
+
+    /// Another flow was first, or has gone.
+    pub(super) fn stand_back(&self, back: bool) {
+        self.gate.set_stood_back(back);
+        if back {
+            for consumer in self.consumers() {
+                consumer.stand_back();
+            }
+            for producer in self.producers() {
+                producer.clear();
+            }
+        }
+        // Only this change shows at once; that the scope is ours again shows with the server's next answer.
+        let status = self.status.borrow().clone();
+        if back && matches!(status.health, Health::Up | Health::InUse) {
+            self.set_server(true, status.detail);
+        }
+        self.bell.ring();
+        self.wake_writers();
+    }
+
+    /// Subscribes, and waits for the server meanwhile.
+    pub(super) fn subscribe(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+    ) -> Result<Subscription, BrokerError> {
+        let source = Source {
+            channel: channel.clone(),
+            topic: self.names.topic(channel)?,
+            stays_open: names::stays_open(channel),
+        };
+        self.check_subscribe(&source)?;
+        let wait = if options.with_kept { SUBSCRIBE_KEPT } else { SUBSCRIBE };
+        let deadline = Instant::now() + wait;
+        let consumer = self.consumer(options.large)?;
+        if consumer.topics().len() >= MAX_CHANNELS {
+            return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
+        }
+        let info = match self.directory.topic(&source.topic, SUBSCRIBE) {
+            Ok(info) => info,
+            Err(LookupError::Missing(_)) => {
+                let (sender, subscription) = subscription(options);
+                consumer
+                    .add_awaiting(&source, sender)
+                    .map_err(|error| refused(&error))?;
+                self.bell.ring();
+                return Ok(subscription);
+            }
+            Err(error) => return Err(error.into()),
+        };
+        let marks = self.directory.marks(&source.topic, info.partitions, deadline)?;
+        let mut ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
+        let (sender, subscription) = subscription(options);
+        if !options.with_kept {
+            consumer
+                .add(&source, &info, ends, sender, None)
+                .map_err(|error| refused(&error))?;
+            return Ok(subscription);
+        }
+        let mut reader = ReaderToEnd::open(&self.settings, &self.last_error, &source.topic, &marks)?;
+        loop {
+            let starts = reader.read(&ends, deadline, &|| self.is_closed(), |message, payload| {
+                let key = message.key()?;
+                record::is_kept(key).then(|| receive(channel, message, payload, None, &self.clock))
+            })?;
+            let mut kept = || -> Vec<Received> { reader.take_latest().into_iter().map(|(_, kept)| kept).collect() };
+            match consumer.add(&source, &info, starts, sender.clone(), Some(&mut kept)) {
+                Ok(()) => return Ok(subscription),
+                Err(Refused::Behind(next)) => ends = next,
+                Err(error) => return Err(refused(&error)),
+            }
+        }
+    }
+
+    fn check_subscribe(&self, source: &Source) -> Result<(), BrokerError> {
+        let status = self.status.borrow().clone();
+        match status.health {
+            Health::Closed => Err(BrokerError::Closed),
+            Health::Up => Ok(()),
+            Health::InUse if source.stays_open => Ok(()),
+            Health::InUse | Health::Connecting | Health::Down => Err(BrokerError::Away(status.detail)),
+        }
+    }
+
+    /// Takes nothing more.
+    pub(super) fn begin_close(&self) {
+        self.closed.store(true, Ordering::Release);
+        for producer in self.producers() {
+            producer.close_outbox();
+        }
+    }
+
+    pub(super) fn is_drained(&self) -> bool {
+        self.producers().iter().all(|producer| producer.is_drained())
+            && self.flow.as_ref().is_none_or(|flow| flow.keyed.is_drained())
+    }
+
+    /// Ends readers, threads and tasks, without waiting for them.
+    pub(super) fn end(&self) {
+        self.stop.cancel();
+        self.bell.ring();
+        for consumer in self.consumers() {
+            consumer.close();
+        }
+        for producer in self.producers() {
+            producer.end();
+        }
+        self.set_status(Health::Closed, "closed".to_owned());
+    }
+}
+
+impl From<LookupError> for BrokerError {
+    fn from(error: LookupError) -> Self {
+        match error {
+            LookupError::Closed => Self::Closed,
+            LookupError::Missing(_) | LookupError::Away(_) => Self::Away(error.to_string()),
+        }
+    }
+}
+
+fn refused(error: &Refused) -> BrokerError {
+    match error {
+        Refused::Closed => BrokerError::Closed,
+        Refused::Failed(reason) => BrokerError::Away(reason.clone()),
+        Refused::Behind(_) => BrokerError::Away("the topic moves too fast".to_owned()),
+    }
+}
