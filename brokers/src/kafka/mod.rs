@@ -5,9 +5,9 @@
 //!                  Directory: metadata, offsets ◄── keeper thread: lives it? topics, positions ──► status
 //! ```
 //!
-//! A channel is a topic; a message is a record whose headers are the message's header, as text ([`record`]). There is no
+//! A channel is a topic; a message is a record whose headers are the message's header, as text (module `record`). There is no
 //! consumer group: each client reads all partitions at positions of its own. Topics are made by the flow of the layer alone
-//! ([`flow_side`]); what a service publishes before that waits.
+//! (module `flow_side`); what a service publishes before that waits.
 
 mod admin;
 mod bell;
