@@ -47,6 +47,12 @@ const CROWD: usize = 64 * 1024;
 const POLL: Duration = Duration::from_millis(200);
 /// How often the poll thread looks for errors while nothing is.
 const IDLE: Duration = Duration::from_millis(500);
+/// How long a new client waits for its first answer.
+const WARM_UP: Duration = Duration::from_secs(1);
+/// How many answers it waits for.
+const WARM_UPS: usize = 6;
+/// How long it runs in between.
+const WARM_UP_PAUSE: Duration = Duration::from_millis(15);
 /// How often messages that wait are looked at for their deadlines.
 const EXPIRY: Duration = Duration::from_millis(100);
 /// How long to wait before a client is made again that could not be made.
@@ -108,6 +114,24 @@ impl Producer {
         let (feeder, stop) = (Arc::clone(&producer), stop.clone());
         supervisor.spawn(lot.as_str(), TaskPolicy::MayEnd, async move { feeder.feed(stop).await });
         Ok(producer)
+    }
+
+    /// Lets the client connect and get its number from the server. By itself it tries so twice a second, and each try asks
+    /// a connection at random, whether that is up or not; but also with each answer that it gets.
+    fn warm_up(&self, stop: &CancellationToken) {
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
+        for _ in 0..WARM_UPS {
+            if stop.is_cancelled() {
+                return;
+            }
+            if let Err(error) = client.client().fetch_metadata(None, WARM_UP) {
+                tracing::debug!(producer = self.lot.as_str(), %error, "not connected beforehand");
+                return;
+            }
+            client.poll(WARM_UP_PAUSE);
+        }
     }
 
     fn make_client(&self) -> Result<Arc<Client>, KafkaError> {
@@ -242,6 +266,7 @@ impl Producer {
 
     /// Runs the callbacks until the end, and makes the client anew after a fatal error.
     fn poll(&self, stop: &CancellationToken) {
+        self.warm_up(stop);
         while !stop.is_cancelled() {
             let client = self.client.lock().clone();
             if let Some(client) = &client {

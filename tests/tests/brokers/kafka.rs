@@ -1,5 +1,7 @@
 //! The Kafka adapter against a real broker.
 
+#![allow(clippy::panic, reason = "helpers of tests")]
+
 mod identities;
 mod outages;
 mod plain;
