@@ -104,9 +104,12 @@ async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
     let reloads = watch(&supervisor, sources, schema(), loaded, WatchSettings::default());
     supervisor.spawn("reload", TaskPolicy::Essential, follow(Arc::clone(&flow), reloads, log));
     let announced = Arc::clone(&flow);
+    let stopping = supervisor.stopping_token();
     supervisor.spawn("ready line", TaskPolicy::MayEnd, async move {
-        announced.ready().await;
-        ready_line(&[("admin", announced.admin())])
+        tokio::select! {
+            () = announced.ready() => ready_line(&[("admin", announced.admin())]),
+            () = stopping.cancelled() => Ok(()),
+        }
     });
     let readiness: Readiness = flow.readiness().clone();
     let steps = ShutdownSteps::new(SHUTDOWN)

@@ -57,6 +57,12 @@ fn round(inner: &Inner, turn: usize) -> bool {
         }
     }
     note_topics(inner, &listing);
+    if !inner.was_up.load(Ordering::Acquire) {
+        // A partition that had no leader for a moment may have been given up by the client: all are asked for again.
+        for consumer in inner.consumers() {
+            consumer.look_again();
+        }
+    }
     found(inner, listing.brokers);
     for consumer in inner.consumers() {
         keep_reading(inner, &consumer, &listing, turn);

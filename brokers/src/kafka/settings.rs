@@ -213,8 +213,9 @@ impl Settings {
         self.with(
             &[
                 ("linger.ms", "0"),
-                // All that is handed over at once fits one request: of a second one it would wait busily for the first.
-                ("batch.size", "4194304"),
+                // The server's limit counts the whole batch, and a topic allows 1 MiB by default: messages that each fit must
+                // not be refused for their company.
+                ("batch.size", "500000"),
                 ("queue.buffering.max.kbytes", "65536"),
             ],
             &[

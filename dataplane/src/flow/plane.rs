@@ -72,6 +72,13 @@ impl PlaneState {
         }
     }
 
+    /// Delivers what came over the link before the bridges of a topic stood.
+    pub fn deliver_early(&mut self, now: Instant, topic: TopicId) {
+        if let Some(engine) = &mut self.engine {
+            self.core.deliver_early(now, topic, engine);
+        }
+    }
+
     /// Carries out what the link has decided; what concerns the control core goes to `news`.
     pub fn pump(&mut self, now: Instant, mut news: impl FnMut(LinkEvent)) {
         let Some(engine) = &mut self.engine else { return };

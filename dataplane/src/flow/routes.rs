@@ -120,6 +120,7 @@ impl Routes {
                     .position(|(from, to, _)| (*from, *to) == (bridge.from, &bridge.to));
                 made.map_or_else(|| Err(String::new()), |at| writers.swap_remove(at).2)
             });
+            state.deliver_early(now, id);
             let path = state.core.path(id);
             Some((id, [Scope::Node, Scope::Layer].map(|scope| (scope, path.reads(scope)))))
         });

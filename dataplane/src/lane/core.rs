@@ -18,6 +18,7 @@ use blaze_proto::Frame;
 use lru::LruCache;
 
 use super::admit::Admitted;
+use super::early::Early;
 use super::measure::micros;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use super::places::topic_id;
@@ -87,6 +88,8 @@ pub struct DataCore {
     pub(super) free_lanes: Vec<LaneId>,
     /// A bridge empties its queue.
     pub(super) draining: bool,
+    /// Came over the link before their bridge stood.
+    pub(super) early: Early,
     /// What could not be attributed to a topic.
     pub unattributed: Drops,
     /// Windows that gave way to newer writers.
@@ -107,6 +110,7 @@ impl DataCore {
             vacant: Vec::new(),
             free_lanes: Vec::new(),
             draining: false,
+            early: Early::default(),
             unattributed: Drops::default(),
             evicted_writers: 0,
         }
@@ -219,15 +223,18 @@ impl DataCore {
 
     /// Takes a message that came over the link; its age is right at `now`.
     pub fn deliver(&mut self, now: Instant, frame: Frame, link: &mut dyn LaneLink) {
-        let Some(topic) = self.find(frame.topic()) else {
-            self.unattributed.add(DropReason::NoDestination, 1);
+        let delivering = self
+            .find(frame.topic())
+            .filter(|topic| self.topics[topic.0 as usize].delivers());
+        let Some(topic) = delivering else {
+            // The sender knew of the pair before this flow did: the bridge may come in a moment.
+            let gone = self.early.hold(now, frame);
+            self.without_destination(gone);
             return;
         };
         let own_layer = frame.origin_layer() == self.config.me.layer.as_str();
         let refused = if own_layer && frame.origin_node() == self.config.me.node.as_str() {
             Some(DropReason::Echo)
-        } else if !self.topics[topic.0 as usize].delivers() {
-            Some(DropReason::NoDestination)
         } else if !self.is_new(topic, &frame) {
             Some(DropReason::Duplicate)
         } else {
@@ -240,6 +247,28 @@ impl DataCore {
         let age_us = frame.age_us();
         let message = Admitted::new(frame, false, age_us, 0);
         self.fan_out(now, topic, Scope::Inter, &message, link);
+    }
+
+    /// Delivers what came before the bridges of a topic stood. To be called after [`DataCore::apply`].
+    pub fn deliver_early(&mut self, now: Instant, topic: TopicId, link: &mut dyn LaneLink) {
+        let path = &self.topics[topic.0 as usize];
+        if !path.delivers() {
+            return;
+        }
+        for frame in self.early.take(now, path.name.as_str()) {
+            self.deliver(now, frame, link);
+        }
+    }
+
+    fn without_destination(&mut self, frames: Vec<Frame>) {
+        for frame in frames {
+            match self.find(frame.topic()) {
+                Some(topic) => self.topics[topic.0 as usize]
+                    .ingress_drops
+                    .add(DropReason::NoDestination, 1),
+                None => self.unattributed.add(DropReason::NoDestination, 1),
+            }
+        }
     }
 
     /// The link has sent the last byte of a message for the first time.
@@ -274,10 +303,13 @@ impl DataCore {
 
     /// Ends bridges that have drained. Returns when it wants to be called again.
     pub fn drain(&mut self, now: Instant, link: &mut dyn LaneLink) -> Option<Instant> {
+        let gone = self.early.expire(now);
+        self.without_destination(gone);
+        let mut next = self.early.next_expiry();
         if !self.draining {
-            return None;
+            return next;
         }
-        let mut next = None;
+        let mut still_draining = false;
         for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
             let Phase::Draining { until } = bridge.phase else {
                 continue;
@@ -298,10 +330,11 @@ impl DataCore {
                 }
                 bridge.end(now);
             } else {
+                still_draining = true;
                 next = Some(next.map_or(until, |other: Instant| other.min(until)));
             }
         }
-        self.draining = next.is_some();
+        self.draining = still_draining;
         next
     }
 

@@ -3,6 +3,7 @@
 mod admit;
 mod bridge;
 pub mod core;
+mod early;
 pub mod measure;
 pub mod path;
 mod places;
