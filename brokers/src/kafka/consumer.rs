@@ -13,7 +13,7 @@ mod topic;
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use blaze_domain::names::ChannelName;
 use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
@@ -254,6 +254,7 @@ impl Consumer {
             readers: Vec::new(),
             assigned: false,
             awaited: false,
+            behind: None,
         };
         topic.identify(info.uuid.clone(), &self.layer);
         topic
@@ -281,6 +282,7 @@ impl Consumer {
                 readers: Vec::new(),
                 assigned: false,
                 awaited: true,
+                behind: None,
             });
         topic.take_in(sender, Vec::new(), None);
         Ok(())
@@ -384,6 +386,20 @@ impl Consumer {
         }
         // Also where nothing moved: the client stops reading a partition whose position it could not find for a moment.
         topic.reassign(&client);
+    }
+
+    /// Looks whether a topic is read although records wait.
+    pub(super) fn watch(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
+        let mut state = self.state.lock();
+        if let Some(topic) = state.topics.get_mut(topic)
+            && topic.assigned
+            && topic.uuid == info.uuid
+        {
+            topic.watch(marks, Instant::now(), &client);
+        }
     }
 
     /// Stops reading, but for what stays open.

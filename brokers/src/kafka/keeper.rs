@@ -103,6 +103,16 @@ fn note_topics(inner: &Inner, listing: &Listing) {
     }
 }
 
+/// The topics whose turn it is to be looked at.
+fn watched(topics: &[Arc<str>], turn: usize) -> Vec<Arc<str>> {
+    let rounds = topics.len().div_ceil(PER_ROUND).max(1);
+    let mine = topics
+        .iter()
+        .enumerate()
+        .filter(|(number, _)| number % rounds == turn % rounds);
+    mine.map(|(_, topic)| Arc::clone(topic)).collect()
+}
+
 fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn: usize) {
     consumer.sweep();
     let topics = consumer.topics();
@@ -121,6 +131,7 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
     let lost_position = consumer.take_lost_position();
     let waiting = topics.iter().filter(|topic| consumer.is_awaited(topic)).count();
     let mut looks = 0;
+    let watched = watched(&topics, turn);
     for topic in topics {
         let awaited = consumer.is_awaited(&topic);
         if awaited {
@@ -132,7 +143,7 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
             }
         }
         let resume = consumer.is_idle(&topic) && inner.gate.lets(false);
-        if !resume && !lost_position {
+        if !resume && !lost_position && !watched.contains(&topic) {
             continue;
         }
         let deadline = Instant::now() + ANSWER;
@@ -142,7 +153,8 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
         });
         match looked {
             Ok((info, marks)) if resume => consumer.resume(&topic, &info, &marks, || inner.gate.lets(false)),
-            Ok((info, marks)) => consumer.check_positions(&topic, &info, &marks),
+            Ok((info, marks)) if lost_position => consumer.check_positions(&topic, &info, &marks),
+            Ok((info, marks)) => consumer.watch(&topic, &info, &marks),
             Err(error) => {
                 tracing::debug!(%topic, %error, "could not be looked at");
                 if lost_position {

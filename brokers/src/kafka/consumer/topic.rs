@@ -1,12 +1,14 @@
 //! One topic that is read: where it stands, and who reads it.
 
+use std::time::{Duration, Instant};
+
 use blaze_domain::WriterId;
 use rdkafka::consumer::Consumer as _;
 use rdkafka::error::KafkaError;
 use rdkafka::{Offset, TopicPartitionList};
 
 use super::{Client, Source};
-use crate::kafka::directory::TopicInfo;
+use crate::kafka::directory::{Marks, TopicInfo};
 use crate::kafka::identity::TopicUuid;
 use crate::port::{Received, SubscriptionSender};
 
@@ -32,7 +34,24 @@ pub(super) struct TopicState {
     pub(super) assigned: bool,
     /// It was not there when its readers came: whatever it will hold came after them, so it is read from its beginning.
     pub(super) awaited: bool,
+    /// It was behind the server's end when it was last looked at.
+    pub(super) behind: Option<Behind>,
 }
+
+/// Records wait on the server and are not read.
+pub(super) struct Behind {
+    /// Where the partitions stood.
+    pub(super) positions: Vec<i64>,
+    /// Since when.
+    pub(super) since: Instant,
+    /// How long that may last: longer each time that asking again has changed nothing, because what waits may be a mark of
+    /// a transaction, which no reader gets.
+    pub(super) patience: Duration,
+}
+
+/// How long a reader may stand still while records wait for it.
+const PATIENCE: Duration = Duration::from_secs(1);
+const MOST_PATIENCE: Duration = Duration::from_secs(60);
 
 impl TopicState {
     pub(super) fn take_in(
@@ -63,6 +82,35 @@ impl TopicState {
             reader.starts.clear();
         }
         self.identify(Some(uuid), layer);
+    }
+
+    /// Looks whether it stands still although records wait. The client library gives a partition up that had no leader at the
+    /// moment when it was to be read (a topic that was just made, a broker that was fenced); asked again, it goes on.
+    pub(super) fn watch(&mut self, marks: &[Marks], now: Instant, client: &Client) {
+        let waits = self.partitions.iter().zip(marks).any(|(at, mark)| mark.high > at.next);
+        if !waits {
+            self.behind = None;
+            return;
+        }
+        let positions: Vec<i64> = self.partitions.iter().map(|at| at.next).collect();
+        match &mut self.behind {
+            Some(behind) if behind.positions == positions => {
+                if now.saturating_duration_since(behind.since) < behind.patience {
+                    return;
+                }
+                tracing::warn!(topic = %self.source.topic, ?positions, "records wait and are not read: asking for them again");
+                behind.since = now;
+                behind.patience = (behind.patience * 2).min(MOST_PATIENCE);
+                self.reassign(client);
+            }
+            _ => {
+                self.behind = Some(Behind {
+                    positions,
+                    since: now,
+                    patience: PATIENCE,
+                });
+            }
+        }
     }
 
     /// What was waited for is there: it is read from its beginning.
