@@ -266,12 +266,8 @@ impl FlowProcess {
     /// # Errors
     /// When the process has gone.
     pub fn rss_kib(&self) -> anyhow::Result<u64> {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.id()))?;
-        let line = status
-            .lines()
-            .find(|line| line.starts_with("VmRSS:"))
-            .context("no VmRSS")?;
-        Ok(line.split_whitespace().nth(1).context("no number")?.parse()?)
+        let bytes = self.process.resident_bytes().context("the process has gone")?;
+        Ok(bytes / 1024)
     }
 
     /// CPU time that it has used.

@@ -1,11 +1,11 @@
 //! Nodes of the demo as processes, and what they print.
 
-use std::net::{Ipv4Addr, UdpSocket};
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use blaze_tests::admin::Admin;
+pub(crate) use blaze_tests::flow::free_domain;
 use blaze_tests::process::Process;
 use blaze_tests::wait;
 use serde_json::Value;
@@ -18,19 +18,6 @@ static TURN: Mutex<()> = Mutex::new(());
 /// Held by the test that runs now.
 pub(crate) fn turn() -> MutexGuard<'static, ()> {
     TURN.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// A DDS domain that nobody uses on loopback now, so that another run of these tests is no neighbour.
-pub(crate) fn free_domain() -> anyhow::Result<u16> {
-    let first = (std::process::id() % 60) as u16;
-    let mut domains = (0..60).map(|step| 40 + (first + step) % 60);
-    // SPDP and user traffic of the first three participants.
-    let free = |domain: &u16| {
-        (10..16).all(|offset| UdpSocket::bind((Ipv4Addr::LOCALHOST, 7_400 + 250 * domain + offset)).is_ok())
-    };
-    domains
-        .find(free)
-        .ok_or_else(|| anyhow::anyhow!("no free DDS domain between 40 and 99"))
 }
 
 /// The recording without the camera: IMU and odometry, 50 Hz each.
