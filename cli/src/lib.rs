@@ -12,6 +12,7 @@ pub mod demo;
 pub mod exit;
 pub mod http;
 pub mod local;
+mod node_file;
 pub mod output;
 
 use std::process::ExitCode;

@@ -4,13 +4,16 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use rdkafka::ClientConfig;
+use parking_lot::Mutex;
 use rdkafka::admin::{AdminClient, AdminOptions};
 use rdkafka::client::DefaultClientContext;
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
+use rdkafka::error::KafkaError;
 use rdkafka::message::{Header, Headers as _, Message as _, OwnedHeaders};
-use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
+use rdkafka::producer::{BaseProducer, BaseRecord, DeliveryResult, Producer as _, ProducerContext};
 use rdkafka::topic_partition_list::{Offset, TopicPartitionList};
+use rdkafka::{ClientConfig, ClientContext};
+use redis::{IntoConnectionInfo as _, ProtocolVersion, PushKind};
 
 /// A record as a plain consumer sees it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -101,9 +104,98 @@ impl KafkaReader {
     }
 }
 
+/// A subscriber of one Redis channel that knows nothing of frames.
+pub struct RedisReader {
+    connection: redis::Connection,
+}
+
+impl RedisReader {
+    /// Subscribes to a channel, prefix included.
+    ///
+    /// # Errors
+    /// When the server does not answer within two seconds.
+    pub fn new(url: &str, channel: &str) -> anyhow::Result<Self> {
+        let info = url.into_connection_info()?;
+        // In RESP2 the client library takes a message for the late answer to a read that timed out, and skips it.
+        let settings = info.redis_settings().clone().set_protocol(ProtocolVersion::RESP3);
+        let client = redis::Client::open(info.set_redis_settings(settings))?;
+        let mut connection = client.get_connection_with_timeout(Duration::from_secs(2))?;
+        connection.set_read_timeout(Some(Duration::from_secs(2)))?;
+        connection.send_packed_command(&redis::cmd("SUBSCRIBE").arg(channel).get_packed_command())?;
+        connection.recv_response()?;
+        connection.set_read_timeout(Some(Duration::from_millis(50)))?;
+        Ok(Self { connection })
+    }
+
+    /// The next payload; `None` if none comes within 50 ms.
+    ///
+    /// # Errors
+    /// When the connection is lost.
+    pub fn poll(&mut self) -> anyhow::Result<Option<Vec<u8>>> {
+        loop {
+            match self.connection.recv_response() {
+                Ok(redis::Value::Push {
+                    kind: PushKind::Message,
+                    data,
+                }) => {
+                    if let Some(redis::Value::BulkString(payload)) = data.into_iter().nth(1) {
+                        return Ok(Some(payload));
+                    }
+                }
+                Ok(_) => {}
+                Err(error) if error.is_timeout() => return Ok(None),
+                Err(error) => return Err(error.into()),
+            }
+        }
+    }
+
+    /// The next payload within a time.
+    ///
+    /// # Errors
+    /// As [`RedisReader::poll`].
+    pub fn next(&mut self, within: Duration) -> anyhow::Result<Option<Vec<u8>>> {
+        let until = Instant::now() + within;
+        loop {
+            let payload = self.poll()?;
+            if payload.is_some() || Instant::now() >= until {
+                return Ok(payload);
+            }
+        }
+    }
+
+    /// The next payload as JSON.
+    ///
+    /// # Errors
+    /// When none comes in time, or something else.
+    pub fn next_json(&mut self, within: Duration) -> anyhow::Result<serde_json::Value> {
+        let payload = self
+            .next(within)?
+            .with_context(|| format!("nothing came within {within:?}"))?;
+        Ok(serde_json::from_slice(&payload)?)
+    }
+}
+
 /// A plain producer.
 pub struct KafkaWriter {
-    producer: BaseProducer,
+    producer: BaseProducer<Deliveries>,
+}
+
+/// Notes the last record that did not arrive.
+#[derive(Default)]
+struct Deliveries {
+    failed: Mutex<Option<KafkaError>>,
+}
+
+impl ClientContext for Deliveries {}
+
+impl ProducerContext for Deliveries {
+    type DeliveryOpaque = ();
+
+    fn delivery(&self, result: &DeliveryResult<'_>, (): ()) {
+        if let Err((error, _)) = result {
+            *self.failed.lock() = Some(error.clone());
+        }
+    }
 }
 
 impl KafkaWriter {
@@ -117,7 +209,7 @@ impl KafkaWriter {
             .set("message.max.bytes", "17825792")
             .set("message.timeout.ms", "5000")
             .set("reconnect.backoff.max.ms", "200")
-            .create()?;
+            .create_with_context(Deliveries::default())?;
         Ok(Self { producer })
     }
 
@@ -127,8 +219,15 @@ impl KafkaWriter {
     /// When it is not acknowledged in time.
     pub fn produce(&self, topic: &str, payload: &[u8]) -> anyhow::Result<()> {
         self.produce_later(topic, payload)?;
+        self.delivered()
+    }
+
+    fn delivered(&self) -> anyhow::Result<()> {
         self.producer.flush(Duration::from_secs(10))?;
-        Ok(())
+        match self.producer.context().failed.lock().take() {
+            None => Ok(()),
+            Some(error) => Err(error).context("a record was not taken by Kafka"),
+        }
     }
 
     /// Produces a value with headers and waits until it is there.
@@ -146,8 +245,7 @@ impl KafkaWriter {
         self.producer
             .send(BaseRecord::<'_, (), [u8]>::to(topic).payload(payload).headers(all))
             .map_err(|(error, _)| error)?;
-        self.producer.flush(Duration::from_secs(10))?;
-        Ok(())
+        self.delivered()
     }
 
     /// Produces a value and does not wait.

@@ -14,11 +14,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use blaze_domain::ServiceName;
-use blaze_domain::node_file::NodeFile;
 use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, RunningFlow};
 use blaze_runtime::Supervisor;
-use blaze_runtime::config::{Schema, Sources, load_typed};
+use blaze_runtime::config::Sources;
 use blaze_sdk::{
     Advertise, Lease, PublishOptions, Publisher, Request, ServiceManager, ServiceOptions, SubscribeOptions,
     Subscription,
@@ -37,6 +36,7 @@ use super::report::{Report, Style};
 use super::roles::{Consumer, PUBLISHING_NODE, PlayedTopic, consumers, played_topics, scope_of};
 use super::session::{self, Script, Stage};
 use crate::exit::{CliError, Exit};
+use crate::node_file;
 use crate::output::Format;
 
 /// How long a node may take to be ready.
@@ -225,19 +225,8 @@ fn settings_of(node: DemoNode, options: &DemoOptions, listen: Ipv4Addr, domain: 
         file_may_be_absent: true,
         ..Sources::default()
     };
-    let remarks = |faults: Vec<blaze_domain::node_file::Fault>| -> Vec<_> {
-        faults.into_iter().map(|fault| (fault.path, fault.detail)).collect()
-    };
-    let schema: Schema<NodeFile> = Arc::new(move |tree| {
-        NodeFile::read(tree)
-            .map(|(file, warnings)| (file, remarks(warnings)))
-            .map_err(remarks)
-    });
-    let loaded = load_typed(&sources, &schema).map_err(|faults| {
-        let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
-        CliError::Usage(format!("--set: {}", lines.join("\n  ")))
-    })?;
-    FlowSettings::try_from(&loaded.value).map_err(|error| CliError::Usage(format!("--set: {error}")))
+    let file = node_file::read(&sources).map_err(|faults| CliError::Usage(format!("--set: {faults}")))?;
+    FlowSettings::try_from(&file).map_err(|error| CliError::Usage(format!("--set: {error}")))
 }
 
 async fn wait_ready(nodes: &Nodes) -> Result<(), CliError> {

@@ -13,15 +13,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_brokers::{Broker, BrokerKind, Health, OpenError, Role, open_layer, open_node};
-use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
+use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
 use blaze_domain::{InstanceName, Scope, ServiceName, TopicName};
-use blaze_runtime::config::{Schema, Sources, load_typed};
+use blaze_runtime::config::Sources;
 use blaze_sdk::{FlowError, ServiceManager, ServiceOptions};
 use clap::Args;
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::args::parse_topic;
 use crate::exit::CliError;
+use crate::node_file;
 
 pub use echo::{EchoOptions, run as echo};
 pub use hz::{HzOptions, run as hz};
@@ -52,7 +53,8 @@ struct LocalService {
 impl LocalService {
     /// Connects, and starts a service `blaze-<command>` whose instance is the process.
     async fn start(target: &LocalTopic, command: &str) -> Result<Self, CliError> {
-        let file = node_file(target.config.clone())?;
+        let sources = Sources::of_process(target.config.clone(), Vec::new());
+        let file = node_file::read(&sources).map_err(CliError::Invalid)?;
         let id = file
             .flow_id()
             .ok_or_else(|| CliError::Invalid("the node file names no layer and node".to_owned()))?;
@@ -79,20 +81,6 @@ impl LocalService {
         self.manager.shutdown().await;
         self.broker.close().await;
     }
-}
-
-fn node_file(config: Option<PathBuf>) -> Result<NodeFile, CliError> {
-    let remarks = |faults: Vec<Fault>| -> Vec<_> { faults.into_iter().map(|f| (f.path, f.detail)).collect() };
-    let schema: Schema<NodeFile> = Arc::new(move |tree| {
-        NodeFile::read(tree)
-            .map(|(file, warnings)| (file, remarks(warnings)))
-            .map_err(remarks)
-    });
-    let loaded = load_typed(&Sources::of_process(config, Vec::new()), &schema).map_err(|faults| {
-        let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
-        CliError::Invalid(lines.join("\n  "))
-    })?;
-    Ok(loaded.value)
 }
 
 fn open(file: &NodeFile) -> Result<(Arc<dyn Broker>, Scope), CliError> {

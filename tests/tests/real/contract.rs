@@ -1,5 +1,6 @@
 //! What the contract says of shared, emptied and remade servers: nothing happens in silence.
 
+use std::cell::RefCell;
 use std::time::Duration;
 
 use blaze_tests::flow::{FlowProcess, FlowSpec};
@@ -11,7 +12,7 @@ use blaze_tests::wait;
 use serde_json::json;
 
 use crate::stream::Stream;
-use crate::support::{RobotAndCloud, SOON, turn};
+use crate::support::{RedisReader, RobotAndCloud, SOON, turn};
 
 const TOPIC: &str = "imu/data";
 
@@ -62,7 +63,7 @@ fn bare_records_of_a_topic_made_anew_are_no_repeats() -> anyhow::Result<()> {
     let system = RobotAndCloud::start(&redis, &kafka)?;
     system.tell_cloud(&json!({"op":"advertise","topic":COMMANDS,"service":"planner","ttl_s":0}))?;
     system.tell_robot(&json!({"op":"request","topic":COMMANDS,"service":"driver","bare":true,"ttl_s":0}))?;
-    let mut reader = crate::support::RedisReader::new(&redis, &system.channel("blaze/bare/fleet/commands"))?;
+    let mut reader = RedisReader::new(&redis, &system.channel("blaze/bare/fleet/commands"))?;
     system.cloud.wait_bridge(COMMANDS, SOON)?;
     system.robot.wait_bridge(COMMANDS, SOON)?;
     let topic = system.topic(COMMANDS);
@@ -71,16 +72,26 @@ fn bare_records_of_a_topic_made_anew_are_no_repeats() -> anyhow::Result<()> {
         if life == "second" {
             delete_topic(&kafka, &topic)?;
         }
-        let mut arrived = None;
+        let (arrived, produced) = (RefCell::new(None), RefCell::new(None));
         wait::until(
             &format!("commands of the {life} topic arrive"),
             SOON,
             || {
-                let _ = writer.produce(&topic, life.as_bytes());
-                arrived = reader.next(Duration::from_millis(100)).ok().flatten();
-                arrived.as_deref() == Some(life.as_bytes())
+                produced.replace(Some(writer.produce(&topic, life.as_bytes())));
+                arrived.replace(Some(reader.next(Duration::from_millis(100))));
+                matches!(&*arrived.borrow(), Some(Ok(Some(payload))) if payload == life.as_bytes())
             },
-            || format!("{}\n{}", system.cloud.tail(), system.robot.tail()),
+            || {
+                format!(
+                    "the last record: {:?}, read: {:?}\n{:?}\n{:?}\n{}\n{}",
+                    produced.borrow(),
+                    arrived.borrow(),
+                    system.cloud.bridges(),
+                    system.robot.bridges(),
+                    system.cloud.tail(),
+                    system.robot.tail()
+                )
+            },
         )?;
     }
     Ok(())

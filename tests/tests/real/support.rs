@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::plain::KafkaWriter;
+pub(crate) use blaze_tests::plain::RedisReader;
 use blaze_tests::servers::unique_name;
 
 /// Where something must happen, on a busy machine.
@@ -87,46 +88,4 @@ impl RobotAndCloud {
 /// A plain connection to Redis.
 pub(crate) fn connect(url: &str) -> anyhow::Result<redis::Connection> {
     Ok(redis::Client::open(url)?.get_connection_with_timeout(Duration::from_secs(2))?)
-}
-
-/// A subscriber that knows nothing of frames.
-pub(crate) struct RedisReader {
-    connection: redis::Connection,
-}
-
-impl RedisReader {
-    /// Subscribes to a channel, prefix included.
-    pub(crate) fn new(url: &str, channel: &str) -> anyhow::Result<Self> {
-        let mut connection = connect(url)?;
-        connection.set_read_timeout(Some(Duration::from_millis(50)))?;
-        connection.send_packed_command(&redis::cmd("SUBSCRIBE").arg(channel).get_packed_command())?;
-        connection.recv_response()?;
-        Ok(Self { connection })
-    }
-
-    /// The next payload within a time.
-    pub(crate) fn next(&mut self, within: Duration) -> anyhow::Result<Option<Vec<u8>>> {
-        let until = std::time::Instant::now() + within;
-        while std::time::Instant::now() < until {
-            match self.connection.recv_response() {
-                Ok(redis::Value::Array(parts)) => {
-                    if let Some(redis::Value::BulkString(payload)) = parts.into_iter().nth(2) {
-                        return Ok(Some(payload));
-                    }
-                }
-                Ok(_) => {}
-                Err(error) if error.is_timeout() => {}
-                Err(error) => return Err(error.into()),
-            }
-        }
-        Ok(None)
-    }
-
-    /// The next payload as JSON.
-    pub(crate) fn next_json(&mut self, within: Duration) -> anyhow::Result<serde_json::Value> {
-        let payload = self
-            .next(within)?
-            .ok_or_else(|| anyhow::anyhow!("nothing came within {within:?}"))?;
-        Ok(serde_json::from_slice(&payload)?)
-    }
 }

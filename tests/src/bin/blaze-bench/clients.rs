@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use anyhow::Context;
+use blaze_tests::plain::RedisReader;
 use rdkafka::ClientConfig;
 use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, TopicReplication};
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
@@ -60,36 +61,14 @@ impl Source for RedisSource {
 }
 
 /// SUBSCRIBE.
-pub(crate) struct RedisSink {
-    connection: redis::Connection,
-}
-
-impl RedisSink {
-    pub(crate) fn new(url: &str, channel: &str) -> anyhow::Result<Self> {
-        let mut connection = redis::Client::open(url)?.get_connection()?;
-        {
-            let mut subscription = connection.as_pubsub();
-            subscription.subscribe(channel)?;
-            subscription.set_read_timeout(Some(Duration::from_millis(50)))?;
-            // Dropping the borrow would unsubscribe.
-            std::mem::forget(subscription);
-        }
-        Ok(Self { connection })
-    }
-}
+pub(crate) struct RedisSink(pub(crate) RedisReader);
 
 impl Sink for RedisSink {
     fn poll(&mut self, found: &mut dyn FnMut(&[u8])) -> anyhow::Result<()> {
         for _ in 0..256 {
-            match self.connection.recv_response() {
-                Ok(redis::Value::Array(parts)) => {
-                    if let Some(redis::Value::BulkString(payload)) = parts.into_iter().nth(2) {
-                        found(&payload);
-                    }
-                }
-                Ok(_) => {}
-                Err(error) if error.is_timeout() => return Ok(()),
-                Err(error) => return Err(error.into()),
+            match self.0.poll()? {
+                Some(payload) => found(&payload),
+                None => break,
             }
         }
         Ok(())

@@ -16,6 +16,7 @@ mod load;
 use std::time::Duration;
 
 use anyhow::Context;
+use blaze_tests::plain::RedisReader;
 use blaze_tests::servers;
 use clap::Parser;
 
@@ -132,7 +133,7 @@ fn measure(
         _ => Box::new(RedisSource::new(redis, &redis_channel)?),
     };
     let sink: Box<dyn Sink> = match kind {
-        PathKind::RedisAlone => Box::new(RedisSink::new(redis, &redis_channel)?),
+        PathKind::RedisAlone => Box::new(RedisSink(RedisReader::new(redis, &redis_channel)?)),
         _ => Box::new(KafkaSink::new(kafka, &kafka_topic)?),
     };
     let cpu = || flows.as_ref().map_or(Ok(Duration::ZERO), Flows::cpu);
