@@ -14,16 +14,17 @@ use crate::wait;
 /// Lines of output that are kept.
 const MAX_LINES: usize = 20_000;
 
-/// A binary of the workspace, beside the test's own.
+/// A binary of the workspace, beside the test's own: in `target/<profile>`, while tests lie in its folder `deps`.
 ///
 /// # Errors
 /// When it has not been built.
 pub fn binary(name: &str) -> anyhow::Result<PathBuf> {
-    let test = std::env::current_exe()?;
-    let folder = test
-        .parent()
-        .and_then(|deps| deps.parent())
-        .context("the test lies in target/<profile>/deps")?;
+    let own = std::env::current_exe()?;
+    let folder = own
+        .ancestors()
+        .skip(1)
+        .find(|folder| !folder.ends_with("deps"))
+        .context("this program lies in no folder")?;
     let path = folder.join(name);
     anyhow::ensure!(
         path.exists(),
