@@ -35,8 +35,8 @@ const MAX_GUID_PREFIXES: usize = 4;
 /// Bounds of an engine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Bytes per destination and class (control, state, bulk) that wait or may have to be repaired; one message always
-    /// fits besides.
+    /// Bytes per destination and class (control, state, bulk) that wait, and as many again that were sent and may have to
+    /// be repaired; one message always fits besides.
     pub queue_bytes: [usize; 3],
     /// Bytes of unfinished and waiting messages of all peers.
     pub reassembly_bytes: usize,

@@ -196,7 +196,8 @@ impl SendClass {
         }
         let message = Outgoing::new(submit, self.part_bytes());
         let cost = Self::cost(&message);
-        while self.waiting_bytes > 0 && self.queue_bytes() + cost > self.limits.queue_bytes {
+        // What waits for its acknowledgement has a bound of its own: a late Feedback must not cost a message.
+        while self.waiting_bytes > 0 && self.waiting_bytes + cost > self.limits.queue_bytes {
             let Some(oldest) = self.waiting.pop_front() else { break };
             self.drop_message(oldest, DropReason::QueueFull, ledger);
         }

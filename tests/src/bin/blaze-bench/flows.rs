@@ -1,7 +1,9 @@
 //! The flows on the way, as processes of their own.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
+use anyhow::Context;
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::plain::KafkaWriter;
 
@@ -82,6 +84,30 @@ impl Flows {
             flow.wait_bridge(route.topic, Duration::from_secs(20))?;
         }
         Ok(())
+    }
+
+    /// What the flows dropped, by reason; empty if nothing.
+    pub(crate) fn dropped(&self) -> anyhow::Result<String> {
+        let mut reasons: BTreeMap<String, f64> = BTreeMap::new();
+        for flow in &self.running {
+            let (_, metrics) = flow.admin().get("/metrics")?;
+            for line in metrics
+                .lines()
+                .filter(|line| line.starts_with("blaze_flow_dropped_total{"))
+            {
+                let (labels, value) = line.rsplit_once(' ').context("a metric without a value")?;
+                let (_, reason) = labels.split_once("reason=\"").context("a metric without a reason")?;
+                *reasons
+                    .entry(reason.trim_end_matches(['"', '}']).to_owned())
+                    .or_default() += value.parse::<f64>()?;
+            }
+        }
+        reasons.retain(|_, count| *count > 0.0);
+        let texts: Vec<String> = reasons
+            .iter()
+            .map(|(reason, count)| format!("{reason} {count}"))
+            .collect();
+        Ok(texts.join(", "))
     }
 
     /// CPU time that the flows have used, all of them together.

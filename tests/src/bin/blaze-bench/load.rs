@@ -14,6 +14,8 @@ const WARM_UP: Duration = Duration::from_secs(1);
 const DRAIN: Duration = Duration::from_secs(5);
 /// Messages on the way at full speed, in bytes: enough to keep every stage busy, too few to overrun any queue.
 const WINDOW_BYTES: u64 = 2 * 1024 * 1024;
+/// And messages: fewer than a flow holds for one topic that comes faster than it can be read.
+const WINDOW_MESSAGES: u64 = 2_048;
 
 /// What is sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -198,7 +200,7 @@ impl Sender<'_> {
     }
 
     fn full(&mut self, bytes: usize, duration: Duration) -> anyhow::Result<()> {
-        let window = (WINDOW_BYTES / bytes as u64).max(2);
+        let window = (WINDOW_BYTES / bytes as u64).clamp(2, WINDOW_MESSAGES);
         let begin = Instant::now();
         // What was lost before must not close the window for ever.
         let missing = self.sent - self.seen.received.load(Ordering::Relaxed);

@@ -80,7 +80,7 @@ fn main() -> anyhow::Result<()> {
     let run = format!("bench-{}", std::process::id());
     let duration = Duration::from_secs_f64(arguments.seconds);
     println!(
-        "{:<27} {:<22} {:>9} {:>8} {:>9} {:>9} {:>9} {:>13}",
+        "{:<27} {:<22} {:>9} {:>8} {:>9} {:>9} {:>9} {:>13}  DROPPED",
         "PATH", "LOAD", "SENT", "LOST", "MSG/S", "p50/ms", "p99/ms", "FLOW us/MSG"
     );
     for kind in PathKind::ALL
@@ -92,8 +92,8 @@ fn main() -> anyhow::Result<()> {
             .filter(|load| load.name().contains(&arguments.load))
         {
             let name = format!("{run}-{}", kind.name().replace('>', "-"));
-            let figures = measure(kind, &name, load, duration, &redis, &kafka)?;
-            print_row(kind, load, &figures);
+            let (figures, dropped) = measure(kind, &name, load, duration, &redis, &kafka)?;
+            print_row(kind, load, &figures, &dropped);
         }
     }
     Ok(())
@@ -106,7 +106,7 @@ fn measure(
     duration: Duration,
     redis: &str,
     kafka: &str,
-) -> anyhow::Result<Figures> {
+) -> anyhow::Result<(Figures, String)> {
     let topic = format!("bench/{}", load.name().replace([' ', '/', ','], "-"));
     let (redis_prefix, kafka_prefix) = (format!("{run}:"), format!("{run}."));
     let redis_channel = format!("{redis_prefix}{topic}");
@@ -137,17 +137,19 @@ fn measure(
         _ => Box::new(KafkaSink::new(kafka, &kafka_topic)?),
     };
     let cpu = || flows.as_ref().map_or(Ok(Duration::ZERO), Flows::cpu);
-    load::run(load, duration, source.as_mut(), sink, &cpu)
+    let figures = load::run(load, duration, source.as_mut(), sink, &cpu)?;
+    let dropped = flows.as_ref().map_or_else(|| Ok(String::new()), Flows::dropped)?;
+    Ok((figures, dropped))
 }
 
-fn print_row(kind: PathKind, load: Load, figures: &Figures) {
+fn print_row(kind: PathKind, load: Load, figures: &Figures, dropped: &str) {
     let cpu = if matches!(kind, PathKind::OneFlow | PathKind::TwoFlows) {
         format!("{:.1}", figures.flow_cpu_us_per_message)
     } else {
         "-".to_owned()
     };
     println!(
-        "{:<27} {:<22} {:>9} {:>8} {:>9.0} {:>9.3} {:>9.3} {:>13}",
+        "{:<27} {:<22} {:>9} {:>8} {:>9.0} {:>9.3} {:>9.3} {:>13}  {dropped}",
         kind.name(),
         load.name(),
         figures.sent,
