@@ -14,7 +14,7 @@ mod outbox;
 pub mod port;
 pub mod redis;
 
-pub use open::{OpenError, open_layer, open_node};
+pub use open::{OpenError, check_layer, open_layer, open_node};
 pub use port::{
     Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, PublishOutcome, Publisher,
     PublisherOptions, Received, Role, SubscribeOptions, Subscription, SubscriptionSender, subscription,

@@ -28,6 +28,21 @@ pub enum OpenError {
     InProcess,
 }
 
+/// Whether the section of a layer scope holds together; connects nowhere and reads no files, so that a node file can be
+/// checked on another machine.
+///
+/// # Errors
+/// As [`open_layer`], but for adapters that live inside one process.
+pub fn check_layer(section: &LayerBroker) -> Result<(), OpenError> {
+    match section {
+        LayerBroker::Memory | LayerBroker::Dds(_) => Ok(()),
+        #[cfg(feature = "kafka")]
+        LayerBroker::Kafka(kafka) => crate::kafka::KafkaBroker::check(kafka),
+        #[cfg(not(feature = "kafka"))]
+        LayerBroker::Kafka(_) => Err(OpenError::NotBuilt { feature: "kafka" }),
+    }
+}
+
 /// Connects to the server of a node scope, in the background.
 ///
 /// # Errors

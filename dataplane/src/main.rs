@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_brokers::memory::MemoryHub;
-use blaze_brokers::{Broker, Role, open_layer, open_node};
-use blaze_domain::node_file::{LayerBroker as LayerSection, NodeBroker, NodeFile};
+use blaze_brokers::{Broker, OpenError, Role, check_layer, open_layer, open_node};
+use blaze_domain::node_file::{Fault, LayerBroker as LayerSection, NodeBroker, NodeFile};
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, LayerBroker, RunningFlow};
 use blaze_flow::world::LayerScopeId;
@@ -76,10 +76,11 @@ fn main() -> ExitCode {
 
 /// The node file as this program reads it.
 fn schema() -> Schema<NodeFile> {
-    let remark = |fault: blaze_domain::node_file::Fault| (fault.path, fault.detail);
+    let remark = |fault: Fault| (fault.path, fault.detail);
     Arc::new(move |value| match NodeFile::read(value) {
         Ok((file, warnings)) => {
-            let faults = file.check_for_flow();
+            let mut faults = file.check_for_flow();
+            faults.extend(broker_fault(&file));
             if faults.is_empty() {
                 Ok((file, warnings.into_iter().map(remark).collect()))
             } else {
@@ -88,6 +89,17 @@ fn schema() -> Schema<NodeFile> {
         }
         Err(faults) => Err(faults.into_iter().map(remark).collect()),
     })
+}
+
+/// What the adapter has against the section of the layer scope. What was not built in is told beside that.
+fn broker_fault(file: &NodeFile) -> Option<Fault> {
+    match check_layer(file.brokers.layer.as_ref()?) {
+        Err(OpenError::Setting { key, reason }) => Some(Fault {
+            path: format!("brokers.layer.{key}"),
+            detail: reason,
+        }),
+        Ok(()) | Err(OpenError::NotBuilt { .. } | OpenError::InProcess) => None,
+    }
 }
 
 async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {

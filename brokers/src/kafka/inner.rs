@@ -74,6 +74,8 @@ pub(super) struct Inner {
     pub(super) cluster: Once,
     pub(super) status: watch::Sender<BrokerStatus>,
     pub(super) was_up: AtomicBool,
+    /// Whether it was told that the server did not answer from the beginning.
+    pub(super) told: AtomicBool,
     pub(super) closed: AtomicBool,
     pub(super) bell: Bell,
     pub(super) supervisor: Supervisor,
@@ -152,7 +154,7 @@ impl Inner {
         if answers && !was_up {
             tracing::info!(detail, "Kafka answers");
             self.wake_writers();
-        } else if !answers && was_up {
+        } else if !answers && (was_up || !self.told.swap(true, Ordering::AcqRel)) {
             tracing::warn!(detail, "Kafka does not answer");
         }
         let taken = self.flow.as_ref().and_then(|flow| flow.stood_back.lock().clone());

@@ -72,8 +72,8 @@ fn round(inner: &Inner, turn: usize) -> bool {
 
 fn lost(inner: &Inner, reason: &str) -> bool {
     inner.gate.set_up(false);
-    let detail = inner.last_error.take().unwrap_or_else(|| reason.to_owned());
-    inner.set_server(false, detail);
+    let reason = inner.last_error.take().unwrap_or_else(|| reason.to_owned());
+    inner.set_server(false, format!("{}: {reason}", inner.settings.place()));
     false
 }
 

@@ -75,17 +75,21 @@ pub struct KafkaBroker {
 }
 
 impl KafkaBroker {
+    /// Whether a section holds together; connects nowhere.
+    ///
+    /// # Errors
+    /// [`OpenError::Setting`] names the key.
+    pub fn check(section: &Section) -> Result<(), OpenError> {
+        read(section).map(|_| ())
+    }
+
     /// Begins to connect, in the background. Must be called on a Tokio runtime.
     ///
     /// # Errors
     /// [`OpenError`] for a property that the client library refuses or that may not be set, and for TLS where it is not
     /// built in.
     pub fn open(section: &Section, role: &Role) -> Result<Self, OpenError> {
-        let settings = Settings::new(section)?;
-        let names = Names::new(&section.prefix).map_err(|reason| OpenError::Setting {
-            key: "kafka.prefix".to_owned(),
-            reason,
-        })?;
+        let (settings, names) = read(section)?;
         let last_error = Arc::<LastError>::default();
         let refused = |reason: String| OpenError::Setting {
             key: "kafka.properties".to_owned(),
@@ -120,6 +124,7 @@ impl KafkaBroker {
             cluster: Once::default(),
             status: watch::Sender::new(connecting),
             was_up: AtomicBool::new(false),
+            told: AtomicBool::new(false),
             closed: AtomicBool::new(false),
             bell: Bell::default(),
             supervisor: Supervisor::new("kafka"),
@@ -158,6 +163,15 @@ impl Drop for KafkaBroker {
         self.inner.begin_close();
         self.inner.end();
     }
+}
+
+fn read(section: &Section) -> Result<(Settings, Names), OpenError> {
+    let settings = Settings::new(section)?;
+    let names = Names::new(&section.prefix).map_err(|reason| OpenError::Setting {
+        key: "kafka.prefix".to_owned(),
+        reason,
+    })?;
+    Ok((settings, names))
 }
 
 #[async_trait]

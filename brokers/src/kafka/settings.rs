@@ -143,6 +143,11 @@ impl Settings {
         config.create_native_config().map(|_| ()).map_err(refused)
     }
 
+    /// Where the server is, for people.
+    pub(super) fn place(&self) -> &str {
+        self.base.get("bootstrap.servers").unwrap_or_default()
+    }
+
     /// With what the section gives on top of our own choice, and what is fixed on top of that.
     fn with(&self, chosen: &[(&str, &str)], fixed: &[(&str, &str)]) -> ClientConfig {
         let mut config = self.base.clone();

@@ -116,6 +116,8 @@ struct Verdict {
     health: Health,
     detail: String,
     scope_open: bool,
+    /// It cannot be reached, and never could.
+    unreachable: bool,
 }
 
 impl Conditions {
@@ -190,10 +192,12 @@ impl Conditions {
 
     fn assess(&self) -> Verdict {
         let (health, detail) = self.health();
+        let away = self.lines.iter().any(|line| matches!(line, LineState::Away(_)));
         Verdict {
             health,
             detail,
             scope_open: self.scope_open(),
+            unreachable: health == Health::Connecting && away,
         }
     }
 
@@ -255,6 +259,8 @@ pub(super) struct State {
     version: watch::Sender<u64>,
     gates: [Arc<Gate>; 2],
     delivers: AtomicBool,
+    /// Whether it was told that the server could not be reached from the beginning.
+    told: AtomicBool,
 }
 
 impl State {
@@ -268,6 +274,7 @@ impl State {
             version: watch::Sender::new(0),
             gates,
             delivers: AtomicBool::new(false),
+            told: AtomicBool::new(false),
         }
     }
 
@@ -285,7 +292,15 @@ impl State {
     }
 
     fn tell(&self, verdict: Verdict) {
-        let Verdict { health, detail, .. } = verdict;
+        let Verdict {
+            health,
+            detail,
+            unreachable,
+            ..
+        } = verdict;
+        if unreachable && !self.told.swap(true, Ordering::AcqRel) {
+            tracing::warn!(detail, "redis cannot be reached, trying on");
+        }
         self.status.send_if_modified(|status| {
             let turned = status.health != health;
             if !turned && status.detail == detail {

@@ -98,6 +98,34 @@ fn all_faults_are_told_at_once_with_their_places() {
 }
 
 #[test]
+fn what_kafka_cannot_use_is_a_fault_with_its_place() {
+    let folder = tempfile::tempdir().unwrap();
+    for (kafka, place) in [
+        ("prefix: \"a:b\"", "4: brokers.layer.kafka.prefix: "),
+        (
+            "properties: { acks: \"1\" }",
+            "4: brokers.layer.kafka.properties.acks: ",
+        ),
+        (
+            "properties: { \"no.such\": \"1\" }",
+            "4: brokers.layer.kafka.properties.no.such: ",
+        ),
+    ] {
+        let content = format!(
+            "layer: {{ name: fog, kind: fog }}\nnode: {{ name: server-1 }}\nbrokers:\n  \
+             layer: {{ kafka: {{ bootstrap: [\"127.0.0.1:9\"], {kafka} }} }}\n"
+        );
+        let path = written(folder.path(), "blaze.yaml", &content);
+        for arguments in [&["--config", &path, "--check"][..], &["--config", &path][..]] {
+            let output = flow_binary(arguments, &[]);
+            let told = text(&output.stderr);
+            assert_eq!(output.status.code(), Some(64), "{told}");
+            assert!(told.starts_with(&format!("{path}:{place}")), "{told}");
+        }
+    }
+}
+
+#[test]
 fn files_that_are_none_are_faults_of_the_configuration() {
     let folder = tempfile::tempdir().unwrap();
     let good = small_file(folder.path(), "40");
