@@ -300,18 +300,19 @@ impl<C> Outbox<C> {
     /// Takes messages in turns of the lanes until `messages` or `bytes` are reached (one message is always taken), and drops
     /// those whose time is over. Returns the bytes taken.
     pub(crate) fn take(&self, now: Instant, messages: usize, bytes: usize, into: &mut Vec<Waiting<C>>) -> usize {
-        self.take_ready(now, messages, bytes, true, |_| true, into)
+        self.take_ready(now, messages, bytes, true, |_| Some(usize::MAX), into)
     }
 
-    /// As [`take`](Self::take), only from lanes whose `to` is ready; what waits in the others is only dropped when its time
-    /// is over. With `one_always`, one message is taken even if it is larger than `bytes`.
+    /// As [`take`](Self::take), only from lanes whose `to` is ready, and of each at most the bytes that `allowance` gives for
+    /// its turn, but always one message; what waits in the others is only dropped when its time is over. With `one_always`,
+    /// one message is taken even if it is larger than `bytes`.
     pub(crate) fn take_ready(
         &self,
         now: Instant,
         messages: usize,
         bytes: usize,
         one_always: bool,
-        is_ready: impl Fn(&C) -> bool,
+        mut allowance: impl FnMut(&C) -> Option<usize>,
         into: &mut Vec<Waiting<C>>,
     ) -> usize {
         let mut state = self.state.lock();
@@ -324,12 +325,13 @@ impl<C> Outbox<C> {
             let Some(queue) = state.lanes.get_mut(&id) else {
                 continue;
             };
-            if !is_ready(&queue.to) {
+            let Some(allowed) = allowance(&queue.to) else {
                 state.bytes -= queue.drop_overdue(now);
                 not_ready.push(id);
                 continue;
-            }
+            };
             let mut full = false;
+            let mut of_lane = 0_usize;
             for _ in 0..TURN {
                 let Some(entry) = queue.entries.front() else { break };
                 if let Some((at, reason)) = entry.expires
@@ -339,6 +341,9 @@ impl<C> Outbox<C> {
                     continue;
                 }
                 let size = entry.body.size();
+                if of_lane > 0 && of_lane.saturating_add(size) > allowed {
+                    break;
+                }
                 let is_first = into.len() == first && one_always;
                 if !is_first && (taken + size > bytes || into.len() - first >= messages) {
                     full = true;
@@ -348,6 +353,7 @@ impl<C> Outbox<C> {
                 queue.bytes -= size;
                 state.bytes -= size;
                 taken += size;
+                of_lane += size;
                 into.push(Waiting {
                     body: entry.body,
                     to: Arc::clone(&queue.to),
@@ -524,6 +530,31 @@ mod tests {
     }
 
     #[test]
+    fn a_lane_gives_what_it_is_allowed_and_always_one() {
+        let outbox = Outbox::new(OutboxLimits {
+            lane_messages: 6,
+            ..SMALL
+        });
+        let lane = outbox.lane("a", None);
+        for count in 0..6 {
+            lane.push(bare(count, 10), None);
+        }
+        let size = bare(0, 10).size();
+        let take = |allowed| {
+            let (mut into, mut turns) = (Vec::new(), 0);
+            let once = |_: &&str| {
+                turns += 1;
+                (turns == 1).then_some(allowed)
+            };
+            outbox.take_ready(Instant::now(), 100, 10_000, true, once, &mut into);
+            into.iter().map(number).collect::<Vec<_>>()
+        };
+        assert_eq!(take(0), [("a", 0)]);
+        assert_eq!(take(3 * size), [("a", 1), ("a", 2), ("a", 3)]);
+        assert_eq!(take(3 * size - 1), [("a", 4), ("a", 5)]);
+    }
+
+    #[test]
     fn lanes_that_are_not_ready_wait_and_expire() {
         let outbox = Outbox::new(SMALL);
         let (a, b) = (outbox.lane("a", Some(Duration::from_secs(5))), outbox.lane("b", None));
@@ -532,7 +563,14 @@ mod tests {
         b.push(bare(2, 10), None);
         let take = |at, ready: &'static str, bytes, one_always| {
             let mut into = Vec::new();
-            outbox.take_ready(at, 100, bytes, one_always, |to| *to == ready, &mut into);
+            outbox.take_ready(
+                at,
+                100,
+                bytes,
+                one_always,
+                |to| (*to == ready).then_some(usize::MAX),
+                &mut into,
+            );
             into.iter().map(number).collect::<Vec<_>>()
         };
         assert_eq!(take(now, "b", 1, false), [], "nothing that is larger than the room");

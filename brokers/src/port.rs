@@ -100,6 +100,14 @@ pub enum BrokerError {
         /// Why not.
         reason: String,
     },
+    /// The server has a channel of another name that it does not tell apart from this one.
+    #[error("channel {channel}: its name and that of {other} are one to the broker")]
+    Collision {
+        /// The channel.
+        channel: String,
+        /// Name of the other on the server.
+        other: String,
+    },
     /// More channels than the adapter holds.
     #[error("more than {0} channels")]
     TooManyChannels(usize),
@@ -311,8 +319,15 @@ pub trait FlowSide: Send + Sync {
     /// `depth` is what the channel keeps per writer for late joiners; 0 = nothing.
     ///
     /// # Errors
-    /// [`BrokerError::Name`] when the server can have no such channel.
+    /// [`BrokerError::Name`] when the server can have no such channel, [`BrokerError::Collision`] when it does not tell it
+    /// apart from another one that it has.
     fn prepare(&self, channel: &ChannelName, depth: u32) -> Result<(), BrokerError>;
+
+    /// Channels that were prepared and then turned out to have the name of somebody else's, which is given with each; since
+    /// the last call.
+    fn take_collisions(&self) -> Vec<(ChannelName, String)> {
+        Vec::new()
+    }
 
     /// Nobody leases a channel any more: it stays as it is.
     fn release(&self, channel: &ChannelName);

@@ -5,13 +5,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use parking_lot::Mutex;
-use rdkafka::admin::{AdminClient, AdminOptions};
+use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, TopicReplication};
 use rdkafka::client::DefaultClientContext;
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
 use rdkafka::error::KafkaError;
 use rdkafka::message::{Header, Headers as _, Message as _, OwnedHeaders};
 use rdkafka::producer::{BaseProducer, BaseRecord, DeliveryResult, Producer as _, ProducerContext};
 use rdkafka::topic_partition_list::{Offset, TopicPartitionList};
+use rdkafka::types::RDKafkaErrorCode;
 use rdkafka::{ClientConfig, ClientContext};
 use redis::{IntoConnectionInfo as _, ProtocolVersion, PushKind};
 
@@ -258,6 +259,22 @@ impl KafkaWriter {
             .map_err(|(error, _)| error)?;
         self.producer.poll(Duration::ZERO);
         Ok(())
+    }
+}
+
+/// Makes a topic of one partition, with these settings.
+///
+/// # Errors
+/// When the broker refuses; a topic that is there already is no error.
+pub fn make_topic(bootstrap: &str, topic: &str, settings: &[(&str, &str)]) -> anyhow::Result<()> {
+    let admin: AdminClient<DefaultClientContext> = client(bootstrap).create()?;
+    let new = NewTopic::new(topic, 1, TopicReplication::Fixed(1));
+    let new = settings.iter().fold(new, |new, (key, value)| new.set(key, value));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let made = runtime.block_on(admin.create_topics(&[new], &AdminOptions::new()))?;
+    match made.into_iter().next().context("no answer")? {
+        Ok(_) | Err((_, RDKafkaErrorCode::TopicAlreadyExists)) => Ok(()),
+        Err((topic, code)) => anyhow::bail!("{topic}: {code}"),
     }
 }
 

@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use rdkafka::ClientContext;
 use rdkafka::admin::{
-    AdminClient, AdminOptions, AlterConfig, ConfigSource, NewTopic, ResourceSpecifier, TopicReplication,
+    AdminClient, AdminOptions, AlterConfig, ConfigResource, ConfigSource, NewTopic, OwnedResourceSpecifier,
+    ResourceSpecifier, TopicReplication,
 };
 use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
@@ -88,6 +89,20 @@ impl Admin {
             .filter(|(_, code)| *code != RDKafkaErrorCode::TopicAlreadyExists)
             .map(|(name, code)| (Arc::from(name), code))
             .collect())
+    }
+
+    /// The largest batches that the server takes of topics, in bytes; of those that it tells.
+    pub(super) fn largest_batches(&self, topics: &[Arc<str>]) -> Result<Vec<(Arc<str>, usize)>, KafkaError> {
+        let resources: Vec<ResourceSpecifier<'_>> = topics.iter().map(|name| ResourceSpecifier::Topic(name)).collect();
+        let found = block_on(self.0.describe_configs(&resources, &Self::options()))?;
+        let limit = |config: ConfigResource| {
+            let OwnedResourceSpecifier::Topic(name) = &config.specifier else {
+                return None;
+            };
+            let bytes = config.get("max.message.bytes")?.value.as_deref()?.parse().ok()?;
+            Some((Arc::from(name.as_str()), bytes))
+        };
+        Ok(found.into_iter().filter_map(Result::ok).filter_map(limit).collect())
     }
 
     /// Lets a topic that is there keep the last value of each key; its other settings stay.

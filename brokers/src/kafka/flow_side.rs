@@ -11,7 +11,7 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use rdkafka::error::RDKafkaErrorCode;
 
-use super::admin::{Admin, Purpose};
+use super::admin::Purpose;
 use super::directory::Listing;
 use super::identity::TopicUuid;
 use super::inner::Inner;
@@ -45,6 +45,7 @@ const MAX_DEPTH: u32 = 10_000;
 
 /// A topic that is to be there.
 struct Prepared {
+    channel: ChannelName,
     topic: Arc<Topic>,
     depth: u32,
     /// Whether it is known to keep what it shall.
@@ -64,9 +65,10 @@ pub(super) struct FlowState {
     listed: Mutex<HashSet<Arc<str>>>,
     /// Topics that could not be made, told once.
     refused: Mutex<HashMap<Arc<str>, (RDKafkaErrorCode, Instant)>>,
+    /// Channels whose name somebody else's topic has, to be told.
+    collisions: Mutex<Vec<(ChannelName, String)>>,
     /// What was asked to be made in the last round.
     asked: Mutex<HashSet<Arc<str>>>,
-    admin: Mutex<Option<Arc<Admin>>>,
 }
 
 impl FlowState {
@@ -81,24 +83,9 @@ impl FlowState {
             stood_back: Mutex::default(),
             listed: Mutex::default(),
             refused: Mutex::default(),
+            collisions: Mutex::default(),
             asked: Mutex::default(),
-            admin: Mutex::default(),
         }
-    }
-
-    /// Ends the client that makes topics. Blocks meanwhile.
-    pub(super) fn close(&self) {
-        let admin = self.admin.lock().take();
-        drop(admin);
-    }
-
-    fn admin(&self, inner: &Inner) -> Result<Arc<Admin>, String> {
-        let mut admin = self.admin.lock();
-        if let Some(admin) = &*admin {
-            return Ok(Arc::clone(admin));
-        }
-        let made = Admin::new(&inner.settings, &inner.last_error).map_err(|error| error.to_string())?;
-        Ok(Arc::clone(admin.insert(Arc::new(made))))
     }
 
     /// Makes what is missing. Fails where what the flow itself needs could not be made; a topic of a service that cannot be
@@ -109,11 +96,12 @@ impl FlowState {
             .iter()
             .map(|(name, _)| Arc::from(name.as_str()))
             .collect();
+        self.refuse_collisions(&there);
         let missing = self.missing(&there);
         *self.listed.lock() = there;
         let needs = missing.iter().any(|(name, _)| self.is_needed(name));
         if !missing.is_empty() {
-            match self.admin(inner)?.make(&missing) {
+            match inner.admin()?.make(&missing) {
                 Ok(refused) => self.note_refused(&missing, &refused)?,
                 Err(error) if needs => return Err(error.to_string()),
                 Err(error) => tracing::warn!(%error, topics = missing.len(), "topics could not be made, trying on"),
@@ -134,6 +122,22 @@ impl FlowState {
         } else {
             Made::Topics
         })
+    }
+
+    /// What was prepared before its name was known to be taken is no longer made.
+    fn refuse_collisions(&self, there: &HashSet<Arc<str>>) {
+        let mut prepared = self.prepared.lock();
+        let mut gone = Vec::new();
+        for name in prepared.keys().filter(|name| !there.contains(*name)) {
+            let other = there.iter().find(|other| collide(name, other));
+            gone.extend(other.map(|other| (Arc::clone(name), other.to_string())));
+        }
+        for (name, other) in gone {
+            if let Some(prepared) = prepared.remove(&name) {
+                tracing::warn!(topic = %name, other, "their names are one to Kafka: the topic is not made");
+                self.collisions.lock().push((prepared.channel, other));
+            }
+        }
     }
 
     /// Whether the flow itself cannot do without a topic.
@@ -204,8 +208,8 @@ impl FlowState {
                 .collect()
         };
         for name in to_check {
-            let done = self
-                .admin(inner)
+            let done = inner
+                .admin()
                 .and_then(|admin| admin.keep_last_values(&name).map_err(|error| error.to_string()));
             match done {
                 Ok(()) => {
@@ -289,12 +293,13 @@ impl FlowSide for KafkaFlowSide {
             let listed = state.listed.lock();
             let other = prepared.keys().chain(listed.iter()).find(|other| collide(&name, other));
             if let Some(other) = other {
-                return Err(BrokerError::Name {
+                return Err(BrokerError::Collision {
                     channel: channel.to_string(),
-                    reason: format!("its topic {name} and the topic {other} collide on Kafka"),
+                    other: other.to_string(),
                 });
             }
             let new = Prepared {
+                channel: channel.clone(),
                 topic: self.inner.topics.of(&name, false).0,
                 depth,
                 keeps: false,
@@ -305,6 +310,10 @@ impl FlowSide for KafkaFlowSide {
         state.refused.lock().remove(&name);
         self.inner.bell.ring();
         Ok(())
+    }
+
+    fn take_collisions(&self) -> Vec<(ChannelName, String)> {
+        std::mem::take(&mut *self.state.collisions.lock())
     }
 
     fn release(&self, channel: &ChannelName) {

@@ -12,6 +12,7 @@ use rdkafka::message::Message as _;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use super::admin::Admin;
 use super::bell::Bell;
 use super::clock::BrokerClock;
 use super::consumer::{Consumer, Refused, Source};
@@ -72,6 +73,7 @@ pub(super) struct Inner {
     pub(super) clients: Mutex<Clients>,
     pub(super) flow: Option<Arc<FlowState>>,
     pub(super) cluster: Once,
+    pub(super) admin: Mutex<Option<Arc<Admin>>>,
     pub(super) status: watch::Sender<BrokerStatus>,
     pub(super) was_up: AtomicBool,
     /// Whether it was told that the server did not answer from the beginning.
@@ -85,6 +87,22 @@ pub(super) struct Inner {
 impl Inner {
     pub(super) fn is_closed(&self) -> bool {
         self.closed.load(Ordering::Acquire)
+    }
+
+    /// The client that makes topics and asks for their settings, made at first use.
+    pub(super) fn admin(&self) -> Result<Arc<Admin>, String> {
+        let mut admin = self.admin.lock();
+        if let Some(admin) = &*admin {
+            return Ok(Arc::clone(admin));
+        }
+        let made = Admin::new(&self.settings, &self.last_error).map_err(|error| error.to_string())?;
+        Ok(Arc::clone(admin.insert(Arc::new(made))))
+    }
+
+    /// Ends that client. Blocks meanwhile.
+    pub(super) fn close_admin(&self) {
+        let admin = self.admin.lock().take();
+        drop(admin);
     }
 
     pub(super) fn consumers(&self) -> Vec<Arc<Consumer>> {

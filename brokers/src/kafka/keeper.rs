@@ -9,6 +9,7 @@ use super::consumer::Consumer;
 use super::directory::Listing;
 use super::flow_side::Made;
 use super::inner::Inner;
+use super::topics::Topic;
 
 /// How long the server has for an answer.
 const ANSWER: Duration = Duration::from_secs(1);
@@ -16,6 +17,8 @@ const ANSWER: Duration = Duration::from_secs(1);
 const CALM: Duration = Duration::from_millis(700);
 /// How often while something is missing.
 const BUSY: Duration = Duration::from_millis(200);
+/// Topics whose largest batch is asked for at once.
+const MAX_ASKED: usize = 512;
 /// Topics that a service asks for one by one in a round.
 const PER_ROUND: usize = 8;
 
@@ -30,9 +33,7 @@ pub(super) fn run(inner: &Inner) {
         }
     }
     inner.directory.close();
-    if let Some(flow) = &inner.flow {
-        flow.close();
-    }
+    inner.close_admin();
 }
 
 /// Asks once and acts on the answer. Returns whether nothing is missing.
@@ -90,16 +91,44 @@ fn found(inner: &Inner, brokers: usize) {
 fn note_topics(inner: &Inner, listing: &Listing) {
     let came = if inner.flow.is_some() {
         let listed: HashMap<&str, usize> = listing.topics.iter().map(|(name, n)| (name.as_str(), *n)).collect();
+        learn_limits(inner, |topic| listed.contains_key(&*topic.name));
         inner.topics.note_all(&listed)
     } else {
-        inner.topics.absent(PER_ROUND).iter().fold(false, |came, name| {
-            let found = inner.directory.list(Some(name), ANSWER).unwrap_or_default();
-            let note = |(topic, partitions): &(String, usize)| inner.topics.note(topic, *partitions);
-            came | found.topics.iter().any(note)
+        let found: Vec<(String, usize)> = inner
+            .topics
+            .absent(PER_ROUND)
+            .iter()
+            .flat_map(|name| inner.directory.list(Some(name), ANSWER).unwrap_or_default().topics)
+            .collect();
+        let is_found = |topic: &Topic| found.iter().any(|(name, _)| **name == *topic.name);
+        learn_limits(inner, |topic| topic.partitions().is_some() || is_found(topic));
+        found.iter().fold(false, |came, (name, partitions)| {
+            came | inner.topics.note(name, *partitions)
         })
     };
     if came || !inner.was_up.load(Ordering::Acquire) {
         inner.wake_writers();
+    }
+}
+
+/// Asks for the largest batch of topics that are new, before anything is written to them.
+fn learn_limits(inner: &Inner, is_there: impl Fn(&Topic) -> bool) {
+    let names = inner.topics.without_limit(is_there, MAX_ASKED);
+    if names.is_empty() {
+        return;
+    }
+    let found = inner
+        .admin()
+        .and_then(|admin| admin.largest_batches(&names).map_err(|error| error.to_string()));
+    let limits: HashMap<Arc<str>, usize> = match found {
+        Ok(limits) => limits.into_iter().collect(),
+        Err(error) => {
+            tracing::debug!(error, topics = names.len(), "the largest batches are not known");
+            HashMap::new()
+        }
+    };
+    for name in names {
+        inner.topics.note_limit(&name, limits.get(&name).copied());
     }
 }
 

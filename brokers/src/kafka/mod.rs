@@ -121,6 +121,7 @@ impl KafkaBroker {
             last_error,
             clients: Mutex::default(),
             flow,
+            admin: Mutex::default(),
             cluster: Once::default(),
             status: watch::Sender::new(connecting),
             was_up: AtomicBool::new(false),

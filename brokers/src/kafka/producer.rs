@@ -202,10 +202,23 @@ impl Producer {
             let Some(client) = self.client.lock().clone() else {
                 return;
             };
-            let is_ready = |to: &Target| to.topic.partitions().is_some() && self.gate.lets(to.topic.stays_open);
+            // Topics with small batches have one turn in each take: what of them is handed over goes together.
+            let mut limited: Vec<Arc<str>> = Vec::new();
+            let allowance = |to: &Target| {
+                let topic = &to.topic;
+                let open = topic.partitions().is_some() && self.gate.lets(topic.stays_open);
+                let allowed = topic.allowance().filter(|_| open)?;
+                if allowed != usize::MAX {
+                    if limited.contains(&topic.name) {
+                        return None;
+                    }
+                    limited.push(Arc::clone(&topic.name));
+                }
+                Some(allowed)
+            };
             let room = WINDOW - in_flight;
             self.outbox
-                .take_ready(Instant::now(), BATCH, room, in_flight == 0, is_ready, taken);
+                .take_ready(Instant::now(), BATCH, room, in_flight == 0, allowance, taken);
             if taken.is_empty() {
                 return;
             }
@@ -230,10 +243,12 @@ impl Producer {
         record.partition = ready.partition;
         record.headers = ready.headers;
         self.context.in_flight.fetch_add(bytes, Ordering::AcqRel);
+        topic.note_in_flight(true);
         if let Err((error, record)) = client.send(record)
             && let Delivery::Message { receipt, .. } = *record.delivery_opaque
         {
             receipt.settle(self.context.failed(&error, &topic));
+            topic.note_in_flight(false);
             self.context.in_flight.fetch_sub(bytes, Ordering::AcqRel);
         }
     }

@@ -1,11 +1,13 @@
 //! The topics that are written, and whether the server has them.
 
 use std::collections::HashMap;
-use std::sync::atomic::{AtomicI32, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI32, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
 
+/// Bytes of a batch that no batch of ours reaches: twice `batch.size`, for what a record has beside its payload.
+const ROOMY: usize = 1_000_000;
 /// Not known to exist.
 const ABSENT: i32 = 0;
 
@@ -15,6 +17,12 @@ pub(super) struct Topic {
     /// Its name on the server.
     pub(super) name: Arc<str>,
     partitions: AtomicI32,
+    /// Largest batch that the server takes, in bytes; 0 = not known.
+    largest_batch: AtomicUsize,
+    /// The server is to be asked for it, also where it was before.
+    asks_limit: AtomicBool,
+    /// Messages that are with the client library and not acknowledged.
+    in_flight: AtomicUsize,
     /// Written also while the scope belongs to another flow.
     pub(super) stays_open: bool,
 }
@@ -26,8 +34,45 @@ impl Topic {
         (partitions != ABSENT).then_some(partitions)
     }
 
+    /// Bytes that may be handed over now, by the sizes that an outbox counts; `None` = nothing.
+    ///
+    /// The server's limit counts the whole batch that the client library makes of what it has. Where that could be too large,
+    /// only what fits is handed over, and more when it is acknowledged: a message is refused for its own size alone.
+    pub(super) fn allowance(&self) -> Option<usize> {
+        let limit = self.largest_batch.load(Ordering::Acquire);
+        if limit == 0 || limit >= ROOMY {
+            return Some(usize::MAX);
+        }
+        // On the wire a small message with its headers has up to twice what the outbox counts.
+        (self.in_flight.load(Ordering::Acquire) == 0).then_some(limit / 2)
+    }
+
+    /// Messages are handed over, or no longer with the client library.
+    pub(super) fn note_in_flight(&self, begins: bool) {
+        if begins {
+            self.in_flight.fetch_add(1, Ordering::AcqRel);
+        } else {
+            self.in_flight.fetch_sub(1, Ordering::AcqRel);
+        }
+    }
+
+    /// The server refused a message for its size. Where that was thought to be impossible, messages go one by one until the
+    /// server has told its limit.
+    pub(super) fn doubt_limit(&self) {
+        if self.allowance() == Some(usize::MAX) {
+            self.largest_batch.store(1, Ordering::Release);
+        }
+        self.asks_limit.store(true, Ordering::Release);
+    }
+
+    fn forget_limit(&self) {
+        self.largest_batch.store(0, Ordering::Release);
+        self.asks_limit.store(true, Ordering::Release);
+    }
+
     /// The server says that there is no such topic.
     pub(super) fn vanished(&self) {
+        self.forget_limit();
         self.partitions.store(ABSENT, Ordering::Release);
     }
 }
@@ -53,6 +98,9 @@ impl Topics {
         let topic = Arc::new(Topic {
             name: Arc::clone(name),
             partitions: AtomicI32::new(ABSENT),
+            largest_batch: AtomicUsize::new(0),
+            asks_limit: AtomicBool::new(true),
+            in_flight: AtomicUsize::new(0),
             stays_open,
         });
         by_name.insert(Arc::clone(name), Arc::downgrade(&topic));
@@ -77,12 +125,33 @@ impl Topics {
         names
     }
 
+    /// Up to `limit` topics whose largest batch the server is to be asked for, of those that it has.
+    pub(super) fn without_limit(&self, is_there: impl Fn(&Topic) -> bool, limit: usize) -> Vec<Arc<str>> {
+        let by_name = self.by_name.lock();
+        let unknown = |topic: &Arc<Topic>| topic.asks_limit.load(Ordering::Acquire) && is_there(topic);
+        let topics = by_name.values().filter_map(Weak::upgrade).filter(unknown);
+        topics.map(|topic| Arc::clone(&topic.name)).take(limit).collect()
+    }
+
+    /// The server takes batches of so many bytes; `None` = it does not say.
+    pub(super) fn note_limit(&self, name: &str, bytes: Option<usize>) {
+        if let Some(topic) = self.by_name.lock().get(name).and_then(Weak::upgrade) {
+            topic.asks_limit.store(false, Ordering::Release);
+            if let Some(bytes) = bytes {
+                topic.largest_batch.store(bytes, Ordering::Release);
+            }
+        }
+    }
+
     /// The server has a topic with so many partitions, or none of that name. Returns whether it came.
     pub(super) fn note(&self, name: &str, partitions: usize) -> bool {
         let Some(topic) = self.by_name.lock().get(name).and_then(Weak::upgrade) else {
             return false;
         };
         let partitions = i32::try_from(partitions).unwrap_or(i32::MAX);
+        if partitions == ABSENT {
+            topic.forget_limit();
+        }
         topic.partitions.swap(partitions, Ordering::AcqRel) == ABSENT && partitions != ABSENT
     }
 
@@ -118,6 +187,35 @@ mod tests {
         assert!(topics.note_all(&HashMap::from([("a", 1)])));
         drop(topic);
         assert!(topics.of(&name, false).1, "it was forgotten with its last publisher");
+    }
+
+    #[test]
+    fn a_topic_with_small_batches_gets_what_fits_when_nothing_is_on_its_way() {
+        let topics = Topics::default();
+        let (topic, _) = topics.of(&Arc::from("a"), false);
+        assert_eq!(topic.allowance(), Some(usize::MAX), "not known");
+        assert_eq!(topics.without_limit(|_| true, 8).len(), 1);
+        topics.note_limit("a", Some(10_000));
+        assert!(topics.without_limit(|_| true, 8).is_empty());
+        assert_eq!(topic.allowance(), Some(5_000));
+        topic.note_in_flight(true);
+        assert_eq!(topic.allowance(), None);
+        topic.note_in_flight(false);
+        assert_eq!(topic.allowance(), Some(5_000));
+        topic.doubt_limit();
+        assert_eq!(topic.allowance(), Some(5_000), "a message was too large by itself");
+        assert_eq!(topics.without_limit(|_| true, 8).len(), 1);
+        topics.note_limit("a", Some(17_825_792));
+        assert_eq!(topic.allowance(), Some(usize::MAX));
+        topic.doubt_limit();
+        assert_eq!(topic.allowance(), Some(0), "one by one");
+        topics.note("a", 0);
+        assert_eq!(topic.allowance(), Some(usize::MAX), "made anew it has another");
+        topics.note_limit("a", None);
+        assert!(
+            topics.without_limit(|_| true, 8).is_empty(),
+            "not asked again and again"
+        );
     }
 
     #[test]

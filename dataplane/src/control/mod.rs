@@ -235,6 +235,12 @@ impl ControlCore {
         self.touch_all(now);
     }
 
+    /// The layer broker has a topic of somebody else's with the name that this one would have: it is blocked there.
+    pub fn refuse_name(&mut self, now: Instant, topic: TopicName, other: String) {
+        self.registry.note_foreign_name(&topic, other);
+        self.touch(now, BTreeSet::from([topic]));
+    }
+
     /// Takes in nothing more: every bridge drains.
     pub fn start_draining(&mut self, now: Instant, wall_ms: u64) {
         self.set_state(now, FlowState::Draining);

@@ -124,6 +124,9 @@ impl ControlCore {
                 }
                 None => {
                     self.scopes.prepared.remove(&key);
+                    if scope == Scope::Layer {
+                        self.registry.forget_foreign_name(topic);
+                    }
                     self.outputs.push_back(Output::Release { scope, channel });
                 }
             }

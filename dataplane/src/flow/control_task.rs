@@ -90,6 +90,10 @@ impl ControlTask {
 
     fn work(&mut self) {
         let now = Instant::now();
+        let collisions = self.side(Scope::Layer).map(|side| side.take_collisions());
+        for (channel, other) in collisions.unwrap_or_default() {
+            self.refuse_name(now, &channel, other);
+        }
         let mut outputs = Vec::new();
         {
             let mut control = self.shared.control.lock();
@@ -169,6 +173,9 @@ impl ControlTask {
                     && let Err(error) = side.prepare(&channel, depth)
                 {
                     tracing::warn!(%channel, %scope, %error, "the broker cannot have this channel");
+                    if let BrokerError::Collision { other, .. } = error {
+                        self.refuse_name(now, &channel, other);
+                    }
                 }
             }
             Output::Release { scope, channel } => {
@@ -176,6 +183,12 @@ impl ControlTask {
                     side.release(&channel);
                 }
             }
+        }
+    }
+
+    fn refuse_name(&self, now: Instant, channel: &ChannelName, other: String) {
+        if let Ok(topic) = channel.as_str().parse() {
+            self.shared.control.lock().refuse_name(now, topic, other);
         }
     }
 

@@ -272,7 +272,7 @@ impl SourceTask {
                         tracing::warn!(channel = %self.channel, scope = %self.scope, %error, "cannot subscribe, trying on");
                     }
                     *self.state.lock() = match error {
-                        BrokerError::Name { .. } | BrokerError::TooManyChannels(_) => {
+                        BrokerError::Name { .. } | BrokerError::Collision { .. } | BrokerError::TooManyChannels(_) => {
                             SourceState::Failed(error.to_string())
                         }
                         BrokerError::Away(_) | BrokerError::Closed => SourceState::Starting,

@@ -185,10 +185,7 @@ impl DataCore {
 
     /// Puts a mark into the counters of every bridge: what happened since the one before is "lately".
     pub fn mark(&mut self) {
-        for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
-            bridge.settle();
-            bridge.stats.mark();
-        }
+        self.topics.iter_mut().for_each(TopicPath::mark);
     }
 
     /// Changes what counts as large, from the next message on.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WriterId};
+use blaze_domain::{DropReason, FlowId, LayerName, Priority, Scope, TopicName, WriterId};
 
 use super::core::FORGET;
 use super::measure::RateMeter;
@@ -198,6 +198,8 @@ pub struct TopicPath {
     pub in_rate: RateMeter,
     /// Dropped before any bridge: echoes, duplicates, what could not be read.
     pub ingress_drops: Drops,
+    /// Those at two moments, so that what happened lately can be told.
+    ingress_marks: [Drops; 2],
     /// Identity that the flow gives to bare messages, per source scope.
     pub bare: BTreeMap<Scope, (WriterId, u64)>,
     /// Since when nobody has used it.
@@ -217,10 +219,27 @@ impl TopicPath {
             largest_bytes: 0,
             in_rate: RateMeter::new(now),
             ingress_drops: Drops::default(),
+            ingress_marks: Default::default(),
             bare: BTreeMap::new(),
             idle: None,
             vacant: false,
         }
+    }
+
+    /// Puts a mark into all counters.
+    pub(super) fn mark(&mut self) {
+        let mark = self.ingress_drops.clone();
+        self.ingress_marks = [std::mem::take(&mut self.ingress_marks[1]), mark];
+        for bridge in &mut self.bridges {
+            bridge.settle();
+            bridge.stats.mark();
+        }
+    }
+
+    /// What was dropped before any bridge since the mark before the last, by reason.
+    #[must_use]
+    pub fn ingress_lately(&self) -> Vec<(DropReason, u64)> {
+        self.ingress_drops.since(&self.ingress_marks[0])
     }
 
     /// Whether nothing goes through it and nothing waits.

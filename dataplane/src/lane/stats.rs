@@ -51,6 +51,13 @@ impl Drops {
             .filter(|(_, count)| *count > 0)
     }
 
+    /// What came since an earlier moment, by reason.
+    #[must_use]
+    pub fn since(&self, before: &Self) -> Vec<(DropReason, u64)> {
+        let new = self.iter().map(|(reason, count)| (reason, count - before.get(reason)));
+        new.filter(|(_, count)| *count > 0).collect()
+    }
+
     /// All of them.
     #[must_use]
     pub fn total(&self) -> u64 {
@@ -106,14 +113,10 @@ impl BridgeStats {
     #[must_use]
     pub fn lately(&self) -> Lately {
         let before = &self.marks[0];
-        let dropped = self
-            .dropped
-            .iter()
-            .map(|(reason, count)| (reason, count - before.dropped.get(reason)));
         Lately {
             taken: self.taken.messages - before.taken,
             out: self.out.messages - before.out,
-            dropped: dropped.filter(|(_, count)| *count > 0).collect(),
+            dropped: self.dropped.since(&before.dropped),
         }
     }
 

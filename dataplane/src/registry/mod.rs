@@ -243,6 +243,16 @@ impl Registry {
         Ok(())
     }
 
+    /// The layer broker has a topic of somebody else's that it would not tell apart from this one.
+    pub fn note_foreign_name(&mut self, topic: &TopicName, other: String) {
+        self.names.note_foreign(topic, other);
+    }
+
+    /// Nobody uses the topic on the layer broker any more.
+    pub fn forget_foreign_name(&mut self, topic: &TopicName) {
+        self.names.forget_foreign(topic);
+    }
+
     /// No bridge of this flow uses the topic on the layer scope any more.
     pub fn take_off_layer(&mut self, topic: &TopicName) {
         self.on_layer.remove(topic);

@@ -10,6 +10,9 @@ const MAX_KAFKA_NAME: usize = 249;
 /// Names that are remembered before those of topics that nobody uses are forgotten.
 const FIRST_SWEEP: usize = 1024;
 
+/// Topics that somebody else's on the broker stands in the way of, at most; as many as a flow has leases.
+const MAX_FOREIGN: usize = 10_000;
+
 /// How the layer broker names topics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum LayerNames {
@@ -55,6 +58,8 @@ impl NameFault {
 pub(super) struct NameBook {
     names: LayerNames,
     holders: HashMap<String, TopicName>,
+    /// Topics whose name somebody else's on the broker has, and that name.
+    foreign: HashMap<TopicName, String>,
     sweep_at: usize,
 }
 
@@ -63,6 +68,7 @@ impl NameBook {
         Self {
             names,
             holders: HashMap::new(),
+            foreign: HashMap::new(),
             sweep_at: FIRST_SWEEP,
         }
     }
@@ -75,6 +81,9 @@ impl NameBook {
         let bytes = prefix_bytes + topic.as_str().len();
         if bytes > MAX_KAFKA_NAME {
             return Err(NameFault::TooLong { bytes });
+        }
+        if let Some(other) = self.foreign.get(topic) {
+            return Err(NameFault::Collision { other: other.clone() });
         }
         let key = kafka_key(topic.as_str());
         if let Some(reserved) = reserved().into_iter().find(|name| kafka_key(name) == key) {
@@ -97,6 +106,20 @@ impl NameBook {
         }
         self.holders.insert(key, topic.clone());
         Ok(())
+    }
+}
+
+impl NameBook {
+    /// The broker has a topic, made by somebody else, that it would not tell apart from this one.
+    pub(super) fn note_foreign(&mut self, topic: &TopicName, other: String) {
+        if self.foreign.len() < MAX_FOREIGN {
+            self.foreign.insert(topic.clone(), other);
+        }
+    }
+
+    /// Nobody leases the topic any more: when somebody does again, the broker is asked anew.
+    pub(super) fn forget_foreign(&mut self, topic: &TopicName) {
+        self.foreign.remove(topic);
     }
 }
 

@@ -191,7 +191,11 @@ impl<'w> Explainer<'_, 'w> {
             entry.is_some_and(|entry| entry.node.advertise.is_some() || entry.layer.advertise.is_some())
         });
         let (flow, code, detail) = match lost {
-            Some((id, flow)) => (id, absent(flow), absence(id, flow)),
+            // A flow that waits for its broker is not merely starting.
+            Some((id, flow)) => match self.broker_fault().filter(|_| id == self.view.me) {
+                Some((code, detail)) => (id, code, detail),
+                None => (id, absent(flow), absence(id, flow)),
+            },
             None => self.missing(StepKind::Advertise, WhyCode::NoAdvertise, || {
                 "nobody advertises it".to_owned()
             }),
@@ -268,17 +272,14 @@ impl<'w> Explainer<'_, 'w> {
         in_node(requester) && (to.node.is_none() || requester.scope == Scope::Node || !node_asks())
     }
 
-    /// Why a lease is missing: nobody is heard on a scope that is another flow's, it lapsed, or there never was one.
+    /// Why a lease is missing: nobody is heard on a scope that is another flow's or whose broker is away, it lapsed, or there
+    /// never was one.
     fn missing(&self, kind: StepKind, code: WhyCode, nobody: impl Fn() -> String) -> (&FlowId, WhyCode, String) {
         let me = self.view.me;
         let to = self.input.to.as_ref().filter(|_| kind == StepKind::Request);
-        let brokers = [&self.input.node_broker, &self.input.layer_broker];
-        let mut in_use = brokers
-            .into_iter()
-            .flatten()
-            .filter(|broker| broker.health == BrokerHealth::InUse);
+        // Who is on a scope that is not read is not heard.
         if to.is_none_or(|to| to.layer == me.layer)
-            && let Some((code, detail)) = in_use.find_map(fault)
+            && let Some((code, detail)) = self.broker_fault()
         {
             return (me, code, detail);
         }
@@ -286,6 +287,12 @@ impl<'w> Explainer<'_, 'w> {
             Some(hint) => (&hint.flow, hint.code, format!("{} of {}", hint.code, hint.service)),
             None => (me, code, nobody()),
         }
+    }
+
+    /// What is wrong with the own brokers.
+    fn broker_fault(&self) -> Option<(WhyCode, String)> {
+        let brokers = [&self.input.node_broker, &self.input.layer_broker];
+        brokers.into_iter().flatten().find_map(fault)
     }
 
     fn hint(&self, kind: StepKind) -> Option<&LeaseHint> {

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::time::Duration;
 
 use blaze_tests::flow::{FlowProcess, FlowSpec};
-use blaze_tests::plain::{KafkaReader, KafkaWriter, delete_topic};
+use blaze_tests::plain::{KafkaReader, KafkaWriter, delete_topic, make_topic};
 use blaze_tests::servers::{
     KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis, unique_name,
 };
@@ -12,7 +12,7 @@ use blaze_tests::wait;
 use serde_json::json;
 
 use crate::stream::Stream;
-use crate::support::{RedisReader, RobotAndCloud, SOON, turn};
+use crate::support::{RedisReader, RobotAndCloud, SOON, connect, turn};
 
 const TOPIC: &str = "imu/data";
 
@@ -169,6 +169,100 @@ fn two_layers_on_one_kafka_are_not_silent() -> anyhow::Result<()> {
     // With a prefix of its own each layer has its scope.
     let other = FlowProcess::start(FlowSpec::new("fog", "fog-2").on_kafka(&kafka.bootstrap(), "fog."))?;
     assert!(other.admin().ready() && cloud.admin().ready());
+    Ok(())
+}
+
+/// A topic that somebody else made takes small batches only: messages are refused for their own size, never for their company.
+#[test]
+fn a_burst_into_a_topic_with_small_batches_is_whole() -> anyhow::Result<()> {
+    const SMALL: u64 = 1_000;
+    let _turn = turn();
+    let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
+    make_topic(&system.kafka, &system.topic(TOPIC), &[("max.message.bytes", "10000")])?;
+    let records = KafkaReader::from_end(&system.kafka, &system.topic(TOPIC))?;
+    system.tell_robot(
+        &json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","reliability":"reliable","ttl_s":0}),
+    )?;
+    system.tell_cloud(&json!({"op":"request","topic":TOPIC,"service":"logger","reliability":"reliable","ttl_s":0}))?;
+    system.cloud.wait_bridge(TOPIC, SOON)?;
+    system.robot.wait_bridge(TOPIC, SOON)?;
+    let mut connection = connect(&system.redis)?;
+    let mut burst = redis::pipe();
+    for number in 0..SMALL {
+        if number == SMALL / 2 {
+            burst.cmd("PUBLISH").arg(system.channel(TOPIC)).arg(vec![b'x'; 20_000]);
+        }
+        burst
+            .cmd("PUBLISH")
+            .arg(system.channel(TOPIC))
+            .arg(format!("{number:0100}"));
+    }
+    let heard: Vec<i64> = burst.query(&mut connection)?;
+    assert!(heard.iter().all(|heard| *heard == 1));
+    let mut arrived = Vec::new();
+    while arrived.len() < SMALL as usize {
+        let record = records.next(SOON);
+        let record = record.ok_or_else(|| anyhow::anyhow!("{} came\n{:?}", arrived.len(), system.cloud.bridges()))?;
+        arrived.push(record.text().parse::<u64>()?);
+    }
+    assert_eq!(arrived, (0..SMALL).collect::<Vec<_>>());
+    wait::until(
+        "the large one is counted",
+        SOON,
+        || {
+            system
+                .cloud
+                .bridges()
+                .iter()
+                .any(|bridge| bridge["dropped"]["too_large"] == 1)
+        },
+        || format!("{:?}", system.cloud.bridges()),
+    )?;
+    Ok(())
+}
+
+/// What is refused before it reaches a bridge is named as well.
+#[test]
+fn why_names_what_is_too_large_for_any_bridge() -> anyhow::Result<()> {
+    let _turn = turn();
+    let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
+    system.tell_robot(&json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","ttl_s":0}))?;
+    system.tell_cloud(&json!({"op":"request","topic":TOPIC,"service":"logger","ttl_s":0}))?;
+    system.robot.wait_bridge(TOPIC, SOON)?;
+    let large = vec![b'x'; 16 * 1024 * 1024 + 1];
+    wait::until(
+        "why names it",
+        SOON,
+        || {
+            let _ = system.publish(TOPIC, &large);
+            let why = system.robot.why(TOPIC, None);
+            why.is_ok_and(|why| why["code"] == "too_large" && why["verdict"] == "not_flowing")
+        },
+        || format!("{:?}", system.robot.why(TOPIC, None)),
+    )?;
+    Ok(())
+}
+
+/// Somebody else's topic has the name that this one would have.
+#[test]
+fn a_foreign_topic_that_collides_blocks_and_is_named() -> anyhow::Result<()> {
+    let _turn = turn();
+    let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
+    make_topic(&system.kafka, &system.topic("ext_y"), &[])?;
+    let replies = KafkaReader::from_end(&system.kafka, &system.topic("blaze/reply"))?;
+    system.tell_robot(&json!({"op":"advertise","topic":"ext/y","service":"a","ttl_s":0}))?;
+    let request = json!({"op":"request","topic":"ext/y","service":"b","id":"1","reply_to":"blaze/reply/x","ttl_s":0});
+    wait::until(
+        "it is refused, and why says so",
+        SOON,
+        || {
+            let _ = system.tell_cloud(&request);
+            let answer = replies.next(SOON).map(|record| record.text()).unwrap_or_default();
+            let why = system.cloud.why("ext/y", None);
+            answer.contains("name_collision") && why.is_ok_and(|why| why["code"] == "name_collision")
+        },
+        || format!("{:?}", system.cloud.why("ext/y", None)),
+    )?;
     Ok(())
 }
 

@@ -111,6 +111,7 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
                     Err((error, _)) => self.0.failed(error, &topic),
                 };
                 receipt.settle(fate);
+                topic.note_in_flight(false);
                 self.0.in_flight.fetch_sub(bytes, Ordering::AcqRel);
                 // The feeder may come when the room is counted.
                 drop(batch);
@@ -144,6 +145,9 @@ impl WriteContext {
             )
         ) {
             topic.vanished();
+        }
+        if reason_of(code) == DropReason::TooLarge {
+            topic.doubt_limit();
         }
         if matches!(code, Some(RDKafkaErrorCode::Fatal)) {
             self.fatal.store(true, Ordering::Release);

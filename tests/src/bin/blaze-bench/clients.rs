@@ -2,10 +2,8 @@
 
 use std::time::Duration;
 
-use anyhow::Context;
 use blaze_tests::plain::RedisReader;
 use rdkafka::ClientConfig;
-use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, TopicReplication};
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
 use rdkafka::message::Message as _;
 use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
@@ -164,20 +162,5 @@ impl Sink for KafkaSink {
             }
         }
         Ok(())
-    }
-}
-
-/// Makes a topic as the flow does.
-pub(crate) fn make_topic(bootstrap: &str, topic: &str) -> anyhow::Result<()> {
-    let admin: AdminClient<_> = ClientConfig::new().set("bootstrap.servers", bootstrap).create()?;
-    let new = NewTopic::new(topic, 1, TopicReplication::Fixed(1))
-        .set("max.message.bytes", "17825792")
-        .set("retention.bytes", "268435456")
-        .set("segment.bytes", "67108864");
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let made = runtime.block_on(admin.create_topics(&[new], &AdminOptions::new()))?;
-    match made.into_iter().next().context("no answer")? {
-        Ok(_) | Err((_, rdkafka::types::RDKafkaErrorCode::TopicAlreadyExists)) => Ok(()),
-        Err((topic, code)) => anyhow::bail!("topic {topic}: {code}"),
     }
 }

@@ -16,7 +16,7 @@ mod load;
 use std::time::Duration;
 
 use anyhow::Context;
-use blaze_tests::plain::RedisReader;
+use blaze_tests::plain::{RedisReader, make_topic};
 use blaze_tests::servers;
 use clap::Parser;
 
@@ -114,7 +114,12 @@ fn measure(
     let flows = match kind {
         PathKind::RedisAlone => None,
         PathKind::KafkaAlone => {
-            clients::make_topic(kafka, &kafka_topic)?;
+            let settings = [
+                ("max.message.bytes", "17825792"),
+                ("retention.bytes", "268435456"),
+                ("segment.bytes", "67108864"),
+            ];
+            make_topic(kafka, &kafka_topic, &settings)?;
             None
         }
         PathKind::OneFlow | PathKind::TwoFlows => Some(Flows::start(&Route {

@@ -104,7 +104,10 @@ async fn names_that_collide_or_are_too_long_are_refused() {
     let one: ChannelName = format!("{stem}/data").parse().unwrap();
     let other: ChannelName = format!("{stem}_data").parse().unwrap();
     flow.side.prepare(&one, 0).unwrap();
-    assert!(matches!(flow.side.prepare(&other, 0), Err(BrokerError::Name { .. })));
+    assert!(matches!(
+        flow.side.prepare(&other, 0),
+        Err(BrokerError::Collision { .. })
+    ));
     let long =
         blaze_brokers::kafka::KafkaBroker::open(&super::section(&server, &"p".repeat(60)), &Role::Service).unwrap();
     let channel: ChannelName = "t".repeat(200).parse().unwrap();
