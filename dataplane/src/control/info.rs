@@ -27,6 +27,7 @@ pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
             .map(|(rate, _)| rate)
             .sum::<Option<f64>>()
             .filter(|_| !all.is_empty()),
+        access: registry.access_of(topic),
     }
 }
 

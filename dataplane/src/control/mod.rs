@@ -18,6 +18,7 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::control::EventKind;
 use blaze_domain::names::ChannelName;
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
 use blaze_proto::link::link_control::Body;
 use bytes::Bytes;
@@ -126,6 +127,8 @@ pub struct ControlConfig {
     pub lease_stores: BTreeSet<Scope>,
     /// Rules of the node file.
     pub rules: PlanRules,
+    /// Who may advertise and request what.
+    pub access: AccessRules,
 }
 
 struct Dirty {
@@ -169,6 +172,7 @@ impl ControlCore {
             layer_answers_need_id: config.layer_answers_need_id,
             layer_names: config.layer_names,
             lease_stores: config.lease_stores.clone(),
+            access: config.access.clone(),
             started: now,
         });
         Self {
@@ -233,6 +237,19 @@ impl ControlCore {
     pub fn set_rules(&mut self, now: Instant, rules: PlanRules) {
         self.config.rules = rules;
         self.touch_all(now);
+    }
+
+    /// Changes who may advertise and request what. Leases that are no longer allowed end.
+    pub fn set_access(&mut self, now: Instant, wall_ms: u64, access: AccessRules) {
+        let ended = self.registry.set_access(now, access);
+        for event in &ended.events {
+            self.tell(event, wall_ms);
+        }
+        for topic in &ended.changed {
+            self.update_channels(topic);
+        }
+        self.save_leases();
+        self.touch(now, ended.changed);
     }
 
     /// Takes in nothing more: every bridge drains.

@@ -72,7 +72,7 @@ impl DataCore {
             Scope::Layer | Scope::Inter => born_here && !own_layer,
         };
         // Before the window takes the number: a foreign message must not silence the writer whose name it bears.
-        if foreign {
+        if foreign || !self.path(topic).info.takes(&frame) {
             return Err(DropReason::ForeignOrigin);
         }
         if !self.is_new(topic, &frame) {

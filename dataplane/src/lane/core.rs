@@ -235,6 +235,8 @@ impl DataCore {
         let own_layer = frame.origin_layer() == self.config.me.layer.as_str();
         let refused = if own_layer && frame.origin_node() == self.config.me.node.as_str() {
             Some(DropReason::Echo)
+        } else if !self.path(topic).info.takes(&frame) {
+            Some(DropReason::ForeignOrigin)
         } else if !self.is_new(topic, &frame) {
             Some(DropReason::Duplicate)
         } else {

@@ -3,7 +3,10 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+use blaze_domain::control::LeaseKind;
+use blaze_domain::node_file::TopicAccess;
 use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WriterId};
+use blaze_proto::Frame;
 
 use super::core::FORGET;
 use super::measure::RateMeter;
@@ -28,6 +31,8 @@ pub struct TopicInfo {
     pub max_bytes: Option<u64>,
     /// Advertised rate in Hz, summed over the writers; `None` where one of them gives none.
     pub rate_hz: Option<f64>,
+    /// Whose messages are taken: the rules of `flow.access`.
+    pub access: TopicAccess,
 }
 
 /// What the advertisements of one scope say of messages that come without a header.
@@ -50,6 +55,13 @@ pub struct BareInfo {
 }
 
 impl TopicInfo {
+    /// Whether the rules let the origin of a message publish it.
+    #[must_use]
+    pub(super) fn takes(&self, frame: &Frame) -> bool {
+        let origin = (frame.origin_layer(), frame.origin_node(), frame.origin_service());
+        self.access.allows(LeaseKind::Advertise, origin.0, origin.1, origin.2)
+    }
+
     /// What is said on the scope that a bare message came from.
     #[must_use]
     pub fn bare(&self, from: Scope) -> &BareInfo {

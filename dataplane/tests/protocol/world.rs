@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{Content, PublishOutcome, Publisher, PublisherOptions, Received};
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::names::ChannelName;
 use blaze_domain::{FlowId, LayerKind, Origin, Priority, Scope, TopicName, WriterId};
 use blaze_flow::control::{ControlConfig, ControlCore, Output};
@@ -197,6 +198,7 @@ impl<'a> Simulation<'a> {
                 layer_names: LayerNames::Any,
                 lease_stores: BTreeSet::new(),
                 rules: PlanRules::default(),
+                access: AccessRules::default(),
             },
             self.now,
         );
