@@ -27,8 +27,8 @@ use crate::lane::path::TopicInfo;
 use crate::link::LinkEvent;
 use crate::plan::{PlanRules, TopicPlan, plan_topic};
 use crate::registry::{EventDraft, LayerNames, Registry, RegistryConfig, UnsavedLease};
-use crate::world::{FlowState, LayerScopeId, Reach, World};
-use info::local_info;
+use crate::world::{FlowState, LayerScopeId, OriginFilter, Reach, World};
+use info::{durable_sources, local_info};
 use routes::route_states;
 pub use scopes::ScopeHealth;
 use scopes::{LOCAL, Scopes};
@@ -86,6 +86,13 @@ pub enum Output {
     },
     /// Let the broker of a scope keep or forget a lease.
     SaveLease(UnsavedLease),
+    /// Forget what is kept of writers for late joiners: their service no longer advertises the topic.
+    ForgetWriters {
+        /// The topic.
+        topic: TopicName,
+        /// Whose.
+        of: OriginFilter,
+    },
     /// Let the broker of a scope make a channel.
     Prepare {
         /// Node or layer.
@@ -148,6 +155,8 @@ pub struct ControlCore {
     reconciled: Instant,
     announced: (u64, u64),
     scopes: Scopes,
+    /// Who advertises which topic as transient_local, in any flow.
+    durable: BTreeMap<TopicName, BTreeSet<OriginFilter>>,
     /// Where other flows say that they are found.
     addresses: BTreeMap<FlowId, String>,
     /// Control payloads or parts of them that were refused.
@@ -186,6 +195,7 @@ impl ControlCore {
             reconciled: now,
             announced: (0, 0),
             scopes: Scopes::default(),
+            durable: BTreeMap::new(),
             addresses: BTreeMap::new(),
             refused: 0,
             overrun: 0,
@@ -392,6 +402,7 @@ impl ControlCore {
         let world = self.registry.world();
         let mut plan = plan_topic(world, topic, &self.config.rules, previous);
         let had_route = previous.is_some_and(|plan| !plan.bridges.is_empty());
+        let durable = durable_sources(world, topic);
         let fault = if plan.uses_layer() {
             self.registry.put_on_layer(topic).err()
         } else {
@@ -403,6 +414,7 @@ impl ControlCore {
         if !plan.uses_layer() {
             self.registry.take_off_layer(topic);
         }
+        self.forget_writers(topic, durable);
         let has_route = !plan.bridges.is_empty();
         let world = self.registry.world();
         let info = Box::new(local_info(&self.registry, topic));
@@ -427,6 +439,20 @@ impl ControlCore {
                 EventKind::RouteDown
             };
             self.tell(&draft(kind, Some(topic.clone())), wall_ms);
+        }
+    }
+
+    /// Notes who advertises a topic as transient_local; what is kept of those who no longer do is to be forgotten.
+    fn forget_writers(&mut self, topic: &TopicName, durable: BTreeSet<OriginFilter>) {
+        let before = self.durable.remove(topic).unwrap_or_default();
+        for gone in before.difference(&durable) {
+            self.outputs.push_back(Output::ForgetWriters {
+                topic: topic.clone(),
+                of: gone.clone(),
+            });
+        }
+        if !durable.is_empty() {
+            self.durable.insert(topic.clone(), durable);
         }
     }
 

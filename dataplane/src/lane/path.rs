@@ -251,11 +251,16 @@ impl TopicPath {
         }
     }
 
+    /// Whether its messages are large, as seen or as advertised.
+    #[must_use]
+    pub fn is_large(&self, large_bytes: u64) -> bool {
+        self.largest_bytes.max(self.info.max_bytes.unwrap_or(0)) > large_bytes
+    }
+
     /// Class of a lane: bulk if the topic is large, else as the lane says, else state.
     #[must_use]
     pub fn class(&self, lane: &LaneSpec, large_bytes: u64) -> Priority {
-        let large = self.largest_bytes.max(self.info.max_bytes.unwrap_or(0)) > large_bytes;
-        if large {
+        if self.is_large(large_bytes) {
             Priority::Bulk
         } else {
             lane.priority.unwrap_or(Priority::State)
@@ -268,6 +273,14 @@ impl TopicPath {
         self.bridges
             .iter()
             .any(|bridge| bridge.from == Scope::Inter && bridge.takes())
+    }
+
+    /// Whether a bridge from that scope takes what was published before it.
+    #[must_use]
+    pub fn reads_kept(&self, scope: Scope) -> bool {
+        self.bridges
+            .iter()
+            .any(|bridge| bridge.from == scope && bridge.takes() && bridge.lane.durable)
     }
 
     /// Whether a bridge takes messages in from that scope.

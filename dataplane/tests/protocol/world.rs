@@ -499,6 +499,7 @@ impl<'a> Simulation<'a> {
                     content,
                     at: now,
                     broker_age_us: 0,
+                    kept: false,
                 }];
                 flow.plane.ingest(now, wall, id, *scope, &mut batch);
             }

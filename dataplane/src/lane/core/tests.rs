@@ -132,6 +132,7 @@ impl Bench {
                 content,
                 at: self.now,
                 broker_age_us: 0,
+                kept: false,
             })
             .collect();
         self.core
