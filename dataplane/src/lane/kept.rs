@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::num::NonZeroUsize;
 use std::time::Instant;
 
-use blaze_domain::{Scope, WriterId};
+use blaze_domain::{Origin, Scope, WriterId};
 use blaze_proto::Frame;
 use lru::LruCache;
 
@@ -120,17 +120,20 @@ impl KeptMessages {
 
     /// A service has begun a new life: the writers of its earlier ones are no more.
     fn supersede(&mut self, topic: TopicId, newer: &Frame) {
-        let origin = |frame: &Frame| {
-            let (layer, node) = (frame.origin_layer().to_owned(), frame.origin_node().to_owned());
-            (layer, node, frame.origin_service().to_owned(), frame.origin_instance().to_owned())
-        };
-        let of = origin(newer);
+        let life = newer.origin();
         // Without a service it is not known whose it is.
-        if of.2.is_empty() {
+        if life.service.is_empty() {
             return;
         }
         let gone = self.remove(|(at, _), writer| {
-            let earlier = |kept: &Kept| kept.frame.origin_epoch() < newer.origin_epoch() && origin(&kept.frame) == of;
+            let earlier = |kept: &Kept| {
+                let origin = kept.frame.origin();
+                let same = Origin {
+                    epoch: life.epoch,
+                    ..origin.clone()
+                };
+                origin.epoch < life.epoch && same == life
+            };
             *at == topic && writer.messages.back().is_some_and(earlier)
         });
         let room = MAX_SUPERSEDED.saturating_sub(self.superseded.len());
@@ -196,7 +199,6 @@ fn bytes_of(writer: &Writer) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use blaze_domain::Origin;
     use blaze_proto::Header;
     use bytes::Bytes;
     use std::time::Duration;

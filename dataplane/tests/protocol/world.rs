@@ -524,7 +524,8 @@ impl<'a> Simulation<'a> {
                 | Output::LayerScope { .. }
                 | Output::SaveLease(_)
                 | Output::Prepare { .. }
-                | Output::Release { .. } => {}
+                | Output::Release { .. }
+                | Output::ForgetWriters { .. } => {}
                 Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
                 Output::Announce { version, digest } => engine.set_registry(now, version, digest),
                 Output::State(state) => engine.set_state(now, hello_state(state)),
