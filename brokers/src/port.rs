@@ -171,6 +171,8 @@ pub struct Received {
     pub at: Instant,
     /// Microseconds that it lay on the server before, where the server tells (Kafka append time).
     pub broker_age_us: u64,
+    /// It was published before the subscription and kept for late joiners.
+    pub kept: bool,
 }
 
 /// What a publisher is for.

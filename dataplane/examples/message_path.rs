@@ -109,6 +109,7 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
                 content,
                 at: Instant::now(),
                 broker_age_us: 0,
+                kept: false,
             });
         }
         let start = Instant::now();

@@ -33,6 +33,8 @@ pub struct FlowSpec {
     pub limit_mbps: f64,
     /// Further lines of the node file.
     pub extra: String,
+    /// More keys of `flow`, such as `access: […]`.
+    pub flow: String,
 }
 
 impl FlowSpec {
@@ -48,6 +50,7 @@ impl FlowSpec {
             domain: None,
             limit_mbps: 160.0,
             extra: String::new(),
+            flow: String::new(),
         }
     }
 
@@ -97,8 +100,9 @@ impl FlowSpec {
         }
         let _ = write!(
             text,
-            "admin: {{ flow: \"127.0.0.1:0\" }}\nflow: {{ bandwidth: {{ limit_mbps: {} }} }}\nstate_dir: {}\n{}",
+            "admin: {{ flow: \"127.0.0.1:0\" }}\nflow: {{ bandwidth: {{ limit_mbps: {} }}, {} }}\nstate_dir: {}\n{}",
             self.limit_mbps,
+            self.flow,
             state.display(),
             self.extra
         );

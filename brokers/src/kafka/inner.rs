@@ -269,7 +269,7 @@ impl Inner {
                 let key = message.key()?;
                 record::is_kept(key).then(|| receive(channel, message, payload, None, &self.clock))
             })?;
-            let mut kept = || -> Vec<Received> { reader.take_latest().into_iter().map(|(_, kept)| kept).collect() };
+            let mut kept = || -> Vec<Received> { reader.take_latest().into_iter().map(|(_, message)| as_kept(message)).collect() };
             match consumer.add(&source, &info, starts, sender.clone(), Some(&mut kept)) {
                 Ok(()) => return Ok(subscription),
                 Err(Refused::Behind(next)) => ends = next,
@@ -313,6 +313,10 @@ impl Inner {
         }
         self.set_status(Health::Closed, "closed".to_owned());
     }
+}
+
+fn as_kept(message: Received) -> Received {
+    Received { kept: true, ..message }
 }
 
 impl From<LookupError> for BrokerError {

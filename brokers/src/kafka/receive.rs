@@ -37,6 +37,7 @@ pub(super) fn receive(
         content,
         at,
         broker_age_us,
+        kept: false,
     }
 }
 

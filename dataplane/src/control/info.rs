@@ -1,10 +1,13 @@
 //! What local advertisements say of a topic.
 
+use std::collections::BTreeSet;
+
 use blaze_domain::control::DEFAULT_ENCODING;
 use blaze_domain::{Durability, Reliability, Scope, TopicName};
 
 use crate::lane::path::{BareInfo, TopicInfo};
 use crate::registry::{LeaseView, Registry, Terms};
+use crate::world::{OriginFilter, World};
 
 /// What the advertisements of a topic on this flow's own brokers say.
 pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
@@ -27,7 +30,28 @@ pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
             .map(|(rate, _)| rate)
             .sum::<Option<f64>>()
             .filter(|_| !all.is_empty()),
+        access: registry.access_of(topic),
     }
+}
+
+/// Who advertises a topic as transient_local, on any flow that is not forgotten. One that is down is still one of them: its
+/// services may well live.
+pub(super) fn durable_sources(world: &World, topic: &TopicName) -> BTreeSet<OriginFilter> {
+    let mut found = BTreeSet::new();
+    for (flow, view) in &world.flows {
+        let Some(entry) = view.topics.get(topic) else {
+            continue;
+        };
+        let offers = [&entry.node, &entry.layer].into_iter().filter_map(|scope| scope.advertise.as_ref());
+        for offer in offers.filter(|offer| offer.durability == Durability::TransientLocal) {
+            found.extend(offer.sources.iter().map(|source| OriginFilter {
+                layer: Some(flow.layer.to_string()),
+                node: Some(source.node.clone()),
+                service: Some(source.service.clone()),
+            }));
+        }
+    }
+    found
 }
 
 /// The header of what comes without one from a scope: where several advertise, nobody knows who of them it was.

@@ -18,6 +18,7 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::control::EventKind;
 use blaze_domain::names::ChannelName;
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
 use blaze_proto::link::link_control::Body;
 use bytes::Bytes;
@@ -26,8 +27,8 @@ use crate::lane::path::TopicInfo;
 use crate::link::LinkEvent;
 use crate::plan::{PlanRules, TopicPlan, plan_topic};
 use crate::registry::{EventDraft, LayerNames, Registry, RegistryConfig, UnsavedLease};
-use crate::world::{FlowState, LayerScopeId, Reach, World};
-use info::local_info;
+use crate::world::{FlowState, LayerScopeId, OriginFilter, Reach, World};
+use info::{durable_sources, local_info};
 use routes::route_states;
 pub use scopes::ScopeHealth;
 use scopes::{LOCAL, Scopes};
@@ -85,6 +86,13 @@ pub enum Output {
     },
     /// Let the broker of a scope keep or forget a lease.
     SaveLease(UnsavedLease),
+    /// Forget what is kept of writers for late joiners: their service no longer advertises the topic.
+    ForgetWriters {
+        /// The topic.
+        topic: TopicName,
+        /// Whose.
+        of: OriginFilter,
+    },
     /// Let the broker of a scope make a channel.
     Prepare {
         /// Node or layer.
@@ -126,6 +134,8 @@ pub struct ControlConfig {
     pub lease_stores: BTreeSet<Scope>,
     /// Rules of the node file.
     pub rules: PlanRules,
+    /// Who may advertise and request what.
+    pub access: AccessRules,
 }
 
 struct Dirty {
@@ -145,6 +155,8 @@ pub struct ControlCore {
     reconciled: Instant,
     announced: (u64, u64),
     scopes: Scopes,
+    /// Who advertises which topic as transient_local, in any flow.
+    durable: BTreeMap<TopicName, BTreeSet<OriginFilter>>,
     /// Where other flows say that they are found.
     addresses: BTreeMap<FlowId, String>,
     /// Control payloads or parts of them that were refused.
@@ -169,6 +181,7 @@ impl ControlCore {
             layer_answers_need_id: config.layer_answers_need_id,
             layer_names: config.layer_names,
             lease_stores: config.lease_stores.clone(),
+            access: config.access.clone(),
             started: now,
         });
         Self {
@@ -182,6 +195,7 @@ impl ControlCore {
             reconciled: now,
             announced: (0, 0),
             scopes: Scopes::default(),
+            durable: BTreeMap::new(),
             addresses: BTreeMap::new(),
             refused: 0,
             overrun: 0,
@@ -239,6 +253,19 @@ impl ControlCore {
     pub fn refuse_name(&mut self, now: Instant, topic: TopicName, other: String) {
         self.registry.note_foreign_name(&topic, other);
         self.touch(now, BTreeSet::from([topic]));
+    }
+
+    /// Changes who may advertise and request what. Leases that are no longer allowed end.
+    pub fn set_access(&mut self, now: Instant, wall_ms: u64, access: AccessRules) {
+        let ended = self.registry.set_access(now, access);
+        for event in &ended.events {
+            self.tell(event, wall_ms);
+        }
+        for topic in &ended.changed {
+            self.update_channels(topic);
+        }
+        self.save_leases();
+        self.touch(now, ended.changed);
     }
 
     /// Takes in nothing more: every bridge drains.
@@ -381,6 +408,7 @@ impl ControlCore {
         let world = self.registry.world();
         let mut plan = plan_topic(world, topic, &self.config.rules, previous);
         let had_route = previous.is_some_and(|plan| !plan.bridges.is_empty());
+        let durable = durable_sources(world, topic);
         let fault = if plan.uses_layer() {
             self.registry.put_on_layer(topic).err()
         } else {
@@ -392,6 +420,7 @@ impl ControlCore {
         if !plan.uses_layer() {
             self.registry.take_off_layer(topic);
         }
+        self.forget_writers(topic, durable);
         let has_route = !plan.bridges.is_empty();
         let world = self.registry.world();
         let info = Box::new(local_info(&self.registry, topic));
@@ -416,6 +445,20 @@ impl ControlCore {
                 EventKind::RouteDown
             };
             self.tell(&draft(kind, Some(topic.clone())), wall_ms);
+        }
+    }
+
+    /// Notes who advertises a topic as transient_local; what is kept of those who no longer do is to be forgotten.
+    fn forget_writers(&mut self, topic: &TopicName, durable: BTreeSet<OriginFilter>) {
+        let before = self.durable.remove(topic).unwrap_or_default();
+        for gone in before.difference(&durable) {
+            self.outputs.push_back(Output::ForgetWriters {
+                topic: topic.clone(),
+                of: gone.clone(),
+            });
+        }
+        if !durable.is_empty() {
+            self.durable.insert(topic.clone(), durable);
         }
     }
 

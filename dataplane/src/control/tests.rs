@@ -1,10 +1,12 @@
 //! The control core as a flow with real brokers drives it.
 
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::LayerKind;
 use serde_json::{Value, json};
 
 use super::*;
 use crate::plan::Bridge;
+use crate::registry::LapseReason;
 
 struct Bench {
     core: ControlCore,
@@ -27,6 +29,7 @@ impl Bench {
             layer_names: LayerNames::Kafka { prefix_bytes: 0 },
             lease_stores: BTreeSet::from(LOCAL),
             rules: PlanRules::default(),
+            access: AccessRules::default(),
         };
         Self {
             core: ControlCore::new(config, now),
@@ -280,4 +283,69 @@ fn other_flows_are_told_of_brokers_that_are_away() {
     assert_eq!(bench.routes("t"), state("deliver", "broker_down"));
     bench.core.set_scope_health(bench.now, Scope::Node, ScopeHealth::Away);
     assert_eq!(bench.routes("t"), state("bridge", "broker_down"));
+}
+
+/// The rules of a node file.
+fn access(rules: Value) -> AccessRules {
+    let file = json!({
+        "layer": {"name": "fog", "kind": "fog"}, "node": {"name": "fog-1"}, "brokers": {"node": {"memory": {}}},
+        "flow": {"access": rules},
+    });
+    let (file, _) = blaze_domain::node_file::NodeFile::read(&file).unwrap();
+    file.flow.access
+}
+
+#[test]
+fn who_may_not_advertise_is_told_and_leaves_no_lease() {
+    let mut bench = Bench::ready();
+    let rules = access(json!([{"match": "cmd/**", "advertise": {"allow": ["*/*/joystick"]}}]));
+    bench.core.set_access(bench.now, 0, rules);
+    let mut denied = lease("advertise", "cmd/vel");
+    denied["service"] = "planner".into();
+    denied["reply_to"] = "blaze/reply/planner".into();
+    bench.send(Scope::Node, &denied);
+    let answers: Vec<Value> = bench
+        .outputs
+        .drain(..)
+        .filter_map(|output| match output {
+            Output::Publish { channel, body, .. } if channel.as_str().starts_with("blaze/reply") => {
+                Some(serde_json::from_slice(&body).unwrap())
+            }
+            _ => None,
+        })
+        .collect();
+    let [answer] = answers.as_slice() else {
+        panic!("{answers:?}")
+    };
+    assert_eq!(answer["error"]["code"], "access_denied", "{answer}");
+    assert_eq!(answer["error"]["pointer"], "/service");
+    assert_eq!(bench.core.registry().lease_count(), 0);
+    assert_eq!(bench.core.refused, 1);
+    let topic = "cmd/vel".parse().unwrap();
+    let reasons: Vec<LapseReason> = bench.core.registry().lapsed(&topic).map(|lease| lease.reason).collect();
+    assert_eq!(reasons, [LapseReason::Denied]);
+    let mut allowed = lease("advertise", "cmd/vel");
+    allowed["service"] = "joystick".into();
+    bench.send(Scope::Node, &allowed);
+    bench.send(Scope::Node, &lease("request", "cmd/vel"));
+    assert_eq!(bench.core.registry().lease_count(), 2, "requests have no rule");
+}
+
+#[test]
+fn leases_that_new_rules_do_not_allow_end() {
+    let mut bench = Bench::ready();
+    bench.send(Scope::Node, &lease("advertise", "cmd/vel"));
+    bench.send(Scope::Layer, &lease("request", "cmd/vel"));
+    bench.step(300);
+    assert_eq!(bench.bridges("cmd/vel"), ["node>Layer"]);
+    bench
+        .core
+        .set_access(bench.now, 0, access(json!([{"match": "cmd/*", "request": {"allow": []}}])));
+    bench.step(300);
+    assert_eq!(bench.bridges("cmd/vel"), [""; 0]);
+    assert_eq!(bench.core.registry().lease_count(), 1);
+    bench.core.set_access(bench.now, 0, AccessRules::default());
+    bench.send(Scope::Layer, &lease("request", "cmd/vel"));
+    bench.step(300);
+    assert_eq!(bench.bridges("cmd/vel"), ["node>Layer"]);
 }

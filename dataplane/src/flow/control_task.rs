@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use blaze_brokers::{
     Broker, BrokerError, Content, FlowSide, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
 };
-use blaze_domain::Scope;
 use blaze_domain::names::ChannelName;
+use blaze_domain::{Scope, TopicName, WriterId};
 use blaze_proto::link::link_control::{LayerScope, State as HelloState};
 use bytes::Bytes;
 use tokio::sync::Notify;
@@ -116,6 +116,9 @@ impl ControlTask {
         for output in outputs {
             self.carry_out(now, output);
         }
+        for (topic, writer) in self.shared.plane.with(|state| state.core.take_superseded()) {
+            self.forget_writer(&topic, writer);
+        }
         // A flow without an inter scope has no pacer that would do it.
         self.shared.plane.with(|state| state.run_timers(now));
     }
@@ -178,6 +181,15 @@ impl ControlTask {
                     }
                 }
             }
+            Output::ForgetWriters { topic, of } => {
+                let writers = plane.with(|state| {
+                    let id = state.core.find(topic.as_str())?;
+                    Some(state.core.forget_writers(id, &of))
+                });
+                for writer in writers.into_iter().flatten() {
+                    self.forget_writer(&topic, writer);
+                }
+            }
             Output::Release { scope, channel } => {
                 if let Some(side) = self.side(scope) {
                     side.release(&channel);
@@ -189,6 +201,13 @@ impl ControlTask {
     fn refuse_name(&self, now: Instant, channel: &ChannelName, other: String) {
         if let Ok(topic) = channel.as_str().parse() {
             self.shared.control.lock().refuse_name(now, topic, other);
+        }
+    }
+
+    /// What the own brokers keep of a writer goes.
+    fn forget_writer(&self, topic: &TopicName, writer: WriterId) {
+        for side in [Scope::Node, Scope::Layer].into_iter().filter_map(|scope| self.side(scope)) {
+            side.forget_writer(&topic.into(), writer);
         }
     }
 

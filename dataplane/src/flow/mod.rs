@@ -270,6 +270,7 @@ pub async fn start_with(
             },
             lease_stores: brokers.lease_stores(),
             rules: settings.live.rules.clone(),
+            access: settings.live.access.clone(),
         },
         now,
     );
@@ -368,7 +369,11 @@ impl RunningFlow {
         self.shared
             .plane
             .read(|state| state.core.set_large_bytes(live.large_bytes));
-        self.shared.control.lock().set_rules(now, live.rules.clone());
+        {
+            let mut control = self.shared.control.lock();
+            control.set_rules(now, live.rules.clone());
+            control.set_access(now, wall_ns() / 1_000_000, live.access.clone());
+        }
         *self.shared.live.lock() = live;
     }
 

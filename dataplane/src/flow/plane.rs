@@ -72,10 +72,11 @@ impl PlaneState {
         }
     }
 
-    /// Delivers what came over the link before the bridges of a topic stood.
-    pub fn deliver_early(&mut self, now: Instant, topic: TopicId) {
-        if let Some(engine) = &mut self.engine {
-            self.core.deliver_early(now, topic, engine);
+    /// Delivers what waited for the bridges of a topic.
+    pub fn deliver_waiting(&mut self, now: Instant, topic: TopicId) {
+        match &mut self.engine {
+            Some(engine) => self.core.deliver_waiting(now, topic, engine),
+            None => self.core.deliver_waiting(now, topic, &mut NoLink),
         }
     }
 

@@ -63,6 +63,7 @@ struct Source {
     task: TaskHandle,
     state: Arc<Mutex<SourceState>>,
     large: bool,
+    with_kept: bool,
 }
 
 /// Writers and source tasks of one flow.
@@ -120,16 +121,22 @@ impl Routes {
                     .position(|(from, to, _)| (*from, *to) == (bridge.from, &bridge.to));
                 made.map_or_else(|| Err(String::new()), |at| writers.swap_remove(at).2)
             });
-            state.deliver_early(now, id);
+            state.deliver_waiting(now, id);
             let path = state.core.path(id);
-            Some((id, [Scope::Node, Scope::Layer].map(|scope| (scope, path.reads(scope)))))
+            let reads = |scope| (scope, path.reads(scope), path.reads_kept(scope));
+            Some((id, [Scope::Node, Scope::Layer].map(reads)))
         });
         let Some((id, reads)) = applied else {
             tracing::error!(%topic, "too many topics: this one is not carried");
             return;
         };
-        for (scope, wanted) in reads {
-            self.read(id, topic, scope, wanted, large);
+        for (scope, wanted, with_kept) in reads {
+            let options = SubscribeOptions {
+                large,
+                with_kept,
+                ..SubscribeOptions::default()
+            };
+            self.read(id, topic, scope, wanted, options);
         }
     }
 
@@ -191,7 +198,7 @@ impl Routes {
         Ok(NewWriter { publisher, options })
     }
 
-    fn read(&self, id: TopicId, topic: &TopicName, scope: Scope, wanted: bool, large: bool) {
+    fn read(&self, id: TopicId, topic: &TopicName, scope: Scope, wanted: bool, options: SubscribeOptions) {
         let mut sources = self.sources.lock();
         let held = sources.remove(&(id, scope));
         if !wanted {
@@ -201,12 +208,14 @@ impl Routes {
             return;
         }
         let before = match held {
-            Some(source) if source.large == large => {
+            // Who has begun with what was kept has it.
+            Some(source) if source.large == options.large && (source.with_kept || !options.with_kept) => {
                 sources.insert((id, scope), source);
                 return;
             }
             Some(source) => {
-                tracing::info!(%topic, %scope, large, "the subscription moves to the connection for its size");
+                let (large, with_kept) = (options.large, options.with_kept);
+                tracing::info!(%topic, %scope, large, with_kept, "subscribed anew: for the size, or for what is kept");
                 source.task.stop();
                 Some(source.task)
             }
@@ -220,16 +229,20 @@ impl Routes {
             channel: topic.into(),
             topic: id,
             scope,
-            options: SubscribeOptions {
-                large,
-                ..SubscribeOptions::default()
-            },
+            options,
             state: Arc::clone(&state),
             before,
         };
         let name = format!("source {scope} {topic}");
         let task = self.supervisor.spawn(name, TaskPolicy::Essential, source.run());
-        sources.insert((id, scope), Source { task, state, large });
+        let (large, with_kept) = (options.large, options.with_kept);
+        let source = Source {
+            task,
+            state,
+            large,
+            with_kept,
+        };
+        sources.insert((id, scope), source);
     }
 }
 

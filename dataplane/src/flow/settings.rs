@@ -2,7 +2,7 @@
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
-use blaze_domain::node_file::{Chunking, FlowSection, NodeFile};
+use blaze_domain::node_file::{AccessRules, Chunking, FlowSection, NodeFile};
 use blaze_domain::{FlowId, LayerKind};
 
 use crate::limit::budget_bytes_per_s;
@@ -34,6 +34,8 @@ pub struct LiveSettings {
     pub large_bytes: u64,
     /// Rules for topics.
     pub rules: PlanRules,
+    /// Who may advertise and request what.
+    pub access: AccessRules,
 }
 
 impl LiveSettings {
@@ -52,6 +54,7 @@ impl From<&FlowSection> for LiveSettings {
             rules: PlanRules {
                 topics: flow.topics.clone(),
             },
+            access: flow.access.clone(),
         }
     }
 }

@@ -18,6 +18,7 @@ use super::routes::SourceState;
 use crate::control::ControlCore;
 use crate::lane::path::{BridgeState as Bridge, Phase};
 use crate::plan::TopicPlan;
+use crate::registry::{LapseReason, LapsedLease};
 use crate::why::{
     BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, StepKind, WhyInput, WhyTarget, explain,
 };
@@ -167,14 +168,17 @@ fn route_of(flow: &blaze_domain::FlowId, route: &RouteState) -> Option<RouteFact
 
 fn lease_hints(shared: &Shared, control: &ControlCore, topic: &TopicName) -> Vec<LeaseHint> {
     let lapsed = control.registry().lapsed(topic).take(MAX_HINTS);
-    let hint = |lapsed: &crate::registry::LapsedLease| LeaseHint {
+    let hint = |lapsed: &LapsedLease| LeaseHint {
         flow: shared.me.clone(),
         kind: match lapsed.key.kind {
             LeaseKind::Advertise => StepKind::Advertise,
             LeaseKind::Request => StepKind::Request,
         },
         service: lapsed.key.service.to_string(),
-        code: WhyCode::LeaseExpired,
+        code: match lapsed.reason {
+            LapseReason::Expired => WhyCode::LeaseExpired,
+            LapseReason::Denied => WhyCode::AccessDenied,
+        },
     };
     lapsed.map(hint).collect()
 }

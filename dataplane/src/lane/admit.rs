@@ -22,6 +22,8 @@ pub(super) struct Admitted {
     pub(super) age_us: u64,
     /// Since it came to this flow.
     pub(super) here_us: u64,
+    /// Published before its bridges were there: only for those that take what was kept.
+    pub(super) kept: bool,
 }
 
 impl Admitted {
@@ -33,6 +35,7 @@ impl Admitted {
             born_here,
             age_us,
             here_us,
+            kept: false,
         }
     }
 }
@@ -46,7 +49,7 @@ impl DataCore {
         from: Scope,
         received: Received,
     ) -> Result<Admitted, DropReason> {
-        let at = received.at;
+        let (at, kept) = (received.at, received.kept);
         let waited_us = received.broker_age_us + micros(now.saturating_duration_since(at));
         let (frame, bare) = match received.content {
             Content::Malformed { .. } => return Err(DropReason::DecodeError),
@@ -72,7 +75,7 @@ impl DataCore {
             Scope::Layer | Scope::Inter => born_here && !own_layer,
         };
         // Before the window takes the number: a foreign message must not silence the writer whose name it bears.
-        if foreign {
+        if foreign || !self.path(topic).info.takes(&frame) {
             return Err(DropReason::ForeignOrigin);
         }
         if !self.is_new(topic, &frame) {
@@ -93,7 +96,10 @@ impl DataCore {
         path.largest_bytes = path.largest_bytes.max(bytes);
         path.in_rate.add(now, bytes);
         let here_us = micros(now.saturating_duration_since(at));
-        Ok(Admitted::new(frame, born_here, age_us, here_us))
+        Ok(Admitted {
+            kept,
+            ..Admitted::new(frame, born_here, age_us, here_us)
+        })
     }
 
     /// Gives a bare payload its header.

@@ -34,10 +34,13 @@ impl BridgeState {
         }
     }
 
-    pub(super) fn renew(&mut self, now: Instant, planned: &Bridge) {
-        if let Phase::Draining { .. } | Phase::Ended = self.phase {
+    /// Takes what is planned now. Returns whether it begins to take messages in.
+    pub(super) fn renew(&mut self, now: Instant, planned: &Bridge) -> bool {
+        let begins = matches!(self.phase, Phase::Draining { .. } | Phase::Ended);
+        if begins {
             self.phase = Phase::Up { since: now };
         }
+        let begins = begins || (planned.lane.durable && !self.lane.durable);
         self.ended = None;
         match (planned.lane.max_rate_hz, &mut self.bucket) {
             (Some(rate), Some(bucket)) => bucket.set_rate(rate, now),
@@ -45,6 +48,7 @@ impl BridgeState {
             (None, bucket) => *bucket = None,
         }
         self.lane = planned.lane.clone();
+        begins
     }
 
     /// Gives a bridge to a local broker its writer, or says why there is none. One that it had goes on delivering.
@@ -110,6 +114,9 @@ impl BridgeState {
 
     /// Whether the message is meant for this bridge at all; what is not is not counted as taken.
     pub(super) fn wants(&self, message: &Admitted) -> bool {
+        if message.kept && !self.lane.durable {
+            return false;
+        }
         // What a flow wrote stays in the layer: only what was born here leaves for another one.
         if matches!(self.target, Target::Inter { .. }) && !message.born_here {
             return false;

@@ -19,6 +19,7 @@ use lru::LruCache;
 
 use super::admit::Admitted;
 use super::early::Early;
+use super::kept::KeptMessages;
 use super::measure::micros;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use super::places::topic_id;
@@ -90,6 +91,10 @@ pub struct DataCore {
     pub(super) draining: bool,
     /// Came over the link before their bridge stood.
     pub(super) early: Early,
+    /// Of transient_local writers, for bridges that begin later.
+    pub(super) kept: KeptMessages,
+    /// Durable bridges that have just begun: topic and place.
+    pub(super) begun: Vec<(TopicId, usize)>,
     /// What could not be attributed to a topic.
     pub unattributed: Drops,
     /// Windows that gave way to newer writers.
@@ -111,6 +116,8 @@ impl DataCore {
             free_lanes: Vec::new(),
             draining: false,
             early: Early::default(),
+            kept: KeptMessages::default(),
+            begun: Vec::new(),
             unattributed: Drops::default(),
             evicted_writers: 0,
         }
@@ -204,8 +211,11 @@ impl DataCore {
         link: &mut dyn LaneLink,
     ) {
         for received in batch.drain(..) {
+            let kept = received.kept;
             match self.check_local(now, wall_ns, topic, from, received) {
                 Ok(admitted) => self.fan_out(now, topic, from, &admitted, link),
+                // What a broker keeps is read again with each subscription.
+                Err(DropReason::Duplicate | DropReason::Echo) if kept => {}
                 Err(reason) => self.topics[topic.0 as usize].ingress_drops.add(reason, 1),
             }
         }
@@ -232,6 +242,8 @@ impl DataCore {
         let own_layer = frame.origin_layer() == self.config.me.layer.as_str();
         let refused = if own_layer && frame.origin_node() == self.config.me.node.as_str() {
             Some(DropReason::Echo)
+        } else if !self.path(topic).info.takes(&frame) {
+            Some(DropReason::ForeignOrigin)
         } else if !self.is_new(topic, &frame) {
             Some(DropReason::Duplicate)
         } else {
@@ -246,8 +258,10 @@ impl DataCore {
         self.fan_out(now, topic, Scope::Inter, &message, link);
     }
 
-    /// Delivers what came before the bridges of a topic stood. To be called after [`DataCore::apply`].
-    pub fn deliver_early(&mut self, now: Instant, topic: TopicId, link: &mut dyn LaneLink) {
+    /// Delivers what waited for the bridges of a topic: what is kept for late joiners, and what came over the link before
+    /// they stood. To be called after [`DataCore::apply`].
+    pub fn deliver_waiting(&mut self, now: Instant, topic: TopicId, link: &mut dyn LaneLink) {
+        self.deliver_kept(now, topic, link);
         let path = &self.topics[topic.0 as usize];
         if !path.delivers() {
             return;
@@ -341,9 +355,9 @@ impl DataCore {
     }
 
     fn fan_out(&mut self, now: Instant, topic: TopicId, from: Scope, message: &Admitted, link: &mut dyn LaneLink) {
-        let large_bytes = self.config.large_bytes;
+        self.kept.keep(now, topic, from, message);
         let path = &mut self.topics[topic.0 as usize];
-        let large = path.largest_bytes.max(path.info.max_bytes.unwrap_or(0)) > large_bytes;
+        let large = path.is_large(self.config.large_bytes);
         for bridge in path.bridges.iter_mut().filter(|bridge| bridge.from == from) {
             if bridge.takes() && bridge.wants(message) {
                 bridge.pass(now, topic, message, large, link);

@@ -4,6 +4,7 @@ mod admit;
 mod bridge;
 pub mod core;
 mod early;
+pub mod kept;
 pub mod measure;
 pub mod path;
 mod places;

@@ -3,7 +3,10 @@
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+use blaze_domain::control::LeaseKind;
+use blaze_domain::node_file::TopicAccess;
 use blaze_domain::{DropReason, FlowId, LayerName, Priority, Scope, TopicName, WriterId};
+use blaze_proto::Frame;
 
 use super::core::FORGET;
 use super::measure::RateMeter;
@@ -28,6 +31,8 @@ pub struct TopicInfo {
     pub max_bytes: Option<u64>,
     /// Advertised rate in Hz, summed over the writers; `None` where one of them gives none.
     pub rate_hz: Option<f64>,
+    /// Whose messages are taken: the rules of `flow.access`.
+    pub access: TopicAccess,
 }
 
 /// What the advertisements of one scope say of messages that come without a header.
@@ -50,6 +55,13 @@ pub struct BareInfo {
 }
 
 impl TopicInfo {
+    /// Whether the rules let the origin of a message publish it.
+    #[must_use]
+    pub(super) fn takes(&self, frame: &Frame) -> bool {
+        let origin = (frame.origin_layer(), frame.origin_node(), frame.origin_service());
+        self.access.allows(LeaseKind::Advertise, origin.0, origin.1, origin.2)
+    }
+
     /// What is said on the scope that a bare message came from.
     #[must_use]
     pub fn bare(&self, from: Scope) -> &BareInfo {
@@ -258,11 +270,16 @@ impl TopicPath {
         }
     }
 
+    /// Whether its messages are large, as seen or as advertised.
+    #[must_use]
+    pub fn is_large(&self, large_bytes: u64) -> bool {
+        self.largest_bytes.max(self.info.max_bytes.unwrap_or(0)) > large_bytes
+    }
+
     /// Class of a lane: bulk if the topic is large, else as the lane says, else state.
     #[must_use]
     pub fn class(&self, lane: &LaneSpec, large_bytes: u64) -> Priority {
-        let large = self.largest_bytes.max(self.info.max_bytes.unwrap_or(0)) > large_bytes;
-        if large {
+        if self.is_large(large_bytes) {
             Priority::Bulk
         } else {
             lane.priority.unwrap_or(Priority::State)
@@ -275,6 +292,14 @@ impl TopicPath {
         self.bridges
             .iter()
             .any(|bridge| bridge.from == Scope::Inter && bridge.takes())
+    }
+
+    /// Whether a bridge from that scope takes what was published before it.
+    #[must_use]
+    pub fn reads_kept(&self, scope: Scope) -> bool {
+        self.bridges
+            .iter()
+            .any(|bridge| bridge.from == scope && bridge.takes() && bridge.lane.durable)
     }
 
     /// Whether a bridge takes messages in from that scope.

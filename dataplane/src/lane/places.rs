@@ -3,13 +3,14 @@
 use std::collections::HashSet;
 use std::time::Instant;
 
-use blaze_domain::TopicName;
+use blaze_domain::{TopicName, WriterId};
 
-use super::core::{DRAIN, DataCore, FORGET, MAX_TOPICS};
+use super::core::{DRAIN, DataCore, FORGET, LaneLink, MAX_TOPICS};
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
 use super::writer::NewWriter;
 use crate::link::LaneId;
 use crate::plan::{Bridge, Target, TopicPlan};
+use crate::world::OriginFilter;
 
 impl DataCore {
     /// Forgets topics that nobody has used for [`FORGET`]; to be called every few seconds. Returns how many.
@@ -39,6 +40,7 @@ impl DataCore {
             for key in gone {
                 self.windows.pop(&key);
             }
+            self.kept.forget_topics(|topic| forgotten.contains(&topic));
         }
         forgotten.len()
     }
@@ -91,21 +93,55 @@ impl DataCore {
             }
         }
         for planned in &plan.bridges {
-            let at = self.place_of(now, topic, planned);
+            let (at, is_new) = self.place_of(now, topic, planned);
             let bridge = &mut self.topics[topic.0 as usize].bridges[at];
-            bridge.renew(now, planned);
+            let begins = bridge.renew(now, planned) || is_new;
             if let Sink::Publish { .. } = bridge.sink {
                 bridge.set_writer(now, writer(planned));
+            }
+            if begins && bridge.lane.durable {
+                self.begun.push((topic, at));
             }
         }
     }
 
-    /// Where the bridge is in its topic; it is made where there is none yet.
-    fn place_of(&mut self, now: Instant, topic: TopicId, planned: &Bridge) -> usize {
+    /// Gives bridges of a topic that have begun what was kept for them. To be called after [`DataCore::apply`].
+    pub(super) fn deliver_kept(&mut self, now: Instant, topic: TopicId, link: &mut dyn LaneLink) {
+        let begun = std::mem::take(&mut self.begun);
+        let (mine, others): (Vec<_>, Vec<_>) = begun.into_iter().partition(|(of, _)| *of == topic);
+        self.begun = others;
+        for (_, at) in mine {
+            let path = &mut self.topics[topic.0 as usize];
+            let large = path.is_large(self.config.large_bytes);
+            let Some(bridge) = path.bridges.get_mut(at) else {
+                continue;
+            };
+            for message in self.kept.of(now, topic, bridge.from) {
+                if bridge.takes() && bridge.wants(&message) {
+                    bridge.pass(now, topic, &message, large, link);
+                }
+            }
+        }
+    }
+
+    /// A writer's lease is over: what is kept of it goes. Returns which writers that were.
+    pub fn forget_writers(&mut self, topic: TopicId, of: &OriginFilter) -> Vec<WriterId> {
+        self.kept.forget(topic, of)
+    }
+
+    /// Writers of earlier lives of their services, since the last call: what brokers keep of them goes, too.
+    pub fn take_superseded(&mut self) -> Vec<(TopicName, WriterId)> {
+        let superseded = std::mem::take(&mut self.kept.superseded);
+        let named = superseded.into_iter().map(|(topic, writer)| (self.path(topic).name.clone(), writer));
+        named.collect()
+    }
+
+    /// Where the bridge is in its topic, and whether it was made now because there was none yet.
+    fn place_of(&mut self, now: Instant, topic: TopicId, planned: &Bridge) -> (usize, bool) {
         let path = &mut self.topics[topic.0 as usize];
         let same = |b: &BridgeState| b.from == planned.from && b.target == planned.to;
         if let Some(at) = path.bridges.iter().position(same) {
-            return at;
+            return (at, false);
         }
         let class = path.class(&planned.lane, self.config.large_bytes);
         let old = path.bridges.iter().position(|bridge| bridge.is_forgotten(now));
@@ -136,7 +172,7 @@ impl DataCore {
             Some(place) => *place = bridge,
             None => path.bridges.push(bridge),
         }
-        at
+        (at, true)
     }
 }
 

@@ -7,6 +7,7 @@ use blaze_domain::control::{
     AdvertiseMessage, Common, ControlError, ControlMessage, ErrorCode, LeaseKind, OriginSelector, Quality,
     RequestMessage,
 };
+use blaze_domain::node_file::{AccessRules, TopicAccess};
 use blaze_domain::{FlowId, InstanceName, LayerName, NodeName, Scope, ServiceName, TopicName};
 
 use super::holder::{key_of, lease_of};
@@ -29,6 +30,15 @@ pub struct LeaseKey {
     pub service: ServiceName,
     /// Its instance.
     pub instance: InstanceName,
+}
+
+impl LeaseKey {
+    /// Whether the rules of its topic allow it.
+    #[must_use]
+    pub fn may(&self, access: &TopicAccess) -> bool {
+        let node = self.node.as_ref().map_or("", NodeName::as_str);
+        access.allows(self.kind, self.layer.as_str(), node, self.service.as_str())
+    }
 }
 
 /// What a lease is about.
@@ -140,7 +150,16 @@ impl<'a> LeaseView<'a> {
     }
 }
 
-/// A lease that was not renewed.
+/// Why a lease is missing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LapseReason {
+    /// It was not renewed.
+    Expired,
+    /// The rules of `flow.access` do not allow it.
+    Denied,
+}
+
+/// A lease that was not renewed, or that the rules do not allow.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LapsedLease {
     /// The topic.
@@ -149,6 +168,8 @@ pub struct LapsedLease {
     pub key: LeaseKey,
     /// When it lapsed.
     pub at: Instant,
+    /// Why.
+    pub reason: LapseReason,
 }
 
 /// All leases of one flow, bounded.
@@ -338,15 +359,44 @@ impl LeaseTable {
             }
             self.remove(&topic, &key);
             self.note_end(&topic, &key);
-            lapsed.push(LapsedLease { topic, key, at });
+            let reason = LapseReason::Expired;
+            lapsed.push(LapsedLease { topic, key, at, reason });
         }
         for lease in &lapsed {
-            if self.lapsed.len() == MAX_LAPSED {
-                self.lapsed.pop_front();
-            }
-            self.lapsed.push_back(lease.clone());
+            self.remember(lease.clone());
         }
         lapsed
+    }
+
+    /// Notes for people who ask that a lease is missing.
+    pub(super) fn remember(&mut self, lease: LapsedLease) {
+        self.lapsed
+            .retain(|other| other.topic != lease.topic || other.key != lease.key);
+        if self.lapsed.len() == MAX_LAPSED {
+            self.lapsed.pop_front();
+        }
+        self.lapsed.push_back(lease);
+    }
+
+    /// Ends the leases that the rules do not allow. Returns them.
+    pub(super) fn end_denied(&mut self, now: Instant, rules: &AccessRules) -> Vec<LapsedLease> {
+        let mut denied = Vec::new();
+        for (topic, leases) in &self.topics {
+            let access = rules.of(topic);
+            let keys = leases.keys().filter(|key| !key.may(&access));
+            denied.extend(keys.map(|key| LapsedLease {
+                topic: topic.clone(),
+                key: key.clone(),
+                at: now,
+                reason: LapseReason::Denied,
+            }));
+        }
+        for lease in &denied {
+            self.remove(&lease.topic, &lease.key);
+            self.note_end(&lease.topic, &lease.key);
+            self.remember(lease.clone());
+        }
+        denied
     }
 
     pub(super) fn next_expiry(&self) -> Option<Instant> {

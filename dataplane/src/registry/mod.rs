@@ -8,6 +8,7 @@
 //! No input or output and no clock: its owner passes the time, sends what [`Registry::poll`] gives, and plans the topics
 //! that each call reports as changed. Poll after every message and at [`Registry::next_poll`].
 
+mod access;
 mod announce;
 mod holder;
 mod kept;
@@ -34,7 +35,7 @@ use blaze_proto::link::link_control::{Body, RouteState};
 
 use announce::{Announcer, MAX_LEASED_ENTRIES};
 use leases::LeaseTable;
-pub use leases::{LapsedLease, LeaseKey, LeaseView, Terms};
+pub use leases::{LapseReason, LapsedLease, LeaseKey, LeaseView, Terms};
 use names::NameBook;
 pub use names::{LayerNames, NameFault, peers_channel};
 pub use peers::MAX_FLOWS;
@@ -192,6 +193,7 @@ impl Registry {
     ) -> Result<u32, ControlError> {
         let message = object.message.as_ref().map_err(Clone::clone)?;
         let common = message.common();
+        self.check_access(now, scope, message, &object.pointer)?;
         if scope == Scope::Layer
             && self.config.layer_answers_need_id
             && common.reply_to.is_some()

@@ -130,6 +130,11 @@ impl Registry {
                 }
             };
             let topic = message.common().topic.clone();
+            if let Err(denied) = self.check_access(now, scope, &message, "") {
+                tracing::warn!(%scope, %topic, detail = denied.detail, "a kept lease is not taken");
+                outcome.skipped += 1;
+                continue;
+            }
             let granted = match self.claim_name(scope, &topic) {
                 Ok(()) => self.leases.restore(now, scope, &self.config.me, &message),
                 Err(fault) => {

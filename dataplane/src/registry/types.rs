@@ -33,6 +33,8 @@ pub struct RegistryConfig {
     pub layer_names: LayerNames,
     /// Scopes whose broker keeps leases; they are to be read.
     pub lease_stores: BTreeSet<Scope>,
+    /// Who may advertise and request what.
+    pub access: AccessRules,
     /// When the flow started.
     pub started: Instant,
 }

@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 use blaze_brokers::{
     Broker, BrokerKind, Content, Health, Later, PublishOutcome, PublisherOptions, Received, SubscribeOptions,
 };
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::LayerKind;
 use blaze_domain::names::ChannelName;
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
@@ -47,6 +48,7 @@ impl Node {
                 limit_mbps: 160.0,
                 large_bytes: 65_536,
                 rules: PlanRules::default(),
+                access: AccessRules::default(),
             },
         };
         let options = FlowOptions {

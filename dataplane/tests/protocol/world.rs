@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{Content, PublishOutcome, Publisher, PublisherOptions, Received};
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::names::ChannelName;
 use blaze_domain::{FlowId, LayerKind, Origin, Priority, Scope, TopicName, WriterId};
 use blaze_flow::control::{ControlConfig, ControlCore, Output};
@@ -197,6 +198,7 @@ impl<'a> Simulation<'a> {
                 layer_names: LayerNames::Any,
                 lease_stores: BTreeSet::new(),
                 rules: PlanRules::default(),
+                access: AccessRules::default(),
             },
             self.now,
         );
@@ -497,6 +499,7 @@ impl<'a> Simulation<'a> {
                     content,
                     at: now,
                     broker_age_us: 0,
+                    kept: false,
                 }];
                 flow.plane.ingest(now, wall, id, *scope, &mut batch);
             }
@@ -521,7 +524,8 @@ impl<'a> Simulation<'a> {
                 | Output::LayerScope { .. }
                 | Output::SaveLease(_)
                 | Output::Prepare { .. }
-                | Output::Release { .. } => {}
+                | Output::Release { .. }
+                | Output::ForgetWriters { .. } => {}
                 Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
                 Output::Announce { version, digest } => engine.set_registry(now, version, digest),
                 Output::State(state) => engine.set_state(now, hello_state(state)),

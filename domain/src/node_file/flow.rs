@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::readers::{boolean, number, parsed, whole};
 use super::walk::{Node, Section, from_empty};
-use super::{AutoBool, TopicPattern, auto_bool};
+use super::{AccessRules, AutoBool, TopicPattern, auto_bool};
 use crate::MAX_PAYLOAD_BYTES;
 use crate::names::{LayerName, TopicName};
 use crate::qos::{Priority, UnknownWord, word_enum};
@@ -31,6 +31,8 @@ pub struct FlowSection {
     pub compression: Compression,
     /// Rules of topics; see [`FlowSection::topic`].
     pub topics: Vec<TopicRule>,
+    /// Who may advertise and request what.
+    pub access: AccessRules,
     /// Threads for compression; 0: cores of the control group.
     pub pool_threads: u16,
     /// Whether this flow joins the inter scope for the others of a large layer.
@@ -49,6 +51,7 @@ impl FlowSection {
             bandwidth: s.sub_or_empty("bandwidth", BandwidthSection::section),
             compression: s.sub_or_empty("compression", Compression::section),
             topics: s.list("topics", |node| node.section(TopicRule::section).flatten()),
+            access: AccessRules::read(s),
             pool_threads: s.or("pool_threads", whole(0, 1024), 0),
             gateway: s.or("gateway", auto_bool, AutoBool::Auto),
         }

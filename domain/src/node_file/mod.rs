@@ -8,6 +8,7 @@
 //! Reading is strict: unknown keys, wrong types and values out of range are faults, and all of them are reported at
 //! once. Each section states its keys, ranges and defaults in one function, one line per key.
 
+mod access;
 mod brokers;
 mod control_plane;
 mod effect;
@@ -24,6 +25,7 @@ use std::path::PathBuf;
 
 use serde_json::Value;
 
+pub use access::{AccessRule, AccessRules, OriginPattern, OriginPatternError, OriginRules, TopicAccess};
 pub use brokers::{
     Brokers, Chunking, DdsLayerBroker, InterDds, KafkaBroker, LayerBroker, MAX_DDS_DOMAIN, MIN_MTU, NodeBroker,
     RedisBroker, RedisTls, Ros2Distro, Ros2Plugin,

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::Context;
 use blaze_brokers::memory::MemoryHub;
-use blaze_domain::node_file::Chunking;
+use blaze_domain::node_file::{AccessRules, Chunking};
 use blaze_domain::{FlowId, LayerKind, Reliability, Scope, TopicName};
 use blaze_flow::flow::settings::{FlowSettings, InterSettings, LiveSettings};
 use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
@@ -129,6 +129,7 @@ async fn start_flow(options: &Options, hub: &MemoryHub, supervisor: &Supervisor)
             limit_mbps: options.limit_mbps,
             large_bytes: LARGE_BYTES as u64,
             rules: PlanRules::default(),
+            access: AccessRules::default(),
         },
     };
     let flow = FlowOptions {

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use blaze_brokers::memory::MemoryHub;
-use blaze_domain::node_file::Chunking;
+use blaze_domain::node_file::{AccessRules, Chunking};
 use blaze_domain::{FlowId, LayerKind, Reliability, Scope, TopicName};
 use blaze_flow::flow::settings::{FlowSettings, InterSettings, LiveSettings};
 use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
@@ -49,6 +49,7 @@ async fn flow(
             limit_mbps: LIMIT_MBPS,
             large_bytes: 65_536,
             rules: PlanRules::default(),
+            access: AccessRules::default(),
         },
     };
     let layer = LayerBroker {

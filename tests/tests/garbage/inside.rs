@@ -10,6 +10,7 @@ use blaze_brokers::{
     Broker, BrokerError, BrokerKind, BrokerStatus, Content, Publisher, PublisherOptions, Received, SubscribeOptions,
     Subscription, SubscriptionSender,
 };
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::names::ChannelName;
 use blaze_domain::{FlowId, LayerKind, Origin, Scope, WriterId};
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
@@ -136,6 +137,7 @@ impl Inside {
             limit_mbps: 160.0,
             large_bytes: 65_536,
             rules: PlanRules::default(),
+            access: AccessRules::default(),
         };
         let options = FlowOptions {
             settings: FlowSettings {

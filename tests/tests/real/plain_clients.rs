@@ -2,8 +2,9 @@
 
 use std::time::{Duration, Instant};
 
+use blaze_tests::flow::{FlowProcess, FlowSpec};
 use blaze_tests::plain::{KafkaReader, KafkaWriter, Record};
-use blaze_tests::servers::{shared_kafka, shared_redis};
+use blaze_tests::servers::{shared_kafka, shared_redis, unique_name};
 use blaze_tests::wait;
 use serde_json::{Value, json};
 
@@ -283,5 +284,53 @@ fn wrong_control_messages_get_code_and_pointer() -> anyhow::Result<()> {
         (&granted["ok"], &granted["id"], &granted["lease_s"]),
         (&json!(true), &json!("9"), &json!(0))
     );
+    Ok(())
+}
+
+/// Who may publish a command is a matter of the node file: refused ones are told, shown, and carry nothing.
+#[test]
+fn commands_come_only_from_whom_the_rules_allow() -> anyhow::Result<()> {
+    const TOPIC: &str = "cmd_vel";
+    let _turn = turn();
+    let redis = shared_redis()?;
+    let prefix = format!("{}:", unique_name("access"));
+    let mut spec = FlowSpec::new("edge", "robot-1").on_redis(&redis, &prefix);
+    spec.flow = "access: [ { match: cmd_vel, advertise: { allow: [ \"edge/*/joystick\" ] } } ]".to_owned();
+    let mut flow = FlowProcess::launch(spec)?;
+    flow.wait_ready()?;
+    let mut connection = connect(&redis)?;
+    let mut tell = |channel: &str, payload: &str| -> anyhow::Result<i64> {
+        Ok(redis::cmd("PUBLISH")
+            .arg(format!("{prefix}{channel}"))
+            .arg(payload)
+            .query(&mut connection)?)
+    };
+    let mut answers = RedisReader::new(&redis, &format!("{prefix}blaze/reply/test"))?;
+    let mut bare = RedisReader::new(&redis, &format!("{prefix}blaze/bare/{TOPIC}"))?;
+    let op = |op: &str, service: &str| {
+        json!({"op": op, "topic": TOPIC, "service": service, "ttl_s": 0, "bare": op == "request",
+               "id": service, "reply_to": "blaze/reply/test"})
+        .to_string()
+    };
+    tell("blaze/flow/control", &op("request", "motor"))?;
+    assert_eq!(answers.next_json(SOON)?["ok"], true);
+    tell("blaze/flow/control", &op("advertise", "planner"))?;
+    let refused = answers.next_json(SOON)?;
+    assert_eq!(refused["error"]["code"], "access_denied", "{refused}");
+    assert_eq!(refused["error"]["pointer"], "/service");
+    let why = flow.why(TOPIC, None)?;
+    assert_eq!((&why["code"], &why["verdict"]), (&json!("access_denied"), &json!("not_flowing")), "{why}");
+    tell("blaze/flow/control", &op("advertise", "joystick"))?;
+    assert_eq!(answers.next_json(SOON)?["ok"], true);
+    flow.wait_bridge(TOPIC, SOON)?;
+    wait::until(
+        "the joystick's command arrives",
+        SOON,
+        || {
+            let _ = tell(TOPIC, "stop");
+            matches!(bare.poll(), Ok(Some(payload)) if payload == b"stop")
+        },
+        || flow.tail(),
+    )?;
     Ok(())
 }

@@ -132,6 +132,7 @@ impl Bench {
                 content,
                 at: self.now,
                 broker_age_us: 0,
+                kept: false,
             })
             .collect();
         self.core
@@ -270,6 +271,39 @@ fn bare_payloads_get_an_identity_of_this_life_of_the_flow() {
         ("imu", "application/json")
     );
     assert_eq!(bench.out.bare.lock().len(), 2);
+}
+
+#[test]
+fn messages_of_origins_that_may_not_publish_are_dropped() {
+    let file = serde_json::json!({
+        "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "robot-1"}, "brokers": {"node": {"memory": {}}},
+        "flow": {"access": [{"match": "imu/**", "advertise": {"deny": ["edge/robot-1/imu", "fog"]}}]},
+    });
+    let (file, _) = blaze_domain::node_file::NodeFile::read(&file).unwrap();
+    let info = TopicInfo {
+        node: BareInfo {
+            service: "imu".into(),
+            ..BareInfo::default()
+        },
+        access: file.flow.access.of(&"imu/data".parse().unwrap()),
+        ..TopicInfo::default()
+    };
+    let mut bench = Bench::new(vec![bridge(Scope::Node, to_cloud())]);
+    bench.apply(vec![bridge(Scope::Node, to_cloud())], info);
+    let bare = Content::Bare {
+        payload: Bytes::from_static(b"a"),
+        identity: None,
+    };
+    bench.take(Scope::Node, vec![bare]);
+    assert_eq!(bench.link.submitted.len(), 0);
+    assert_eq!(bench.drops(), vec![(DropReason::ForeignOrigin, 1)]);
+    bench.apply(vec![bridge(Scope::Node, to_cloud())], TopicInfo::default());
+    let bare = Content::Bare {
+        payload: Bytes::from_static(b"a"),
+        identity: None,
+    };
+    bench.take(Scope::Node, vec![bare]);
+    assert_eq!(bench.link.submitted.len(), 1, "without rules everybody may");
 }
 
 #[test]

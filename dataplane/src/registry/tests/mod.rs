@@ -6,6 +6,7 @@ mod sync;
 
 use std::time::Duration;
 
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::LayerKind;
 use blaze_domain::control::{AdvertiseMessage, ControlMessage, RequestMessage, WithdrawMessage};
 use blaze_proto::link::link_control::{Hello, Kind, State};
@@ -26,6 +27,7 @@ fn config(me: &str, epoch: u64, started: Instant) -> RegistryConfig {
         layer_answers_need_id: true,
         layer_names: LayerNames::Any,
         lease_stores: BTreeSet::new(),
+        access: AccessRules::default(),
         started,
     }
 }

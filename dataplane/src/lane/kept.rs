@@ -1,0 +1,277 @@
+//! The last messages of transient_local writers, for bridges that begin later.
+//!
+//! A broker keeps them for those who subscribe to it; a bridge that begins while the topic is being read already gets them
+//! from here, and so does a flow that comes back.
+
+use std::collections::VecDeque;
+use std::num::NonZeroUsize;
+use std::time::Instant;
+
+use blaze_domain::{Origin, Scope, WriterId};
+use blaze_proto::Frame;
+use lru::LruCache;
+
+use super::admit::Admitted;
+use super::path::TopicId;
+use crate::world::OriginFilter;
+
+/// Writers that are kept at most; the one that was silent longest gives way.
+const MAX_WRITERS: usize = 16_384;
+/// Bytes that are kept at most (64 MiB), of all writers; one message always fits.
+const MAX_BYTES: usize = 64 * 1024 * 1024;
+/// Messages of one writer that are kept at most, whatever depth it names.
+const MAX_DEPTH: usize = 10_000;
+
+/// Superseded writers that wait to be fetched at most.
+const MAX_SUPERSEDED: usize = 16_384;
+
+/// One message as it came.
+#[derive(Clone)]
+struct Kept {
+    frame: Frame,
+    hops: u32,
+    born_here: bool,
+    age_us: u64,
+    since: Instant,
+}
+
+impl Kept {
+    /// The message now: older by what it lay here.
+    fn admitted(&self, now: Instant) -> Admitted {
+        let waited = now.saturating_duration_since(self.since);
+        let waited_us = u64::try_from(waited.as_micros()).unwrap_or(u64::MAX);
+        let age_us = self.age_us.saturating_add(waited_us);
+        let frame = self.frame.clone().with_hops_and_age(self.hops, age_us);
+        Admitted {
+            kept: true,
+            ..Admitted::new(frame, self.born_here, age_us, 0)
+        }
+    }
+}
+
+struct Writer {
+    from: Scope,
+    messages: VecDeque<Kept>,
+}
+
+/// What is kept, per topic and writer.
+pub(super) struct KeptMessages {
+    writers: LruCache<(TopicId, WriterId), Writer>,
+    bytes: usize,
+    /// Messages that gave way to those of other writers.
+    pub(super) evicted: u64,
+    /// Writers of earlier lives of their services, which are to be forgotten by the brokers, too.
+    pub(super) superseded: Vec<(TopicId, WriterId)>,
+}
+
+impl Default for KeptMessages {
+    fn default() -> Self {
+        Self {
+            writers: LruCache::new(NonZeroUsize::new(MAX_WRITERS).unwrap_or(NonZeroUsize::MIN)),
+            bytes: 0,
+            evicted: 0,
+            superseded: Vec::new(),
+        }
+    }
+}
+
+impl KeptMessages {
+    /// Keeps a message, if its writer is transient_local.
+    pub(super) fn keep(&mut self, now: Instant, topic: TopicId, from: Scope, message: &Admitted) {
+        let depth = usize::try_from(message.frame.depth()).unwrap_or(MAX_DEPTH).min(MAX_DEPTH);
+        if depth == 0 {
+            return;
+        }
+        let key = (topic, message.frame.writer());
+        if !self.writers.contains(&key) {
+            self.supersede(topic, &message.frame);
+            if self.writers.len() == self.writers.cap().get() {
+                self.evict();
+            }
+        }
+        let kept = Kept {
+            frame: message.frame.clone(),
+            hops: message.hops,
+            born_here: message.born_here,
+            age_us: message.age_us,
+            since: now,
+        };
+        self.bytes += kept.frame.wire_len();
+        let writer = self.writers.get_or_insert_mut(key, || Writer {
+            from,
+            messages: VecDeque::new(),
+        });
+        writer.from = from;
+        writer.messages.push_back(kept);
+        while writer.messages.len() > depth {
+            self.bytes -= writer.messages.pop_front().map_or(0, |kept| kept.frame.wire_len());
+        }
+        while self.bytes > MAX_BYTES && self.writers.len() > 1 {
+            self.evict();
+        }
+        // One writer alone: its own oldest give way.
+        if let Some((_, writer)) = self.writers.iter_mut().next() {
+            while self.bytes > MAX_BYTES && writer.messages.len() > 1 {
+                self.bytes -= writer.messages.pop_front().map_or(0, |kept| kept.frame.wire_len());
+                self.evicted += 1;
+            }
+        }
+    }
+
+    /// A service has begun a new life: the writers of its earlier ones are no more.
+    fn supersede(&mut self, topic: TopicId, newer: &Frame) {
+        let life = newer.origin();
+        // Without a service it is not known whose it is.
+        if life.service.is_empty() {
+            return;
+        }
+        let gone = self.remove(|(at, _), writer| {
+            let earlier = |kept: &Kept| {
+                let origin = kept.frame.origin();
+                let same = Origin {
+                    epoch: life.epoch,
+                    ..origin.clone()
+                };
+                origin.epoch < life.epoch && same == life
+            };
+            *at == topic && writer.messages.back().is_some_and(earlier)
+        });
+        let room = MAX_SUPERSEDED.saturating_sub(self.superseded.len());
+        self.superseded.extend(gone.into_iter().take(room).map(|writer| (topic, writer)));
+    }
+
+    /// Forgets the writer that was silent longest.
+    fn evict(&mut self) {
+        if let Some((_, writer)) = self.writers.pop_lru() {
+            self.evicted += writer.messages.len() as u64;
+            self.bytes -= bytes_of(&writer);
+        }
+    }
+
+    /// What is kept of a topic from one scope, in the order of each writer and otherwise as it came.
+    pub(super) fn of(&self, now: Instant, topic: TopicId, from: Scope) -> Vec<Admitted> {
+        let mut found: Vec<&Kept> = self
+            .writers
+            .iter()
+            .filter(|((of, _), writer)| *of == topic && writer.from == from)
+            .flat_map(|(_, writer)| &writer.messages)
+            .collect();
+        // Stable, and the times of one writer ascend.
+        found.sort_by_key(|kept| kept.since);
+        found.into_iter().map(|kept| kept.admitted(now)).collect()
+    }
+
+    /// Forgets writers of a topic. Returns which.
+    pub(super) fn forget(&mut self, topic: TopicId, of: &OriginFilter) -> Vec<WriterId> {
+        let is_of = |kept: &Kept| {
+            let frame = &kept.frame;
+            of.matches(frame.origin_layer(), frame.origin_node(), frame.origin_service())
+        };
+        let fits = |writer: &Writer| writer.messages.back().is_some_and(is_of);
+        self.remove(|(of, _), writer| *of == topic && fits(writer))
+    }
+
+    /// Forgets topics.
+    pub(super) fn forget_topics(&mut self, gone: impl Fn(TopicId) -> bool) {
+        self.remove(|(of, _), _| gone(*of));
+    }
+
+    fn remove(&mut self, gone: impl Fn(&(TopicId, WriterId), &Writer) -> bool) -> Vec<WriterId> {
+        let keys: Vec<(TopicId, WriterId)> = self
+            .writers
+            .iter()
+            .filter(|(key, writer)| gone(key, writer))
+            .map(|(key, _)| *key)
+            .collect();
+        for key in &keys {
+            if let Some(writer) = self.writers.pop(key) {
+                self.bytes -= bytes_of(&writer);
+            }
+        }
+        keys.into_iter().map(|(_, writer)| writer).collect()
+    }
+}
+
+fn bytes_of(writer: &Writer) -> usize {
+    writer.messages.iter().map(|kept| kept.frame.wire_len()).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use blaze_proto::Header;
+    use bytes::Bytes;
+    use std::time::Duration;
+
+    const TOPIC: TopicId = TopicId(3);
+
+    fn message(writer: u8, service: &str, epoch: u64, sequence: u64, bytes: usize) -> Admitted {
+        let origin = Origin {
+            layer: "edge".into(),
+            node: "robot-1".into(),
+            service: service.into(),
+            instance: "0".into(),
+            epoch,
+        };
+        let header = Header {
+            depth: 2,
+            ..Header::new("map", origin, WriterId([writer; 16]), sequence, 0)
+        };
+        let frame = Frame::new(&header, Bytes::from(vec![0; bytes])).unwrap();
+        Admitted::new(frame, true, 5, 0)
+    }
+
+    fn sequences(kept: &KeptMessages, now: Instant) -> Vec<(u8, u64)> {
+        let found = kept.of(now, TOPIC, Scope::Node);
+        found.iter().map(|m| (m.frame.writer().0[0], m.frame.sequence())).collect()
+    }
+
+    #[test]
+    fn each_writer_keeps_its_last_ones_and_they_grow_older() {
+        let (mut kept, now) = (KeptMessages::default(), Instant::now());
+        for sequence in 1..=3 {
+            kept.keep(now, TOPIC, Scope::Node, &message(1, "a", 1, sequence, 10));
+            kept.keep(now, TOPIC, Scope::Node, &message(2, "b", 1, sequence, 10));
+        }
+        kept.keep(now, TopicId(4), Scope::Node, &message(1, "a", 1, 9, 10));
+        let mut found = sequences(&kept, now);
+        found.sort_unstable();
+        assert_eq!(found, [(1, 2), (1, 3), (2, 2), (2, 3)]);
+        assert!(kept.of(now, TOPIC, Scope::Layer).is_empty());
+        let later = kept.of(now + Duration::from_millis(7), TOPIC, Scope::Node);
+        assert!(later.iter().all(|m| m.kept && m.age_us == 7_005 && m.hops == 0));
+    }
+
+    #[test]
+    fn a_service_that_is_gone_or_new_leaves_nothing() {
+        let (mut kept, now) = (KeptMessages::default(), Instant::now());
+        kept.keep(now, TOPIC, Scope::Node, &message(1, "a", 1, 1, 10));
+        kept.keep(now, TOPIC, Scope::Node, &message(2, "b", 1, 1, 10));
+        kept.keep(now, TOPIC, Scope::Node, &message(3, "a", 2, 1, 10));
+        assert_eq!(kept.superseded, [(TOPIC, WriterId([1; 16]))]);
+        let of = OriginFilter {
+            service: Some("b".into()),
+            ..OriginFilter::default()
+        };
+        assert_eq!(kept.forget(TOPIC, &of), [WriterId([2; 16])]);
+        assert_eq!(sequences(&kept, now), [(3, 1)]);
+        kept.forget_topics(|_| true);
+        assert_eq!((kept.bytes, kept.writers.len()), (0, 0));
+    }
+
+    #[test]
+    fn what_is_kept_is_bounded() {
+        let (mut kept, now) = (KeptMessages::default(), Instant::now());
+        for writer in 0..100 {
+            kept.keep(now, TOPIC, Scope::Node, &message(writer, &format!("s{writer}"), 1, 1, 1_000_000));
+        }
+        assert!(kept.bytes <= MAX_BYTES, "{}", kept.bytes);
+        assert!(kept.evicted >= 33 && kept.writers.len() >= 60);
+        let mut alone = KeptMessages::default();
+        let mut last = message(1, "a", 1, 1, 40_000_000_usize.min(16_000_000));
+        alone.keep(now, TOPIC, Scope::Node, &last);
+        last = message(1, "a", 1, 2, 16_000_000);
+        alone.keep(now, TOPIC, Scope::Node, &last);
+        assert_eq!(sequences(&alone, now), [(1, 1), (1, 2)]);
+    }
+}
