@@ -1,10 +1,12 @@
 //! The admin port of a running flow, asked as an operator's script would.
 
 use std::io::{Read, Write};
-use std::net::{SocketAddr, TcpStream};
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use anyhow::Context;
+
+use crate::network::connect;
 
 /// One admin port, reached from this process or from inside a namespace.
 #[derive(Debug, Clone)]
@@ -21,10 +23,7 @@ impl Admin {
     /// # Errors
     /// When nothing answers within two seconds, or the answer is no HTTP.
     pub fn get(&self, path: &str) -> anyhow::Result<(u16, String)> {
-        let answer = match &self.namespace {
-            None => self.ask_directly(path)?,
-            Some(namespace) => self.ask_inside(namespace, path)?,
-        };
+        let answer = self.ask(path)?;
         let (head, body) = answer.split_once("\r\n\r\n").context("no end of the HTTP header")?;
         let status = head.split_whitespace().nth(1).context("no HTTP status")?.parse()?;
         Ok((status, body.to_owned()))
@@ -60,9 +59,9 @@ impl Admin {
         line.rsplit(' ').next()?.parse().ok()
     }
 
-    fn ask_directly(&self, path: &str) -> anyhow::Result<String> {
+    fn ask(&self, path: &str) -> anyhow::Result<String> {
         let timeout = Duration::from_secs(2);
-        let mut stream = TcpStream::connect_timeout(&self.address, timeout)?;
+        let mut stream = connect(self.namespace.as_deref(), self.address, timeout)?;
         stream.set_read_timeout(Some(timeout))?;
         write!(
             stream,
@@ -72,17 +71,5 @@ impl Admin {
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer)?;
         Ok(String::from_utf8_lossy(&answer).into_owned())
-    }
-
-    fn ask_inside(&self, namespace: &str, path: &str) -> anyhow::Result<String> {
-        let script = format!(
-            "exec 3<>/dev/tcp/{}/{}; printf 'GET {path} HTTP/1.1\\r\\nHost: x\\r\\nConnection: close\\r\\n\\r\\n' >&3; timeout 2 cat <&3",
-            self.address.ip(),
-            self.address.port()
-        );
-        let output = std::process::Command::new("ip")
-            .args(["netns", "exec", namespace, "bash", "-c", &script])
-            .output()?;
-        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
     }
 }

@@ -1,6 +1,7 @@
 //! `blaze-flow` as a process of its own, on real brokers.
 
 use std::fmt::Write as _;
+use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -8,7 +9,8 @@ use anyhow::Context;
 use serde_json::Value;
 
 use crate::admin::Admin;
-use crate::process::Process;
+use crate::network::Host;
+use crate::process::{Process, Signal};
 use crate::wait;
 
 /// Where a flow must say `ready`, on a busy machine.
@@ -27,8 +29,12 @@ pub struct FlowSpec {
     pub redis: Option<(String, String)>,
     /// Address and prefix of the layer scope's Kafka.
     pub kafka: Option<(String, String)>,
-    /// DDS domain of the inter scope, on loopback.
+    /// DDS domain of the inter scope, on loopback or its host's address.
     pub domain: Option<u16>,
+    /// The host of a network that it runs on; absent = this machine.
+    pub host: Option<Host>,
+    /// Addresses of flows to begin with; empty = loopback, which a host of a network does not share.
+    pub peers: Vec<Ipv4Addr>,
     /// `flow.bandwidth.limit_mbps`.
     pub limit_mbps: f64,
     /// Further lines of the node file.
@@ -48,6 +54,8 @@ impl FlowSpec {
             redis: None,
             kafka: None,
             domain: None,
+            host: None,
+            peers: Vec::new(),
             limit_mbps: 160.0,
             extra: String::new(),
             flow: String::new(),
@@ -75,6 +83,14 @@ impl FlowSpec {
         self
     }
 
+    /// On a host of a network, with the addresses of other flows' hosts to begin with.
+    #[must_use]
+    pub fn inside(mut self, host: &Host, peers: &[Ipv4Addr]) -> Self {
+        self.host = Some(host.clone());
+        self.peers = peers.to_vec();
+        self
+    }
+
     /// The node file.
     #[must_use]
     pub fn to_yaml(&self, state: &Path) -> String {
@@ -93,9 +109,16 @@ impl FlowSpec {
             );
         }
         if let Some(domain) = self.domain {
+            let listen = self.host.as_ref().map_or(Ipv4Addr::LOCALHOST, |host| host.address);
+            let peers = match (&self.host, &self.peers[..]) {
+                (None, []) => &[Ipv4Addr::LOCALHOST],
+                (_, peers) => peers,
+            };
+            let peers: Vec<String> = peers.iter().map(|peer| format!("\"{peer}\"")).collect();
             let _ = writeln!(
                 text,
-                "  inter: {{ dds: {{ domain: {domain}, listen: \"127.0.0.1\", peers: [\"127.0.0.1\"] }} }}"
+                "  inter: {{ dds: {{ domain: {domain}, listen: \"{listen}\", peers: [{}] }} }}",
+                peers.join(", ")
             );
         }
         let _ = write!(
@@ -129,7 +152,7 @@ impl FlowProcess {
         let folder = tempfile::tempdir()?;
         let file = folder.path().join("blaze.yaml");
         std::fs::write(&file, spec.to_yaml(folder.path()))?;
-        let process = run(&file)?;
+        let process = run(&file, spec.host.as_ref())?;
         Ok(Self {
             spec,
             file,
@@ -178,7 +201,7 @@ impl FlowProcess {
         let address = line.split(SAID).nth(1).and_then(|rest| rest.split_whitespace().next());
         let admin = Admin {
             address: address.context("no address")?.parse()?,
-            namespace: None,
+            namespace: self.spec.host.as_ref().map(|host| host.namespace.clone()),
         };
         self.admin = Some(admin.clone());
         Ok(admin)
@@ -206,6 +229,14 @@ impl FlowProcess {
         self.process.tail()
     }
 
+    /// Sends it a signal.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn signal(&self, signal: Signal) -> anyhow::Result<()> {
+        self.process.signal(signal)
+    }
+
     /// Kills it with -9 and waits for its end.
     ///
     /// # Errors
@@ -219,7 +250,7 @@ impl FlowProcess {
     /// # Errors
     /// As [`FlowProcess::launch`].
     pub fn relaunch(&mut self) -> anyhow::Result<()> {
-        self.process = run(&self.file)?;
+        self.process = run(&self.file, self.spec.host.as_ref())?;
         self.admin = None;
         Ok(())
     }
@@ -291,8 +322,9 @@ impl FlowProcess {
     }
 }
 
-fn run(file: &Path) -> anyhow::Result<Process> {
-    Process::start("blaze-flow", &["--config", &file.to_string_lossy()], None)
+fn run(file: &Path, host: Option<&Host>) -> anyhow::Result<Process> {
+    let namespace = host.map(|host| host.namespace.as_str());
+    Process::start("blaze-flow", &["--config", &file.to_string_lossy()], namespace)
 }
 
 /// A DDS domain that nobody uses on loopback now, so that another run of these tests is no neighbour.
@@ -300,7 +332,7 @@ fn run(file: &Path) -> anyhow::Result<Process> {
 /// # Errors
 /// When there is none between 40 and 99.
 pub fn free_domain() -> anyhow::Result<u16> {
-    use std::net::{Ipv4Addr, UdpSocket};
+    use std::net::UdpSocket;
     use std::sync::atomic::{AtomicU16, Ordering};
     static NEXT: AtomicU16 = AtomicU16::new(0);
     let first = (std::process::id() % 60) as u16 + NEXT.fetch_add(1, Ordering::Relaxed);

@@ -1,13 +1,17 @@
-//! What end-to-end tests stand on: real processes, network namespaces, and waits on conditions.
+//! What end-to-end tests stand on: real processes and servers, emulated networks, faults, and waits on conditions.
 
 pub mod admin;
 pub mod flow;
+mod guard;
 pub mod network;
 #[cfg(feature = "kafka")]
 pub mod plain;
 pub mod process;
+pub mod proxy;
+pub mod scenario;
 pub mod servers;
 pub mod wait;
+pub mod wan;
 
 /// Whether the full counts are wanted (`scripts/test --long`).
 #[must_use]

@@ -2,14 +2,16 @@
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use anyhow::Context;
+pub use rustix::process::Signal;
+use rustix::process::{Pid, kill_process};
 
 use crate::admin::Admin;
-use crate::wait;
+use crate::{network, wait};
 
 /// Lines of output that are kept.
 const MAX_LINES: usize = 20_000;
@@ -50,15 +52,7 @@ impl Process {
     /// # Errors
     /// When it is not built or does not start.
     pub fn start(name: &str, arguments: &[&str], namespace: Option<&str>) -> anyhow::Result<Self> {
-        let program = binary(name)?;
-        let mut command = match namespace {
-            None => Command::new(program),
-            Some(namespace) => {
-                let mut command = Command::new("ip");
-                command.args(["netns", "exec", namespace]).arg(program);
-                command
-            }
-        };
+        let mut command = network::program(namespace, binary(name)?);
         command
             .args(arguments)
             .stdin(Stdio::null())
@@ -132,10 +126,17 @@ impl Process {
     /// # Errors
     /// When it does not end in time.
     pub fn terminate(&mut self, deadline: Duration) -> anyhow::Result<Option<i32>> {
-        Command::new("kill")
-            .args(["-TERM", &self.child.id().to_string()])
-            .status()?;
+        self.signal(Signal::TERM)?;
         self.exit(deadline)
+    }
+
+    /// Sends it a signal.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn signal(&self, signal: Signal) -> anyhow::Result<()> {
+        let pid = Pid::from_raw(i32::try_from(self.child.id())?).context("no process id")?;
+        kill_process(pid, signal).with_context(|| format!("{signal:?} to a process"))
     }
 
     /// Waits for its end and gives its exit code.

@@ -1,13 +1,14 @@
 //! A Kafka broker of one test.
 
 use std::path::Path;
-use std::process::Command;
 use std::time::Duration;
 
 use anyhow::Context as _;
 
+use super::endpoint::Endpoint;
 use super::process::ServerProcess;
 use super::{installed, kafka_wire, ports};
+use crate::network::Host;
 
 /// Measured: 3 s, some seconds more after a kill. The rest is for a machine that does much else.
 const START: Duration = Duration::from_secs(60);
@@ -29,6 +30,8 @@ const LOGGING: &str = include_str!(concat!(
 pub struct KafkaOptions {
     /// Largest heap of the Java machine, MiB.
     pub heap_mib: u32,
+    /// The host of a network that it runs and listens on; absent = this machine's loopback.
+    pub host: Option<Host>,
     /// Lines of `server.properties`; they win over those of `scripts/services.d/kafka.properties`.
     pub extra: Vec<String>,
 }
@@ -37,6 +40,7 @@ impl Default for KafkaOptions {
     fn default() -> Self {
         Self {
             heap_mib: 512,
+            host: None,
             extra: Vec::new(),
         }
     }
@@ -47,7 +51,7 @@ impl Default for KafkaOptions {
 pub struct KafkaServer {
     process: ServerProcess,
     options: KafkaOptions,
-    port: u16,
+    endpoint: Endpoint,
     cluster: String,
 }
 
@@ -80,12 +84,13 @@ impl KafkaServer {
     fn prepare(options: KafkaOptions) -> anyhow::Result<Self> {
         let process = ServerProcess::new("kafka")?;
         let folder = process.folder();
-        let port = ports::free()?;
+        let endpoint = Endpoint::new(options.host.as_ref(), ports::free()?);
         let data = folder.join("data");
         let cluster = new_cluster_id();
         copy_formatted(&installed::path("kafka/formatted")?, &data, &cluster)?;
         let mut text = PROPERTIES
-            .replace("@PORT@", &port.to_string())
+            .replace("PLAINTEXT://127.0.0.1:", &format!("PLAINTEXT://{}:", endpoint.ip()))
+            .replace("@PORT@", &endpoint.port.to_string())
             .replace("@CONTROLLER_PORT@", &ports::free()?.to_string())
             .replace("@DATA@", &data.display().to_string());
         for line in &options.extra {
@@ -97,13 +102,13 @@ impl KafkaServer {
         Ok(Self {
             process,
             options,
-            port,
+            endpoint,
             cluster,
         })
     }
 
     fn spawn(&self) -> anyhow::Result<()> {
-        let mut command = Command::new(installed::path("jre/bin/java")?);
+        let mut command = self.endpoint.program(installed::path("jre/bin/java")?);
         // Java itself expands the asterisk.
         let libraries = installed::path("kafka/libs")?.join("*");
         command
@@ -123,10 +128,10 @@ impl KafkaServer {
         self.wait_ready()
     }
 
-    /// `127.0.0.1:PORT`.
+    /// `ADDRESS:PORT`; the address is 127.0.0.1 or that of its host.
     #[must_use]
     pub fn bootstrap(&self) -> String {
-        format!("127.0.0.1:{}", self.port)
+        format!("{}:{}", self.endpoint.ip(), self.endpoint.port)
     }
 
     /// Waits until the broker lists itself and every partition has a leader.
@@ -136,7 +141,7 @@ impl KafkaServer {
     pub fn wait_ready(&self) -> anyhow::Result<()> {
         // The cluster tells that it has the port: another broker there would answer as well.
         let ready = || {
-            kafka_wire::metadata(self.port)
+            kafka_wire::metadata(&self.endpoint)
                 .is_ok_and(|metadata| metadata.cluster == self.cluster && metadata.is_ready())
         };
         self.process.wait_ready(START, ready)?;
@@ -232,7 +237,7 @@ mod tests {
 
     #[test]
     fn the_template_has_a_place_for_all_that_is_filled_in() {
-        for word in ["@PORT@", "@CONTROLLER_PORT@", "@DATA@"] {
+        for word in ["PLAINTEXT://127.0.0.1:", "@PORT@", "@CONTROLLER_PORT@", "@DATA@"] {
             assert!(PROPERTIES.contains(word), "{word}");
         }
     }

@@ -4,10 +4,11 @@
 //! without the feature `kafka`.
 
 use std::io::{Read as _, Write as _};
-use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::time::Duration;
 
 use anyhow::Context as _;
+
+use super::endpoint::Endpoint;
 
 const TIMEOUT: Duration = Duration::from_secs(1);
 /// The most that an answer may hold: metadata of test topics is a few KiB.
@@ -35,12 +36,12 @@ impl Metadata {
     }
 }
 
-/// Asks the broker on a loopback port.
+/// Asks a broker.
 ///
 /// # Errors
 /// When there is no answer within a second, or one that is not Kafka's.
-pub(super) fn metadata(port: u16) -> anyhow::Result<Metadata> {
-    let mut stream = TcpStream::connect_timeout(&SocketAddr::from((Ipv4Addr::LOCALHOST, port)), TIMEOUT)?;
+pub(super) fn metadata(broker: &Endpoint) -> anyhow::Result<Metadata> {
+    let mut stream = broker.connect(TIMEOUT)?;
     stream.set_read_timeout(Some(TIMEOUT))?;
     stream.write_all(&request())?;
     let mut length = [0; 4];

@@ -2,12 +2,13 @@
 //!
 //! Most tests share the servers that `scripts/services start` runs ([`shared_redis`], [`shared_kafka`]) and keep apart by
 //! [`unique_name`]. A test that kills, freezes or configures a server starts one of its own: [`RedisServer`],
-//! [`KafkaServer`]. Those listen on loopback only, on a free port, and end with the value, or with the test's process.
+//! [`KafkaServer`]. Those listen on a free port of loopback, or of a host of a [network](crate::network) alone, and end with
+//! the value, or with the test's process.
 //!
 //! All calls block the thread. In an asynchronous test they need a runtime with several threads.
 
 mod certificates;
-mod guard;
+mod endpoint;
 mod installed;
 mod kafka;
 mod kafka_wire;

@@ -11,7 +11,7 @@ use parking_lot::Mutex;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
-use super::guard;
+use crate::guard;
 
 /// Lines of the log that go into an error.
 const LOG_LINES: usize = 20;

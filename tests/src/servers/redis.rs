@@ -2,14 +2,15 @@
 
 use std::fmt::Write as _;
 use std::io::{Read as _, Write as _};
-use std::net::{Ipv4Addr, SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
 use super::certificates::Certificates;
+use super::endpoint::Endpoint;
 use super::process::{ServerProcess, output_within};
 use super::{installed, ports};
+use crate::network::Host;
 
 /// Measured: 0.05 s. The rest is for a machine that does much else.
 const START: Duration = Duration::from_secs(20);
@@ -50,6 +51,8 @@ impl RedisKind {
 pub struct RedisOptions {
     /// 0 for any free port.
     pub port: u16,
+    /// The host of a network that it runs and listens on; absent = this machine's loopback.
+    pub host: Option<Host>,
     /// TLS only, no plain port. The client trusts [`RedisServer::authority`].
     pub tls: bool,
     /// Users as in `ACL SETUSER`: `edge on >pw ~b:* &b:* +@all -@dangerous`.
@@ -62,7 +65,7 @@ pub struct RedisOptions {
 pub struct RedisServer {
     kind: RedisKind,
     process: ServerProcess,
-    port: u16,
+    endpoint: Endpoint,
     certificates: Option<Certificates>,
 }
 
@@ -107,18 +110,19 @@ impl RedisServer {
             true => Some(Certificates::write(process.folder())?),
             false => None,
         };
-        let text = configuration(process.folder(), port, certificates.as_ref(), options)?;
+        let endpoint = Endpoint::new(options.host.as_ref(), port);
+        let text = configuration(process.folder(), &endpoint, certificates.as_ref(), options)?;
         std::fs::write(process.folder().join("redis.conf"), text)?;
         Ok(Self {
             kind,
             process,
-            port,
+            endpoint,
             certificates,
         })
     }
 
     fn spawn(&self) -> anyhow::Result<()> {
-        let mut command = Command::new(self.kind.program()?);
+        let mut command = self.endpoint.program(self.kind.program()?);
         command.arg("redis.conf");
         self.process.spawn(command)?;
         // The log tells that it has the port: another server there would answer as well.
@@ -127,17 +131,17 @@ impl RedisServer {
         Ok(())
     }
 
-    /// `redis://127.0.0.1:PORT`, or `rediss://…` with TLS.
+    /// `redis://127.0.0.1:PORT`, or with its host's address; `rediss://…` with TLS.
     #[must_use]
     pub fn url(&self) -> String {
         let scheme = if self.certificates.is_some() { "rediss" } else { "redis" };
-        format!("{scheme}://127.0.0.1:{}", self.port)
+        format!("{scheme}://{}:{}", self.endpoint.ip(), self.endpoint.port)
     }
 
     /// The port it listens on.
     #[must_use]
     pub fn port(&self) -> u16 {
-        self.port
+        self.endpoint.port
     }
 
     /// File with the certificate of the authority that signed the server's, in PEM form; `None` without TLS.
@@ -184,7 +188,7 @@ impl RedisServer {
     #[must_use]
     pub fn ping(&self) -> bool {
         match &self.certificates {
-            None => ping(self.port).is_some_and(|answer| is_ready(&answer)),
+            None => ping(&self.endpoint).is_some_and(|answer| is_ready(&answer)),
             Some(_) => {
                 let output = output_within(self.client(&["PING"]), PING);
                 output.is_ok_and(|output| is_ready(&printed(&output)))
@@ -205,8 +209,9 @@ impl RedisServer {
     }
 
     fn client(&self, arguments: &[&str]) -> Command {
-        let mut command = Command::new(installed::folder().join("bin/redis-cli"));
-        command.args(["-e", "-h", "127.0.0.1", "-p", &self.port.to_string()]);
+        let mut command = self.endpoint.program(installed::folder().join("bin/redis-cli"));
+        let (ip, port) = (self.endpoint.ip().to_string(), self.endpoint.port.to_string());
+        command.args(["-e", "-h", &ip, "-p", &port]);
         if let Some(files) = &self.certificates {
             command.arg("--tls").arg("--cacert").arg(&files.authority);
         }
@@ -225,10 +230,11 @@ impl RedisServer {
 
 fn configuration(
     folder: &Path,
-    port: u16,
+    endpoint: &Endpoint,
     tls: Option<&Certificates>,
     options: &RedisOptions,
 ) -> anyhow::Result<String> {
+    let (ip, port) = (endpoint.ip(), endpoint.port);
     let mut text = String::new();
     match tls {
         None => writeln!(text, "port {port}")?,
@@ -239,7 +245,11 @@ fn configuration(
             writeln!(text, "tls-key-file {}", files.key.display())?;
         }
     }
-    writeln!(text, "bind 127.0.0.1\ndir {}\nloglevel notice", folder.display())?;
+    writeln!(
+        text,
+        "bind {ip}\nprotected-mode no\ndir {}\nloglevel notice",
+        folder.display()
+    )?;
     writeln!(text, "save \"\"\nappendonly no\nappendfsync always")?;
     // Large messages to a slow reader: the default of 32 MiB cuts it off.
     writeln!(text, "client-output-buffer-limit pubsub 256mb 128mb 60")?;
@@ -253,9 +263,8 @@ fn configuration(
 }
 
 /// The first line of the answer to `PING`.
-pub(super) fn ping(port: u16) -> Option<String> {
-    let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
-    let mut stream = TcpStream::connect_timeout(&address, PING).ok()?;
+pub(super) fn ping(server: &Endpoint) -> Option<String> {
+    let mut stream = server.connect(PING).ok()?;
     stream.set_read_timeout(Some(PING)).ok()?;
     stream.write_all(b"PING\r\n").ok()?;
     let mut buffer = [0; 256];

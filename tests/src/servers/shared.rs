@@ -5,6 +5,7 @@
 
 use std::sync::OnceLock;
 
+use super::endpoint::Endpoint;
 use super::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, installed, kafka_wire, redis};
 
 type Once<T> = OnceLock<Result<T, String>>;
@@ -54,7 +55,8 @@ fn redis_at(name: &str, kind: RedisKind, own: &'static Once<RedisServer>) -> any
     let port = url
         .strip_prefix("redis://127.0.0.1:")
         .and_then(|port| port.trim_end_matches('/').parse().ok());
-    let answers = port.is_none_or(|port| redis::ping(port).is_some_and(|answer| redis::is_ready(&answer)));
+    let answers =
+        port.is_none_or(|port| redis::ping(&Endpoint::loopback(port)).is_some_and(|answer| redis::is_ready(&answer)));
     anyhow::ensure!(answers, "{}", silent(name, &url));
     Ok(url)
 }
@@ -64,7 +66,7 @@ fn kafka_at(name: &str, own: &'static Once<KafkaServer>) -> anyhow::Result<Strin
         return Ok(started(own, || KafkaServer::start(KafkaOptions::default()))?.bootstrap());
     };
     let port = address.strip_prefix("127.0.0.1:").and_then(|port| port.parse().ok());
-    let answers = port.is_none_or(|port| kafka_wire::metadata(port).is_ok());
+    let answers = port.is_none_or(|port| kafka_wire::metadata(&Endpoint::loopback(port)).is_ok());
     anyhow::ensure!(answers, "{}", silent(name, &address));
     Ok(address)
 }

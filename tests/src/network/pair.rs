@@ -1,29 +1,10 @@
-//! Network namespaces joined by veth pairs: several hosts on one machine.
+//! Hosts that are joined by one wire or one switch, without routers.
 
-use std::process::Command;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use anyhow::Context;
+use super::namespace::run;
 
 static NEXT: AtomicU32 = AtomicU32::new(0);
-
-/// Runs a command.
-///
-/// # Errors
-/// When it fails; the message holds what it printed.
-pub fn run(command: &str) -> anyhow::Result<String> {
-    let output = Command::new("bash")
-        .args(["-c", command])
-        .output()
-        .with_context(|| command.to_owned())?;
-    let text = format!(
-        "{}{}",
-        String::from_utf8_lossy(&output.stdout),
-        String::from_utf8_lossy(&output.stderr)
-    );
-    anyhow::ensure!(output.status.success(), "{command}: {text}");
-    Ok(text)
-}
 
 /// Two hosts and the wire between them.
 pub struct Pair {
@@ -148,111 +129,4 @@ impl Drop for Lan {
             let _ = run(&format!("ip netns del {name}"));
         }
     }
-}
-
-/// Refuses with a sentence for people where namespaces cannot be made.
-///
-/// # Errors
-/// When this is not root, or iproute2 or nftables is missing.
-pub fn check_rights() -> anyhow::Result<()> {
-    let user = run("id -u")?;
-    anyhow::ensure!(
-        user.trim() == "0",
-        "this test makes network namespaces and must be run by root: `sudo -E env PATH=\"$PATH\" cargo test -p blaze-tests --test e2e`"
-    );
-    for tool in ["ip", "nft"] {
-        anyhow::ensure!(
-            run(&format!("command -v {tool}")).is_ok(),
-            "`{tool}` is missing: run `apt-get install -y iproute2 nftables`"
-        );
-    }
-    Ok(())
-}
-
-/// What an interface had sent at some time.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Sample {
-    /// When the counter was read: seconds since 1970, right within [`Sample::MAX_ERROR_S`].
-    pub at_s: f64,
-    /// Ethernet payload bytes.
-    pub bytes: u64,
-    /// Packets.
-    pub packets: u64,
-}
-
-impl Sample {
-    /// Samples whose time is less certain, because their reader had to wait for the processor, are left out.
-    pub const MAX_ERROR_S: f64 = 0.000_5;
-}
-
-/// Reads a host's counter again and again, from a process in its namespace so that no start of a process stands between
-/// the clock and the counter. It ends when dropped.
-pub struct Meter {
-    child: std::process::Child,
-    samples: std::sync::Arc<std::sync::Mutex<Vec<Sample>>>,
-}
-
-impl Meter {
-    /// Starts to read the counter of `v0` every `period_ms`.
-    ///
-    /// # Errors
-    /// When the namespace has gone.
-    pub fn start(namespace: &str, period_ms: u32) -> anyhow::Result<Self> {
-        let script = format!(
-            "cd /sys/class/net/v0/statistics; exec 3<> <(:); \
-             while :; do read -r p < tx_packets; s=$EPOCHREALTIME; read -r b < tx_bytes; echo $s $EPOCHREALTIME $b $p; \
-             read -r -t {}.{:03} -u 3; done",
-            period_ms / 1000,
-            period_ms % 1000
-        );
-        let mut child = Command::new("ip")
-            .args(["netns", "exec", namespace, "bash", "-c", &script])
-            .stdin(std::process::Stdio::null())
-            .stdout(std::process::Stdio::piped())
-            .spawn()?;
-        let samples = std::sync::Arc::<std::sync::Mutex<Vec<Sample>>>::default();
-        let kept = std::sync::Arc::clone(&samples);
-        let out = child.stdout.take().context("no output")?;
-        std::thread::spawn(move || {
-            use std::io::BufRead as _;
-            for line in std::io::BufReader::new(out).lines().map_while(Result::ok) {
-                let mut kept = kept.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-                kept.extend(parse_sample(&line));
-            }
-        });
-        Ok(Self { child, samples })
-    }
-
-    /// What was read so far.
-    #[must_use]
-    pub fn samples(&self) -> Vec<Sample> {
-        self.samples
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner)
-            .clone()
-    }
-}
-
-impl Drop for Meter {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-fn parse_sample(line: &str) -> Option<Sample> {
-    const ETHERNET_HEADER: u64 = 14;
-    let mut words = line.split_whitespace();
-    let before: f64 = words.next()?.parse().ok()?;
-    let after: f64 = words.next()?.parse().ok()?;
-    let bytes: u64 = words.next()?.parse().ok()?;
-    let packets: u64 = words.next()?.parse().ok()?;
-    if after - before > 2.0 * Sample::MAX_ERROR_S {
-        return None;
-    }
-    Some(Sample {
-        at_s: (before + after) / 2.0,
-        bytes: bytes.saturating_sub(packets * ETHERNET_HEADER),
-        packets,
-    })
 }

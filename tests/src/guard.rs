@@ -1,5 +1,5 @@
-//! Ends servers that outlive the test's process, which may die without running a destructor (a signal, an abort, a server
-//! kept in a static).
+//! Ends servers and network namespaces that outlive the test's process, which may die without running a destructor (a signal,
+//! an abort, a server kept in a static).
 //!
 //! One shell per process reads a pipe that only this process holds. When the pipe closes, the process has gone, and the
 //! shell kills what was not taken off its list. A process counts only while its start time is the one that was noted, so
@@ -15,16 +15,22 @@ use parking_lot::Mutex;
 
 const SCRIPT: &str = r#"
 trap '' INT TERM HUP
-declare -A started folder
-while IFS=' ' read -r verb pid time path; do
+declare -A started folder namespace
+while IFS=' ' read -r verb name time path; do
   case "$verb" in
-    add) started[$pid]=$time; folder[$pid]=$path ;;
-    remove) unset "started[$pid]" "folder[$pid]" ;;
+    add) started[$name]=$time; folder[$name]=$path ;;
+    remove) unset "started[$name]" "folder[$name]" ;;
+    add-namespace) namespace[$name]=1 ;;
+    remove-namespace) unset "namespace[$name]" ;;
   esac
 done
 for pid in "${!started[@]}"; do
   read -r -a stat 2>/dev/null < "/proc/$pid/stat" && [ "${stat[21]}" = "${started[$pid]}" ] && kill -KILL "$pid"
   rm -rf -- "${folder[$pid]}"
+done
+for name in "${!namespace[@]}"; do
+  for pid in $(ip netns pids "$name" 2>/dev/null); do kill -KILL "$pid"; done
+  ip netns del "$name" 2>/dev/null
 done
 "#;
 
@@ -34,15 +40,28 @@ static GUARD: Mutex<Option<ChildStdin>> = Mutex::new(None);
 ///
 /// # Errors
 /// When there is no such process, or no guard can be started.
-pub(super) fn add(pid: u32, folder: &Path) -> anyhow::Result<()> {
+pub(crate) fn add(pid: u32, folder: &Path) -> anyhow::Result<()> {
     let start = start_time(pid).with_context(|| format!("process {pid} has gone"))?;
     tell(&format!("add {pid} {start} {}\n", folder.display()))
 }
 
 /// The process has ended and was reaped.
-pub(super) fn remove(pid: u32) {
+pub(crate) fn remove(pid: u32) {
     // A guard that is gone has nothing to forget.
     let _ = tell(&format!("remove {pid}\n"));
+}
+
+/// From now on the namespace goes with this process, and so does what runs in it.
+///
+/// # Errors
+/// When no guard can be started.
+pub(crate) fn add_namespace(name: &str) -> anyhow::Result<()> {
+    tell(&format!("add-namespace {name}\n"))
+}
+
+/// The namespace has gone.
+pub(crate) fn remove_namespace(name: &str) {
+    let _ = tell(&format!("remove-namespace {name}\n"));
 }
 
 fn tell(line: &str) -> anyhow::Result<()> {
@@ -52,7 +71,7 @@ fn tell(line: &str) -> anyhow::Result<()> {
         None => guard.insert(start()?),
     };
     pipe.write_all(line.as_bytes())
-        .context("the guard of the servers has gone")
+        .context("the guard of this process has gone")
 }
 
 fn start() -> anyhow::Result<ChildStdin> {
@@ -64,7 +83,7 @@ fn start() -> anyhow::Result<ChildStdin> {
         .stderr(Stdio::null())
         .process_group(0)
         .spawn()
-        .context("starting the guard of the servers")?;
+        .context("starting the guard of this process")?;
     child.stdin.take().context("the guard has no pipe")
 }
 

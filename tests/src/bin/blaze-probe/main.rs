@@ -1,0 +1,107 @@
+//! A service which publishes or listens, and counts: what `blaze demo` does not play. Either it brings a flow of its own
+//! in the same process (`--listen`), or it is an ordinary service on a broker that has one (`--redis`, `--kafka`). Tests run
+//! several of them on one machine in network namespaces; since they share a clock, the latencies are true.
+
+mod ear;
+mod site;
+mod source;
+
+use std::net::Ipv4Addr;
+use std::str::FromStr;
+use std::time::Duration;
+
+use blaze_domain::{LayerName, NodeName, Reliability, ServiceName, TopicName};
+use clap::{Parser, ValueEnum};
+
+use site::Site;
+
+/// From this size on a topic is large.
+pub(crate) const LARGE_BYTES: usize = 65_536;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Role {
+    /// With a flow of its own: edge/probe-1
+    Publish,
+    /// With a flow of its own: cloud/probe-2
+    Listen,
+}
+
+/// Publishes or listens, and counts. SIGUSR1 ends the publishing; it stays until it is ended itself or its time is over.
+#[derive(Debug, Clone, Parser)]
+pub(crate) struct Options {
+    pub(crate) role: Role,
+    /// With a flow of its own: address of the one interface that is used
+    #[arg(long, required_unless_present_any = ["redis", "kafka"])]
+    pub(crate) listen: Option<Ipv4Addr>,
+    /// The other host
+    #[arg(long)]
+    pub(crate) peer: Option<Ipv4Addr>,
+    #[arg(long, default_value_t = 0)]
+    pub(crate) domain: u16,
+    #[arg(long, default_value_t = 160.0)]
+    pub(crate) limit_mbps: f64,
+    /// On the Redis of a node scope instead: its URL
+    #[arg(long, conflicts_with_all = ["listen", "kafka"], requires = "layer", requires = "node")]
+    pub(crate) redis: Option<String>,
+    /// On the Kafka of a layer scope instead: HOST:PORT
+    #[arg(long, conflicts_with = "listen", requires = "layer", requires = "node")]
+    pub(crate) kafka: Option<String>,
+    /// Layer of the flow
+    #[arg(long)]
+    pub(crate) layer: Option<LayerName>,
+    /// Node of the service
+    #[arg(long)]
+    pub(crate) node: Option<NodeName>,
+    #[arg(long, default_value = "probe")]
+    pub(crate) service: ServiceName,
+    /// NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS
+    #[arg(long, required = true)]
+    pub(crate) topic: Vec<Topic>,
+    /// Seconds
+    #[arg(long, default_value_t = 60)]
+    pub(crate) duration: u64,
+}
+
+#[derive(Debug, Clone)]
+pub(crate) struct Topic {
+    pub(crate) name: TopicName,
+    pub(crate) reliability: Reliability,
+    pub(crate) hz: f64,
+    pub(crate) bytes: usize,
+    pub(crate) lifespan: Duration,
+}
+
+impl FromStr for Topic {
+    type Err = anyhow::Error;
+
+    fn from_str(text: &str) -> anyhow::Result<Self> {
+        let parts: Vec<&str> = text.split(',').collect();
+        let [name, reliability, hz, bytes, lifespan] = parts[..] else {
+            anyhow::bail!("{text}: NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS is expected")
+        };
+        Ok(Self {
+            name: name.parse()?,
+            reliability: match reliability {
+                "reliable" => Reliability::Reliable,
+                "best_effort" => Reliability::BestEffort,
+                other => anyhow::bail!("{other}: reliable or best_effort is expected"),
+            },
+            hz: hz.parse()?,
+            bytes: bytes.parse()?,
+            lifespan: Duration::from_millis(lifespan.parse()?),
+        })
+    }
+}
+
+#[tokio::main]
+async fn main() -> anyhow::Result<()> {
+    let options = Options::parse();
+    let site = Site::start(&options).await?;
+    eprintln!("ready node={} admin={}", site.node, site.admin);
+    match options.role {
+        Role::Publish => source::publish(&site.service, &options).await?,
+        Role::Listen => ear::listen(&site.service, &options).await?,
+    }
+    site.end().await;
+    Ok(())
+}

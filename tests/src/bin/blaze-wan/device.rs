@@ -1,0 +1,84 @@
+//! TUN devices in other namespaces.
+
+use std::fs::File;
+use std::io::{Read as _, Seek as _};
+
+use anyhow::Context as _;
+use blaze_tests::network::inside;
+use parking_lot::Mutex;
+use tun::Device;
+
+/// Nicer processes wait: on a busy machine a packet would be late by a time slice of theirs.
+const PRIORITY: i32 = -20;
+
+/// A TUN device. Its file stays valid whatever namespace the thread that uses it is in.
+pub(crate) struct Tun {
+    device: Device,
+    name: String,
+    /// `/proc/thread-self/net/dev` of the device's namespace.
+    counters: Mutex<File>,
+}
+
+/// Makes a device in a namespace and sets it up; it has no address yet.
+pub(crate) fn open(namespace: &str, name: &str, mtu: u16) -> anyhow::Result<Tun> {
+    inside(namespace, || {
+        let mut configuration = tun::configure();
+        configuration.tun_name(name).mtu(mtu).up();
+        let device = tun::create(&configuration).with_context(|| format!("a TUN device {name} in {namespace}"))?;
+        let counters = File::open("/proc/thread-self/net/dev").context("the counters of the interfaces")?;
+        Ok(Tun {
+            device,
+            name: name.to_owned(),
+            counters: Mutex::new(counters),
+        })
+    })
+}
+
+impl Tun {
+    /// The next packet that the namespace sends; waits for it.
+    pub(crate) fn recv(&self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        self.device.recv(buffer)
+    }
+
+    /// Gives the namespace a packet.
+    pub(crate) fn send(&self, packet: &[u8]) -> std::io::Result<()> {
+        self.device.send(packet).map(|_| ())
+    }
+
+    /// Packets that the namespace wanted to send and the kernel dropped, because its queue was full.
+    pub(crate) fn missed(&self) -> anyhow::Result<u64> {
+        let mut text = String::new();
+        let mut counters = self.counters.lock();
+        counters.rewind()?;
+        counters.read_to_string(&mut text)?;
+        missed(&text, &self.name).with_context(|| format!("{} is not among the interfaces", self.name))
+    }
+}
+
+/// The twelfth number of an interface's line: dropped while sending.
+fn missed(text: &str, name: &str) -> Option<u64> {
+    let line = text.lines().find_map(|line| {
+        let (interface, numbers) = line.split_once(':')?;
+        (interface.trim() == name).then_some(numbers)
+    })?;
+    line.split_whitespace().nth(11)?.parse().ok()
+}
+
+/// Puts this thread, and those that it starts, before others where the system lets it.
+pub(crate) fn hurry() {
+    // Without the right to it packets are later on a busy machine, and nothing else.
+    let _ = rustix::process::setpriority_process(None, PRIORITY);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_right_counter_is_read() {
+        let text = "Inter-|   Receive  |  Transmit\n face |bytes packets errs drop fifo frame compressed multicast|…\n  \
+                    lo: 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16\n  w0:21 22 23 24 25 26 27 28 29 30 31 32 33 34 35 36\n";
+        assert_eq!(missed(text, "w0"), Some(32));
+        assert_eq!(missed(text, "w1"), None);
+    }
+}

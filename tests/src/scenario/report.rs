@@ -1,0 +1,194 @@
+//! What a scenario measured.
+
+use std::time::Duration;
+
+use super::Expect;
+
+/// One topic at one consumer.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Route {
+    /// Consumer.
+    pub consumer: String,
+    /// Topic.
+    pub topic: String,
+    /// Messages published, from the first on; those before the route was up are no loss.
+    pub sent: u64,
+    /// Messages received.
+    pub received: u64,
+    /// Missing between the first received and the last published.
+    pub lost: u64,
+    /// Repeats.
+    pub duplicated: u64,
+    /// Came after a later one.
+    pub reordered: u64,
+    /// From publishing to the consumer's callback, ms, sorted; of the time in which faults are played.
+    pub latencies_ms: Vec<f64>,
+}
+
+impl Route {
+    /// The latency in ms that a share (0 to 1) of the messages does not exceed; `None` without any.
+    #[must_use]
+    pub fn latency_ms(&self, share: f64) -> Option<f64> {
+        let rank = ((share * self.latencies_ms.len() as f64).ceil() as usize).max(1);
+        self.latencies_ms.get(rank - 1).copied()
+    }
+
+    fn faults(&self, expect: &Expect) -> Option<String> {
+        let once_in_order = self.duplicated == 0 && self.reordered == 0;
+        let holds = match expect {
+            Expect::Whole(..) => self.received > 0 && self.lost == 0 && once_in_order,
+            Expect::LostAtMost(_, _, share) => {
+                let all = self.lost + self.received;
+                self.received > 0 && self.lost as f64 <= share * all as f64 && once_in_order
+            }
+            Expect::Received(_, _, least) => self.received >= *least,
+            Expect::P99(_, _, most) => self
+                .latency_ms(0.99)
+                .is_some_and(|p99| Duration::from_secs_f64(p99 / 1e3) <= *most),
+        };
+        (!holds).then(|| format!("{expect:?} does not hold: {self}"))
+    }
+}
+
+impl std::fmt::Display for Route {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let latency = |share| {
+            self.latency_ms(share)
+                .map_or("–".to_owned(), |milliseconds| format!("{milliseconds:.2}"))
+        };
+        write!(
+            f,
+            "{:<16} {:<20} {:>9} {:>9} {:>6} {:>6} {:>9} {:>8} {:>8} {:>8}",
+            self.consumer,
+            self.topic,
+            self.sent,
+            self.received,
+            self.lost,
+            self.duplicated,
+            self.reordered,
+            latency(0.5),
+            latency(0.99),
+            latency(1.0)
+        )
+    }
+}
+
+/// All topics at all consumers.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Report {
+    /// Of the scenario.
+    pub name: String,
+    /// In the order of the scenario.
+    pub routes: Vec<Route>,
+}
+
+impl Report {
+    /// A topic at a consumer.
+    #[must_use]
+    pub fn route(&self, consumer: &str, topic: &str) -> Option<&Route> {
+        let mut routes = self.routes.iter();
+        routes.find(|route| route.consumer == consumer && route.topic == topic)
+    }
+
+    /// Whether all that was expected holds.
+    ///
+    /// # Errors
+    /// Names all that does not, with the table.
+    pub fn check(&self, expect: &[Expect]) -> anyhow::Result<()> {
+        let faults = expect.iter().filter_map(|expect| {
+            let (Expect::Whole(consumer, topic)
+            | Expect::LostAtMost(consumer, topic, _)
+            | Expect::Received(consumer, topic, _)
+            | Expect::P99(consumer, topic, _)) = expect;
+            match self.route(consumer, topic) {
+                Some(route) => route.faults(expect),
+                None => Some(format!("there is no {topic} at {consumer}")),
+            }
+        });
+        let faults: Vec<String> = faults.collect();
+        anyhow::ensure!(faults.is_empty(), "{}\n{self}", faults.join("\n"));
+        Ok(())
+    }
+}
+
+impl std::fmt::Display for Report {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        writeln!(
+            f,
+            "{}\n{:<16} {:<20} {:>9} {:>9} {:>6} {:>6} {:>9} {:>8} {:>8} {:>8}",
+            self.name,
+            "CONSUMER",
+            "TOPIC",
+            "SENT",
+            "RECEIVED",
+            "LOST",
+            "TWICE",
+            "REORDERED",
+            "p50/ms",
+            "p99/ms",
+            "MAX/ms"
+        )?;
+        self.routes.iter().try_for_each(|route| writeln!(f, "{route}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn report() -> Report {
+        let route = Route {
+            consumer: "recorder".to_owned(),
+            topic: "imu".to_owned(),
+            sent: 1_000,
+            received: 990,
+            lost: 10,
+            latencies_ms: (1..=100).map(f64::from).collect(),
+            ..Route::default()
+        };
+        Report {
+            name: "a scenario".to_owned(),
+            routes: vec![route],
+        }
+    }
+
+    #[test]
+    fn what_is_expected_is_checked() {
+        let report = report();
+        let route = &report.routes[0];
+        assert_eq!(
+            (route.latency_ms(0.5), route.latency_ms(0.99)),
+            (Some(50.0), Some(99.0))
+        );
+        report
+            .check(&[
+                Expect::LostAtMost("recorder", "imu", 0.01),
+                Expect::Received("recorder", "imu", 990),
+                Expect::P99("recorder", "imu", Duration::from_millis(99)),
+            ])
+            .unwrap();
+        for wrong in [
+            Expect::Whole("recorder", "imu"),
+            Expect::LostAtMost("recorder", "imu", 0.009),
+            Expect::Received("recorder", "imu", 991),
+            Expect::P99("recorder", "imu", Duration::from_millis(98)),
+            Expect::Received("recorder", "odom", 1),
+            Expect::Received("player", "imu", 1),
+        ] {
+            assert!(report.check(std::slice::from_ref(&wrong)).is_err(), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn repeats_are_never_expected() {
+        for (duplicated, reordered) in [(1, 0), (0, 1)] {
+            let mut report = report();
+            report.routes[0].lost = 0;
+            report.check(&[Expect::Whole("recorder", "imu")]).unwrap();
+            report.routes[0].duplicated = duplicated;
+            report.routes[0].reordered = reordered;
+            assert!(report.check(&[Expect::Whole("recorder", "imu")]).is_err());
+            assert!(report.check(&[Expect::LostAtMost("recorder", "imu", 1.0)]).is_err());
+        }
+    }
+}
