@@ -81,6 +81,7 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
             lane,
         }],
         blocked: Vec::new(),
+        carrier: None,
     };
     let counter = Arc::new(Counter::default());
     core.apply(now, id, TopicInfo::default(), &plan, |_| {
@@ -109,6 +110,7 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
                 content,
                 at: Instant::now(),
                 broker_age_us: 0,
+                place: None,
             });
         }
         let start = Instant::now();

@@ -212,6 +212,7 @@ impl MemoryHub {
                     content: Content::Frame(frame),
                     at: now,
                     broker_age_us: u64::try_from(now.saturating_duration_since(since).as_micros()).unwrap_or(u64::MAX),
+                    place: None,
                 });
             }
         }
@@ -225,6 +226,7 @@ impl MemoryHub {
             content,
             at: Instant::now(),
             broker_age_us: 0,
+            place: None,
         };
         let mut readers = channel.readers.lock();
         if depth > 0

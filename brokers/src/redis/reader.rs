@@ -280,6 +280,7 @@ fn kept_messages(fields: Vec<(Vec<u8>, Vec<u8>)>, hash: &str, now_ns: u64, now: 
             content: Content::Frame(frame),
             at: now,
             broker_age_us: now_ns.saturating_sub(written_ns) / 1_000,
+            place: None,
         })
         .collect()
 }

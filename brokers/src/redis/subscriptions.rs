@@ -282,6 +282,7 @@ impl Subscriptions {
             content,
             at,
             broker_age_us: 0,
+            place: None,
         };
         channel.readers.retain_mut(|reader| reader.offer(message.clone()));
         if channel.readers.is_empty() {

@@ -48,6 +48,7 @@ fn received(writer: u8, sequence: u64) -> Received {
         content: Content::from_bytes(Bytes::from(frame(writer, sequence))),
         at: Instant::now(),
         broker_age_us: 0,
+        place: None,
     }
 }
 

@@ -4,13 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, BrokerError, PublisherOptions, SubscribeOptions};
+use blaze_brokers::{Begin, Broker, BrokerError, PublisherOptions, SubscribeOptions};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName};
 use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
 
 use super::plane::Plane;
+use crate::control::Duty;
 use crate::lane::path::{TopicId, TopicInfo};
 use crate::lane::writer::NewWriter;
 use crate::plan::{Bridge, Target, TopicPlan};
@@ -85,8 +86,9 @@ impl Routes {
         }
     }
 
-    /// Makes the bridges of a topic equal to its plan.
-    pub(super) fn apply(&self, topic: &TopicName, plan: &TopicPlan, info: TopicInfo) {
+    /// Makes the bridges of a topic equal to its plan. Where the flow gives up to carry it out of the layer: the offsets that
+    /// the next one begins at, by partition, if the broker has any.
+    pub(super) fn apply(&self, topic: &TopicName, plan: &TopicPlan, info: TopicInfo, duty: &Duty) -> Option<Vec<i64>> {
         let now = Instant::now();
         let held = self.plane.read(|state| {
             state.core.find(topic.as_str())?;
@@ -100,7 +102,7 @@ impl Routes {
         });
         if held.is_none() && plan.bridges.is_empty() {
             // A topic of other flows that this one has no part in takes no place here.
-            return;
+            return None;
         }
         let (large, held) = held.unwrap_or_else(|| {
             let large = self.plane.read(|state| state.core.is_large(topic, info.max_bytes));
@@ -121,16 +123,32 @@ impl Routes {
                 made.map_or_else(|| Err(String::new()), |at| writers.swap_remove(at).2)
             });
             state.deliver_early(now, id);
+            let stopped_at = state.core.stopped_at(id);
             let path = state.core.path(id);
-            Some((id, [Scope::Node, Scope::Layer].map(|scope| (scope, path.reads(scope)))))
+            let reads = [Scope::Node, Scope::Layer].map(|scope| (scope, path.reads(scope)));
+            Some((id, reads, stopped_at))
         });
-        let Some((id, reads)) = applied else {
+        let Some((id, reads, stopped_at)) = applied else {
             tracing::error!(%topic, "too many topics: this one is not carried");
-            return;
+            return None;
         };
         for (scope, wanted) in reads {
-            self.read(id, topic, scope, wanted, large);
+            let begin = match duty {
+                Duty::Takes(begin) if scope == Scope::Layer => begin.clone(),
+                _ => Begin::Now,
+            };
+            self.read(
+                &Reading {
+                    id,
+                    topic,
+                    scope,
+                    large,
+                },
+                wanted,
+                begin,
+            );
         }
+        (*duty == Duty::GivesUp && !stopped_at.is_empty()).then_some(stopped_at)
     }
 
     /// Whether what a topic's bridges read is subscribed.
@@ -191,22 +209,32 @@ impl Routes {
         Ok(NewWriter { publisher, options })
     }
 
-    fn read(&self, id: TopicId, topic: &TopicName, scope: Scope, wanted: bool, large: bool) {
+    /// Reads a scope for a topic, or no longer. A `begin` other than now is where bridges out of the layer begin that the topic
+    /// gets now.
+    fn read(&self, reading: &Reading<'_>, wanted: bool, begin: Begin) {
+        let &Reading {
+            id,
+            topic,
+            scope,
+            large,
+        } = reading;
         let mut sources = self.sources.lock();
         let held = sources.remove(&(id, scope));
         if !wanted {
+            drop(sources);
             if let Some(source) = held {
                 source.task.stop();
+                self.plane.read(|state| state.core.reads_no_more(id));
             }
             return;
         }
         let before = match held {
-            Some(source) if source.large == large => {
+            Some(source) if source.large == large && begin == Begin::Now => {
                 sources.insert((id, scope), source);
                 return;
             }
             Some(source) => {
-                tracing::info!(%topic, %scope, large, "the subscription moves to the connection for its size");
+                tracing::info!(%topic, %scope, large, ?begin, "the subscription begins anew");
                 source.task.stop();
                 Some(source.task)
             }
@@ -225,12 +253,21 @@ impl Routes {
                 ..SubscribeOptions::default()
             },
             state: Arc::clone(&state),
+            begin,
             before,
         };
         let name = format!("source {scope} {topic}");
         let task = self.supervisor.spawn(name, TaskPolicy::Essential, source.run());
         sources.insert((id, scope), Source { task, state, large });
     }
+}
+
+/// What is to be read.
+struct Reading<'a> {
+    id: TopicId,
+    topic: &'a TopicName,
+    scope: Scope,
+    large: bool,
 }
 
 /// Reads one topic from one scope.
@@ -242,19 +279,38 @@ struct SourceTask {
     scope: Scope,
     options: SubscribeOptions,
     state: Arc<Mutex<SourceState>>,
+    /// Where bridges out of the layer begin.
+    begin: Begin,
     /// The task that it replaces: two at a time would read everything twice.
     before: Option<TaskHandle>,
 }
 
 impl SourceTask {
     async fn run(mut self) {
+        let again = self.before.is_some();
         if let Some(before) = self.before.take() {
             before.finished().await;
         }
+        let mut begin = match self.scope {
+            Scope::Layer => self
+                .plane
+                .read(|state| state.core.begin_reading(self.topic, &self.begin, again)),
+            Scope::Node | Scope::Inter => Begin::Now,
+        };
         let mut reported = false;
         loop {
-            match self.broker.subscribe(&self.channel, self.options).await {
+            match self
+                .broker
+                .subscribe_from(&self.channel, self.options, begin.clone())
+                .await
+            {
                 Ok(mut subscription) => {
+                    // What comes after an outage begins then.
+                    begin = Begin::Now;
+                    if !subscription.starts().is_empty() && self.scope == Scope::Layer {
+                        self.plane
+                            .read(|state| state.core.reads_from(self.topic, subscription.starts()));
+                    }
                     *self.state.lock() = SourceState::Subscribed;
                     reported = false;
                     let mut batch = Vec::with_capacity(BATCH);

@@ -10,6 +10,7 @@ use bytes::Bytes;
 use super::core::{DataConfig, DataCore};
 use super::measure::micros;
 use super::path::TopicId;
+use super::reading::For;
 use super::window::DuplicateWindow;
 
 /// Where a message stands when it reaches the bridges.
@@ -22,6 +23,8 @@ pub(super) struct Admitted {
     pub(super) age_us: u64,
     /// Since it came to this flow.
     pub(super) here_us: u64,
+    /// Which bridges it is for.
+    pub(super) meant: For,
 }
 
 impl Admitted {
@@ -33,6 +36,7 @@ impl Admitted {
             born_here,
             age_us,
             here_us,
+            meant: For::All,
         }
     }
 }
@@ -45,6 +49,7 @@ impl DataCore {
         topic: TopicId,
         from: Scope,
         received: Received,
+        meant: For,
     ) -> Result<Admitted, DropReason> {
         let at = received.at;
         let waited_us = received.broker_age_us + micros(now.saturating_duration_since(at));
@@ -75,7 +80,8 @@ impl DataCore {
         if foreign {
             return Err(DropReason::ForeignOrigin);
         }
-        if !self.is_new(topic, &frame) {
+        // What is read again was noted the first time; the flow that gets it drops what it had.
+        if meant != For::Outside && !self.is_new(topic, &frame) {
             // What a flow has written carries hops; a publisher that repeats itself does not.
             return Err(if born_here {
                 DropReason::Duplicate
@@ -93,7 +99,10 @@ impl DataCore {
         path.largest_bytes = path.largest_bytes.max(bytes);
         path.in_rate.add(now, bytes);
         let here_us = micros(now.saturating_duration_since(at));
-        Ok(Admitted::new(frame, born_here, age_us, here_us))
+        Ok(Admitted {
+            meant,
+            ..Admitted::new(frame, born_here, age_us, here_us)
+        })
     }
 
     /// Gives a bare payload its header.

@@ -22,6 +22,7 @@ use super::early::Early;
 use super::measure::micros;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use super::places::topic_id;
+use super::reading::For;
 use super::stats::Drops;
 use super::window::DuplicateWindow;
 use super::writer::{NewWriter, Writer};
@@ -207,7 +208,11 @@ impl DataCore {
         link: &mut dyn LaneLink,
     ) {
         for received in batch.drain(..) {
-            match self.check_local(now, wall_ns, topic, from, received) {
+            let meant = match from {
+                Scope::Layer => self.path_mut(topic).places.take(received.place),
+                Scope::Node | Scope::Inter => For::All,
+            };
+            match self.check_local(now, wall_ns, topic, from, received, meant) {
                 Ok(admitted) => self.fan_out(now, topic, from, &admitted, link),
                 Err(reason) => self.topics[topic.0 as usize].ingress_drops.add(reason, 1),
             }
@@ -348,7 +353,7 @@ impl DataCore {
         let path = &mut self.topics[topic.0 as usize];
         let large = path.largest_bytes.max(path.info.max_bytes.unwrap_or(0)) > large_bytes;
         for bridge in path.bridges.iter_mut().filter(|bridge| bridge.from == from) {
-            if bridge.takes() && bridge.wants(message) {
+            if bridge.takes() && bridge.wants(message) && bridge.is_meant(message.meant) {
                 bridge.pass(now, topic, message, large, link);
             }
         }

@@ -7,6 +7,7 @@ mod early;
 pub mod measure;
 pub mod path;
 mod places;
+pub mod reading;
 pub mod stats;
 pub mod window;
 pub mod writer;

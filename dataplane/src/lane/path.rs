@@ -7,6 +7,7 @@ use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WriterId};
 
 use super::core::FORGET;
 use super::measure::RateMeter;
+use super::reading::Places;
 use super::stats::{BridgeStats, Drops};
 use super::writer::Writer;
 use crate::limit::bucket::TokenBucket;
@@ -198,6 +199,8 @@ pub struct TopicPath {
     pub in_rate: RateMeter,
     /// Dropped before any bridge: echoes, duplicates, what could not be read.
     pub ingress_drops: Drops,
+    /// Where the layer scope is read, if its broker keeps places.
+    pub places: Places,
     /// Identity that the flow gives to bare messages, per source scope.
     pub bare: BTreeMap<Scope, (WriterId, u64)>,
     /// Since when nobody has used it.
@@ -217,6 +220,7 @@ impl TopicPath {
             largest_bytes: 0,
             in_rate: RateMeter::new(now),
             ingress_drops: Drops::default(),
+            places: Places::default(),
             bare: BTreeMap::new(),
             idle: None,
             vacant: false,

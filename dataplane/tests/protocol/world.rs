@@ -192,6 +192,7 @@ impl<'a> Simulation<'a> {
                 epoch,
                 node_scope: true,
                 layer_scope: Some(layer_scope),
+                replicas: false,
                 inter_scope: true,
                 layer_answers_need_id: false,
                 layer_names: LayerNames::Any,
@@ -497,6 +498,7 @@ impl<'a> Simulation<'a> {
                     content,
                     at: now,
                     broker_age_us: 0,
+                    place: None,
                 }];
                 flow.plane.ingest(now, wall, id, *scope, &mut batch);
             }
@@ -519,13 +521,14 @@ impl<'a> Simulation<'a> {
             match output {
                 Output::Publish { .. }
                 | Output::LayerScope { .. }
+                | Output::Replicas { .. }
                 | Output::SaveLease(_)
                 | Output::Prepare { .. }
                 | Output::Release { .. } => {}
                 Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
                 Output::Announce { version, digest } => engine.set_registry(now, version, digest),
                 Output::State(state) => engine.set_state(now, hello_state(state)),
-                Output::Plan { topic, plan, info } => {
+                Output::Plan { topic, plan, info, .. } => {
                     let Some(id) = flow.plane.core.intern(&topic, now) else {
                         continue;
                     };

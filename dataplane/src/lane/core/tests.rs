@@ -115,6 +115,7 @@ impl Bench {
         let plan = TopicPlan {
             bridges,
             blocked: Vec::new(),
+            carrier: None,
         };
         let out = Arc::clone(&self.out);
         self.core.apply(self.now, self.topic, info, &plan, |_| {
@@ -132,6 +133,7 @@ impl Bench {
                 content,
                 at: self.now,
                 broker_age_us: 0,
+                place: None,
             })
             .collect();
         self.core
@@ -443,6 +445,7 @@ impl Bench {
         let plan = TopicPlan {
             bridges: vec![bridge(Scope::Node, Target::Layer)],
             blocked: Vec::new(),
+            carrier: None,
         };
         self.core
             .apply(self.now, self.topic, TopicInfo::default(), &plan, |_| match writer {
