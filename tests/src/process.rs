@@ -132,10 +132,19 @@ impl Process {
     /// # Errors
     /// When it does not end in time.
     pub fn terminate(&mut self, deadline: Duration) -> anyhow::Result<Option<i32>> {
+        self.ask_to_end()?;
+        self.exit(deadline)
+    }
+
+    /// Asks it to end (SIGTERM) and does not wait.
+    ///
+    /// # Errors
+    /// When nobody can be asked.
+    pub fn ask_to_end(&self) -> anyhow::Result<()> {
         Command::new("kill")
             .args(["-TERM", &self.child.id().to_string()])
             .status()?;
-        self.exit(deadline)
+        Ok(())
     }
 
     /// Waits for its end and gives its exit code.
