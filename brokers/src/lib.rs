@@ -16,6 +16,6 @@ pub mod redis;
 
 pub use open::{OpenError, check_layer, open_layer, open_node};
 pub use port::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, PublishOutcome, Publisher,
-    PublisherOptions, Received, Role, SubscribeOptions, Subscription, SubscriptionSender, subscription,
+    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, Place, PublishOutcome,
+    Publisher, PublisherOptions, Received, Role, SubscribeOptions, Subscription, SubscriptionSender, subscription,
 };

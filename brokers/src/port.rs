@@ -173,6 +173,37 @@ pub struct Received {
     pub broker_age_us: u64,
     /// It was published before the subscription and kept for late joiners.
     pub kept: bool,
+    /// Where it lies on the server, if that keeps messages in places (Kafka).
+    pub place: Option<Place>,
+}
+
+/// Where a message lies on a server that keeps messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Place {
+    /// Number of the partition, from 0.
+    pub partition: usize,
+    /// Its offset there; the next message has a larger one.
+    pub offset: i64,
+    /// When the server took it, in milliseconds of the server's clock since 1970; `None` where it does not tell.
+    pub appended_ms: Option<i64>,
+}
+
+/// Where a subscription begins, on a server that keeps messages; others begin now.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Begin {
+    /// With what is published from now on.
+    #[default]
+    Now,
+    /// At these offsets, by partition; further partitions now. An offset that the server does not have is moved to the nearest.
+    At(Arc<[i64]>),
+    /// With the first message that the server took at that time of its clock (milliseconds since 1970) or later, but never
+    /// behind these offsets, by partition.
+    Since {
+        /// The time.
+        appended_ms: i64,
+        /// No later than here; partitions that are missing have no such bound.
+        latest: Arc<[i64]>,
+    },
 }
 
 /// What a publisher is for.
@@ -290,6 +321,20 @@ pub trait Broker: Send + Sync + 'static {
     /// [`BrokerError`] when it cannot be subscribed now.
     async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError>;
 
+    /// As [`Broker::subscribe`], from a place on the server. A server that keeps no messages begins now.
+    ///
+    /// # Errors
+    /// As [`Broker::subscribe`].
+    async fn subscribe_from(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+        begin: Begin,
+    ) -> Result<Subscription, BrokerError> {
+        let _ = begin;
+        self.subscribe(channel, options).await
+    }
+
     /// What only the flow of a scope does on its broker; absent where the client is a service's, or where nothing outlives
     /// the process.
     fn flow_side(&self) -> Option<Arc<dyn FlowSide>> {
@@ -376,6 +421,8 @@ pub struct SubscriptionSender {
 /// The reader's end of a subscription. Dropping it unsubscribes.
 pub struct Subscription {
     ring: Arc<Ring>,
+    /// Offsets that it begins at, by partition.
+    starts: Vec<i64>,
 }
 
 /// Both ends of a subscription.
@@ -391,7 +438,10 @@ pub fn subscription(options: SubscribeOptions) -> (SubscriptionSender, Subscript
         SubscriptionSender {
             ring: Arc::clone(&ring),
         },
-        Subscription { ring },
+        Subscription {
+            ring,
+            starts: Vec::new(),
+        },
     )
 }
 
@@ -438,6 +488,19 @@ impl SubscriptionSender {
 }
 
 impl Subscription {
+    /// The same, said to begin at these offsets.
+    #[must_use]
+    pub fn starting_at(mut self, starts: Vec<i64>) -> Self {
+        self.starts = starts;
+        self
+    }
+
+    /// Offset of the first message that it can get, by partition; empty where the server has no places.
+    #[must_use]
+    pub fn starts(&self) -> &[i64] {
+        &self.starts
+    }
+
     /// Waits for messages and takes up to `limit` of them into `batch`. Returns how many; 0 = the subscription ended.
     /// Cancelling it loses nothing.
     pub async fn receive(&mut self, batch: &mut Vec<Received>, limit: usize) -> usize {

@@ -81,6 +81,7 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
             lane,
         }],
         blocked: Vec::new(),
+        carrier: None,
     };
     let counter = Arc::new(Counter::default());
     core.apply(now, id, TopicInfo::default(), &plan, |_| {
@@ -110,6 +111,7 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
                 at: Instant::now(),
                 broker_age_us: 0,
                 kept: false,
+                place: None,
             });
         }
         let start = Instant::now();

@@ -3,6 +3,8 @@
 //! The registry builds it from local leases and from what other flows announced; the planner only reads it.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
 
 use blaze_domain::{Durability, FlowId, LayerKind, LayerName, Priority, Reliability, TopicName};
 use sha2::{Digest, Sha256};
@@ -33,6 +35,34 @@ pub struct FlowView {
     pub layer_scope: Option<LayerScopeId>,
     /// What its local services advertise and request.
     pub topics: BTreeMap<TopicName, TopicEntry>,
+    /// It has been ready for as long as it takes to be given what others carry ([`SETTLED_AFTER`]).
+    pub settled: bool,
+    /// What it does for topics, as far as plans of other flows hang on it.
+    pub parts: BTreeMap<TopicName, Part>,
+}
+
+/// A flow that has been ready for this long is given topics that a live one carries.
+pub const SETTLED_AFTER: Duration = Duration::from_secs(5);
+
+/// The part of a flow in one topic.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Part {
+    /// Whether it carries what is published on its layer scope to other groups.
+    pub carrying: Carrying,
+    /// The flows that it sends the topic to over the inter scope, sorted.
+    pub receivers: Vec<FlowId>,
+}
+
+/// Whether a flow carries what services of its layer scope publish to other groups.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Carrying {
+    /// It does not.
+    #[default]
+    No,
+    /// It does.
+    Carries,
+    /// It did, and whoever comes next begins at these offsets, by partition.
+    HandedOver(Arc<[i64]>),
 }
 
 /// Identity of a layer broker; two flows of one layer with the same value reach each other over it.

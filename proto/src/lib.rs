@@ -20,6 +20,15 @@ pub mod link {
     include!(concat!(env!("OUT_DIR"), "/blaze.link.v1.rs"));
 }
 
+impl From<link::link_control::Body> for link::LinkControl {
+    fn from(body: link::link_control::Body) -> Self {
+        Self {
+            body: Some(body),
+            channel: None,
+        }
+    }
+}
+
 /// A priority as it travels; [`Priority::State`](blaze_domain::Priority::State) for one that is not given.
 #[must_use]
 pub fn priority_from_wire(value: i32) -> blaze_domain::Priority {

@@ -245,6 +245,22 @@ impl FlowProcess {
         self.process.kill()
     }
 
+    /// Asks it to end (SIGTERM) and does not wait: it goes on until what it holds has left.
+    ///
+    /// # Errors
+    /// When the system refuses.
+    pub fn terminate(&self) -> anyhow::Result<()> {
+        self.process.ask_to_end()
+    }
+
+    /// Waits for its end and gives its exit code.
+    ///
+    /// # Errors
+    /// When it does not end in time.
+    pub fn exit(&mut self, deadline: Duration) -> anyhow::Result<Option<i32>> {
+        self.process.exit(deadline)
+    }
+
     /// Starts it again with the same node file and does not wait.
     ///
     /// # Errors

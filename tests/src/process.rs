@@ -126,8 +126,16 @@ impl Process {
     /// # Errors
     /// When it does not end in time.
     pub fn terminate(&mut self, deadline: Duration) -> anyhow::Result<Option<i32>> {
-        self.signal(Signal::TERM)?;
+        self.ask_to_end()?;
         self.exit(deadline)
+    }
+
+    /// Asks it to end (SIGTERM) and does not wait.
+    ///
+    /// # Errors
+    /// When nobody can be asked.
+    pub fn ask_to_end(&self) -> anyhow::Result<()> {
+        self.signal(Signal::TERM)
     }
 
     /// Sends it a signal.

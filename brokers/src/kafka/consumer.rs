@@ -60,6 +60,16 @@ pub(super) enum Refused {
     Closed,
 }
 
+/// How a reader joins those that a topic has.
+pub(super) enum Join<'a> {
+    /// With what is read next.
+    Following,
+    /// What lies before that is read once more, for it alone.
+    Rewinding,
+    /// It gets what is kept first, and is refused if records between that and what is read next have been read already.
+    AfterKept(&'a mut dyn FnMut() -> Vec<Received>),
+}
+
 #[derive(Default)]
 struct State {
     topics: HashMap<Arc<str>, TopicState>,
@@ -208,15 +218,14 @@ impl Consumer {
         }
     }
 
-    /// Takes a reader in that begins at the given offsets. `info` is what the server said of the topic just before. With
-    /// `kept` it gets those first, and is refused if records between them and the next ones have been read already.
+    /// Takes a reader in that begins at the given offsets. `info` is what the server said of the topic just before.
     pub(super) fn add(
         &self,
         source: &Source,
         info: &TopicInfo,
         starts: Vec<i64>,
         sender: SubscriptionSender,
-        kept: Option<&mut dyn FnMut() -> Vec<Received>>,
+        join: Join<'_>,
     ) -> Result<(), Refused> {
         let Some(client) = self.client.lock().clone() else {
             return Err(Refused::Closed);
@@ -235,10 +244,15 @@ impl Consumer {
                 topic.made_anew(found.clone(), &self.layer);
                 topic.grow(info.partitions, &self.layer);
                 topic.reassign(&client);
-            } else if kept.is_some() && topic.partitions.iter().zip(&starts).any(|(at, start)| at.next > *start) {
+            } else if matches!(join, Join::AfterKept(_))
+                && topic.partitions.iter().zip(&starts).any(|(at, start)| at.next > *start)
+            {
                 return Err(Refused::Behind(topic.partitions.iter().map(|at| at.next).collect()));
             }
-            topic.take_in(sender, starts, kept);
+            if let Join::Rewinding = join {
+                topic.rewind(&starts, &client);
+            }
+            topic.take_in(sender, starts, join);
             return Ok(());
         }
         let mut topic = TopicState {
@@ -260,7 +274,7 @@ impl Consumer {
         topic
             .assign(&client)
             .map_err(|error| Refused::Failed(error.to_string()))?;
-        topic.take_in(sender, starts, kept);
+        topic.take_in(sender, starts, join);
         state.topics.insert(Arc::clone(&source.topic), topic);
         Ok(())
     }
@@ -284,7 +298,7 @@ impl Consumer {
                 awaited: true,
                 behind: None,
             });
-        topic.take_in(sender, Vec::new(), None);
+        topic.take_in(sender, Vec::new(), Join::Following);
         Ok(())
     }
 

@@ -7,6 +7,7 @@ use parking_lot::Mutex;
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
 use rdkafka::metadata::{Metadata, MetadataTopic};
+use rdkafka::{Offset, TopicPartitionList};
 
 use super::context::{LastError, ReadContext};
 use super::identity::{Identities, TopicUuid};
@@ -158,6 +159,27 @@ impl Directory {
             }
         };
         (0..partitions).map(mark).collect()
+    }
+
+    /// The first offset of each partition whose record the server took at that time of its clock, in milliseconds since 1970,
+    /// or later; `None` where there is none. Waits for the answer.
+    pub(super) fn since(
+        &self,
+        topic: &str,
+        partitions: usize,
+        appended_ms: i64,
+        timeout: Duration,
+    ) -> Result<Vec<Option<i64>>, LookupError> {
+        let mut asked = TopicPartitionList::new();
+        for partition in (0..).take(partitions) {
+            asked.add_partition_offset(topic, partition, Offset::Offset(appended_ms))?;
+        }
+        let answer = self.client()?.offsets_for_times(asked, timeout)?;
+        let offset = |partition: i32| match answer.find_partition(topic, partition)?.offset() {
+            Offset::Offset(offset) => Some(offset),
+            _ => None,
+        };
+        Ok((0..).take(partitions).map(offset).collect())
     }
 
     /// Ends it. Blocks while the client ends.

@@ -15,9 +15,9 @@ use tokio_util::sync::CancellationToken;
 use super::admin::Admin;
 use super::bell::Bell;
 use super::clock::BrokerClock;
-use super::consumer::{Consumer, Refused, Source};
+use super::consumer::{Consumer, Join, Refused, Source};
 use super::context::LastError;
-use super::directory::{Directory, LookupError};
+use super::directory::{Directory, LookupError, Marks};
 use super::flow_side::FlowState;
 use super::gate::Gate;
 use super::names::{self, Names};
@@ -27,7 +27,7 @@ use super::receive::receive;
 use super::record;
 use super::settings::{Lot, Settings};
 use super::topics::Topics;
-use crate::port::{BrokerError, BrokerStatus, Health, Received, SubscribeOptions, Subscription, subscription};
+use crate::port::{Begin, BrokerError, BrokerStatus, Health, Received, SubscribeOptions, Subscription, subscription};
 
 /// Channels that one client reads at most.
 const MAX_CHANNELS: usize = 10_000;
@@ -229,6 +229,7 @@ impl Inner {
         &self,
         channel: &ChannelName,
         options: SubscribeOptions,
+        begin: &Begin,
     ) -> Result<Subscription, BrokerError> {
         let source = Source {
             channel: channel.clone(),
@@ -250,7 +251,7 @@ impl Inner {
                     .add_awaiting(&source, sender)
                     .map_err(|error| refused(&error))?;
                 self.bell.ring();
-                return Ok(subscription);
+                return Ok(subscription.starting_at(vec![0]));
             }
             Err(error) => return Err(error.into()),
         };
@@ -258,10 +259,15 @@ impl Inner {
         let mut ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
         let (sender, subscription) = subscription(options);
         if !options.with_kept {
+            let starts = self.starts(&source.topic, &marks, begin)?;
+            let join = match begin {
+                Begin::Now => Join::Following,
+                Begin::At(_) | Begin::Since { .. } => Join::Rewinding,
+            };
             consumer
-                .add(&source, &info, ends, sender, None)
+                .add(&source, &info, starts.clone(), sender, join)
                 .map_err(|error| refused(&error))?;
-            return Ok(subscription);
+            return Ok(subscription.starting_at(starts));
         }
         let mut reader = ReaderToEnd::open(&self.settings, &self.last_error, &source.topic, &marks)?;
         loop {
@@ -270,12 +276,34 @@ impl Inner {
                 record::is_kept(key).then(|| receive(channel, message, payload, None, &self.clock))
             })?;
             let mut kept = || -> Vec<Received> { reader.take_latest().into_iter().map(|(_, message)| as_kept(message)).collect() };
-            match consumer.add(&source, &info, starts, sender.clone(), Some(&mut kept)) {
+            match consumer.add(&source, &info, starts, sender.clone(), Join::AfterKept(&mut kept)) {
                 Ok(()) => return Ok(subscription),
                 Err(Refused::Behind(next)) => ends = next,
                 Err(error) => return Err(refused(&error)),
             }
         }
+    }
+
+    /// Where a reader begins: on the server, and where it was told to.
+    fn starts(&self, topic: &str, marks: &[Marks], begin: &Begin) -> Result<Vec<i64>, BrokerError> {
+        let wanted: Vec<Option<i64>> = match begin {
+            Begin::Now => vec![None; marks.len()],
+            Begin::At(offsets) => (0..marks.len()).map(|at| offsets.get(at).copied()).collect(),
+            Begin::Since { appended_ms, latest } => {
+                let found = self.directory.since(topic, marks.len(), *appended_ms, SUBSCRIBE)?;
+                let ends = marks.iter().map(|mark| mark.high);
+                let bound = |at: usize| latest.get(at).copied().unwrap_or(i64::MAX);
+                let first = found.into_iter().zip(ends).enumerate();
+                first
+                    .map(|(at, (found, end))| Some(found.unwrap_or(end).min(bound(at))))
+                    .collect()
+            }
+        };
+        let start = |(mark, wanted): (&Marks, Option<i64>)| match wanted {
+            Some(offset) => offset.clamp(mark.low, mark.high.max(mark.low)),
+            None => mark.high,
+        };
+        Ok(marks.iter().zip(wanted).map(start).collect())
     }
 
     fn check_subscribe(&self, source: &Source) -> Result<(), BrokerError> {

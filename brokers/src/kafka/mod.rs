@@ -47,7 +47,7 @@ use tokio_util::sync::CancellationToken;
 use crate::open::OpenError;
 use crate::outbox::{Body, Lane};
 use crate::port::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome, Publisher,
+    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome, Publisher,
     PublisherOptions, Role, SubscribeOptions, Subscription,
 };
 use bell::Bell;
@@ -210,8 +210,17 @@ impl Broker for KafkaBroker {
     }
 
     async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError> {
+        self.subscribe_from(channel, options, Begin::Now).await
+    }
+
+    async fn subscribe_from(
+        &self,
+        channel: &ChannelName,
+        options: SubscribeOptions,
+        begin: Begin,
+    ) -> Result<Subscription, BrokerError> {
         let (inner, channel) = (Arc::clone(&self.inner), channel.clone());
-        let subscribe = tokio::task::spawn_blocking(move || inner.subscribe(&channel, options));
+        let subscribe = tokio::task::spawn_blocking(move || inner.subscribe(&channel, options, &begin));
         subscribe.await.unwrap_or_else(|_| Err(BrokerError::Closed))
     }
 

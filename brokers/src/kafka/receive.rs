@@ -12,7 +12,7 @@ use rdkafka::message::{BorrowedMessage, Headers as _, Message as _, Timestamp};
 
 use super::clock::BrokerClock;
 use super::record;
-use crate::port::{Content, Received};
+use crate::port::{Content, Place, Received};
 
 /// A record as it goes to readers.
 pub(super) fn receive(
@@ -23,10 +23,16 @@ pub(super) fn receive(
     clock: &Mutex<BrokerClock>,
 ) -> Received {
     let at = Instant::now();
-    let broker_age_us = match message.timestamp() {
-        Timestamp::LogAppendTime(appended) => clock.lock().age_us(appended, at),
-        Timestamp::CreateTime(_) | Timestamp::NotAvailable => 0,
+    let appended_ms = match message.timestamp() {
+        Timestamp::LogAppendTime(appended) => Some(appended),
+        Timestamp::CreateTime(_) | Timestamp::NotAvailable => None,
     };
+    let broker_age_us = appended_ms.map_or(0, |appended| clock.lock().age_us(appended, at));
+    let place = usize::try_from(message.partition()).ok().map(|partition| Place {
+        partition,
+        offset: message.offset(),
+        appended_ms,
+    });
     let payload = Bytes::copy_from_slice(payload);
     let content = if channel.is_reserved() {
         Content::Bare { payload, identity }
@@ -38,6 +44,7 @@ pub(super) fn receive(
         at,
         broker_age_us,
         kept: false,
+        place,
     }
 }
 

@@ -213,6 +213,7 @@ impl MemoryHub {
                     at: now,
                     broker_age_us: u64::try_from(now.saturating_duration_since(since).as_micros()).unwrap_or(u64::MAX),
                     kept: true,
+                    place: None,
                 });
             }
         }
@@ -227,6 +228,7 @@ impl MemoryHub {
             at: Instant::now(),
             broker_age_us: 0,
             kept: false,
+            place: None,
         };
         let mut readers = channel.readers.lock();
         if depth > 0

@@ -281,6 +281,7 @@ fn kept_messages(fields: Vec<(Vec<u8>, Vec<u8>)>, hash: &str, now_ns: u64, now: 
             at: now,
             broker_age_us: now_ns.saturating_sub(written_ns) / 1_000,
             kept: true,
+            place: None,
         })
         .collect()
 }

@@ -283,6 +283,7 @@ impl Subscriptions {
             at,
             broker_age_us: 0,
             kept: false,
+            place: None,
         };
         channel.readers.retain_mut(|reader| reader.offer(message.clone()));
         if channel.readers.is_empty() {

@@ -49,6 +49,7 @@ fn received(writer: u8, sequence: u64) -> Received {
         at: Instant::now(),
         broker_age_us: 0,
         kept: false,
+        place: None,
     }
 }
 

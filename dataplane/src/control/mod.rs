@@ -9,7 +9,9 @@
 //! Without input or output: what it wants done comes out of [`ControlCore::poll`]. Production carries it out with tasks and
 //! brokers, the simulated network with plain calls.
 
+mod carrying;
 mod info;
+mod replicas;
 mod routes;
 mod scopes;
 
@@ -26,9 +28,12 @@ use bytes::Bytes;
 use crate::lane::path::TopicInfo;
 use crate::link::LinkEvent;
 use crate::plan::{PlanRules, TopicPlan, plan_topic};
-use crate::registry::{EventDraft, LayerNames, Registry, RegistryConfig, UnsavedLease};
+use crate::registry::{EventDraft, LayerNames, MAX_ROUTES, Registry, RegistryConfig, UnsavedLease, carrying_states};
 use crate::world::{FlowState, LayerScopeId, OriginFilter, Reach, World};
+use carrying::Carriers;
+pub use carrying::Duty;
 use info::{durable_sources, local_info};
+use replicas::Replicas;
 use routes::route_states;
 pub use scopes::ScopeHealth;
 use scopes::{LOCAL, Scopes};
@@ -69,6 +74,15 @@ pub enum Output {
         plan: TopicPlan,
         /// What local advertisements say.
         info: Box<TopicInfo>,
+        /// What changes of who carries it out of the layer. After [`Duty::GivesUp`] call [`ControlCore::given_up`].
+        duty: Duty,
+    },
+    /// Put a message on the channel that flows share on the layer broker.
+    Replicas {
+        /// The message.
+        body: Bytes,
+        /// It is of no use later.
+        deadline: Option<Instant>,
     },
     /// Say this version and digest in Hello.
     Announce {
@@ -124,6 +138,8 @@ pub struct ControlConfig {
     pub node_scope: bool,
     /// Its layer broker.
     pub layer_scope: Option<LayerScopeId>,
+    /// Flows that share the layer broker have a channel of their own there (Kafka).
+    pub replicas: bool,
     /// Whether it has an inter scope, so that it must listen for peers before it is ready.
     pub inter_scope: bool,
     /// Answers on the layer scope share one channel (Kafka, DDS).
@@ -141,6 +157,8 @@ pub struct ControlConfig {
 struct Dirty {
     first: Instant,
     last: Instant,
+    /// It is planned with the next tick.
+    urgent: bool,
 }
 
 /// Leases, other flows, plans.
@@ -157,6 +175,8 @@ pub struct ControlCore {
     scopes: Scopes,
     /// Who advertises which topic as transient_local, in any flow.
     durable: BTreeMap<TopicName, BTreeSet<OriginFilter>>,
+    replicas: Replicas,
+    carriers: Carriers,
     /// Where other flows say that they are found.
     addresses: BTreeMap<FlowId, String>,
     /// Control payloads or parts of them that were refused.
@@ -185,6 +205,8 @@ impl ControlCore {
             started: now,
         });
         Self {
+            replicas: Replicas::new(config.epoch),
+            carriers: Carriers::default(),
             config,
             registry,
             plans: BTreeMap::new(),
@@ -271,7 +293,10 @@ impl ControlCore {
     /// Takes in nothing more: every bridge drains.
     pub fn start_draining(&mut self, now: Instant, wall_ms: u64) {
         self.set_state(now, FlowState::Draining);
-        self.plan_due(now + LATEST, wall_ms);
+        for dirty in self.dirty.values_mut() {
+            dirty.urgent = true;
+        }
+        self.plan_due(now, wall_ms);
     }
 
     /// Takes a payload of the control channel of a scope.
@@ -315,18 +340,19 @@ impl ControlCore {
             LinkEvent::PeerDown { flow, .. } => self.registry.set_reach(now, &flow, Reach::Down),
             LinkEvent::PeerForgotten { flow, .. } => {
                 self.addresses.remove(&flow);
-                self.registry.forget(&flow)
+                self.registry.forget_link(now, &flow)
             }
             _ => BTreeSet::new(),
         };
         self.touch(now, changed);
+        self.hurry(now);
     }
 
     /// Does what is due. To be called every few ten milliseconds.
     pub fn tick(&mut self, now: Instant, wall_ms: u64) {
         let listened = !self.config.inter_scope || now.saturating_duration_since(self.started) >= LISTEN;
         let knows_leases = !LOCAL.iter().any(|scope| self.is_reading_leases(*scope));
-        if self.state == FlowState::Starting && listened && knows_leases {
+        if self.state == FlowState::Starting && listened && knows_leases && self.knows_replicas(now) {
             self.set_state(now, FlowState::Ready);
         }
         let expired = self.registry.expire(now);
@@ -338,6 +364,9 @@ impl ControlCore {
         }
         self.touch(now, expired.changed);
         self.save_leases();
+        let changed = self.registry.watch_flows(now);
+        self.touch(now, changed);
+        self.hurry(now);
         if now.saturating_duration_since(self.reconciled) >= RECONCILE {
             self.reconciled = now;
             self.touch_all(now);
@@ -349,6 +378,7 @@ impl ControlCore {
                 body: Box::new(body),
             });
         }
+        self.tell_replicas(now);
         let announced = self.registry.announced();
         if announced != self.announced {
             self.announced = announced;
@@ -368,6 +398,7 @@ impl ControlCore {
         self.state = state;
         let changed = self.registry.set_state(state);
         self.outputs.push_back(Output::State(state));
+        self.hello_now();
         self.touch(now, changed);
         self.touch_all(now);
     }
@@ -377,7 +408,19 @@ impl ControlCore {
             self.dirty
                 .entry(topic)
                 .and_modify(|dirty| dirty.last = now)
-                .or_insert(Dirty { first: now, last: now });
+                .or_insert(Dirty {
+                    first: now,
+                    last: now,
+                    urgent: false,
+                });
+        }
+    }
+
+    /// A topic is planned with the next tick.
+    fn touch_urgent(&mut self, now: Instant, topic: &TopicName) {
+        self.touch(now, BTreeSet::from([topic.clone()]));
+        if let Some(dirty) = self.dirty.get_mut(topic) {
+            dirty.urgent = true;
         }
     }
 
@@ -389,7 +432,9 @@ impl ControlCore {
 
     fn plan_due(&mut self, now: Instant, wall_ms: u64) {
         let due = |dirty: &Dirty| {
-            now.saturating_duration_since(dirty.last) >= QUIET || now.saturating_duration_since(dirty.first) >= LATEST
+            dirty.urgent
+                || now.saturating_duration_since(dirty.last) >= QUIET
+                || now.saturating_duration_since(dirty.first) >= LATEST
         };
         let topics: Vec<TopicName> = self
             .dirty
@@ -409,6 +454,7 @@ impl ControlCore {
         let mut plan = plan_topic(world, topic, &self.config.rules, previous);
         let had_route = previous.is_some_and(|plan| !plan.bridges.is_empty());
         let durable = durable_sources(world, topic);
+        let carried = previous.is_some_and(TopicPlan::carries_out);
         let fault = if plan.uses_layer() {
             self.registry.put_on_layer(topic).err()
         } else {
@@ -422,6 +468,7 @@ impl ControlCore {
         }
         self.forget_writers(topic, durable);
         let has_route = !plan.bridges.is_empty();
+        let duty = self.duty(now, topic, carried, &plan);
         let world = self.registry.world();
         let info = Box::new(local_info(&self.registry, topic));
         let unused = plan.bridges.is_empty() && world.flows.values().all(|flow| !flow.topics.contains_key(topic));
@@ -430,13 +477,17 @@ impl ControlCore {
         } else {
             self.plans.insert(topic.clone(), plan.clone());
         }
-        let routes = route_states(&self.config.me, &plan, |scope| self.scopes.health(scope));
+        let carrying = self.carrying(now, topic, &plan);
+        let mut routes = carrying_states(&self.config.me, &carrying);
+        routes.extend(route_states(&self.config.me, &plan, |scope| self.scopes.health(scope)));
+        routes.truncate(MAX_ROUTES);
         self.registry.set_route_state(now, topic, routes);
         self.update_channels(topic);
         self.outputs.push_back(Output::Plan {
             topic: topic.clone(),
             plan,
             info,
+            duty,
         });
         if had_route != has_route {
             let kind = if has_route {

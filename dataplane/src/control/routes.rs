@@ -6,9 +6,6 @@ use blaze_proto::link::link_control::RouteState;
 use super::ScopeHealth;
 use crate::plan::{Bridge, Destination, Target, TopicPlan};
 
-/// Routes of one topic that other flows are told of.
-const MAX_ROUTE_STATES: usize = 16;
-
 /// What this flow does for a topic.
 pub(super) fn route_states(me: &FlowId, plan: &TopicPlan, health: impl Fn(Scope) -> ScopeHealth) -> Vec<RouteState> {
     let carried = plan.bridges.iter().map(|bridge| {
@@ -43,7 +40,6 @@ pub(super) fn route_states(me: &FlowId, plan: &TopicPlan, health: impl Fn(Scope)
     let mut states: Vec<RouteState> = carried.chain(blocked).collect();
     // Where there are too many, what fails is told first.
     states.sort_by_key(|state| state.ok);
-    states.truncate(MAX_ROUTE_STATES);
     states
 }
 

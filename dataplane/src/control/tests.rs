@@ -24,6 +24,7 @@ impl Bench {
             epoch: 1,
             node_scope: true,
             layer_scope: Some(LayerScopeId::kafka("")),
+            replicas: true,
             inter_scope: false,
             layer_answers_need_id: true,
             layer_names: LayerNames::Kafka { prefix_bytes: 0 },

@@ -1,5 +1,7 @@
 //! `GET /v1/…`: what the flow knows and does, as JSON. Each answer also names the flow, its epoch and the time.
 
+mod peers;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -18,7 +20,6 @@ use super::Shared;
 use super::plane::wall_ns;
 use super::routes::SourceState;
 use crate::lane::path::{BridgeState, Phase, Sink, TopicPath};
-use crate::link::{Engine, PeerState};
 use crate::plan::Target;
 use crate::registry::{LeaseView, Terms};
 use crate::world::{Advertise, Request};
@@ -30,7 +31,7 @@ pub(super) fn router(shared: Arc<Shared>) -> Router {
     Router::new()
         .route("/v1/topics", get(topics))
         .route("/v1/bridges", get(bridges))
-        .route("/v1/peers", get(peers))
+        .route("/v1/peers", get(peers::peers))
         .route("/v1/allocation", get(allocation))
         .route("/v1/why", get(super::why::why))
         .with_state(shared)
@@ -209,7 +210,14 @@ async fn bridges(State(shared): App) -> Json<Value> {
         }
     }
     let rows: Vec<Value> = rows.into_iter().map(|(_, _, row)| row).collect();
-    answer(&shared, json!({"bridges": rows}))
+    // What another flow on the same layer broker carries out of the layer.
+    let control = shared.control.lock();
+    let plans = control.plans().iter();
+    let not_owner: Vec<Value> = plans
+        .filter_map(|(topic, plan)| Some(json!({"topic": topic, "owner": plan.carrier.as_ref()?})))
+        .collect();
+    drop(control);
+    answer(&shared, json!({"bridges": rows, "not_owner": not_owner}))
 }
 
 fn scope_and_broker(shared: &Shared, scope: Scope) -> Value {
@@ -281,42 +289,6 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
         "detail": bridge.failure, "class": class, "reliable": bridge.lane.reliable, "max_rate_hz": bridge.lane.max_rate_hz,
         "lifespan_ms": bridge.lane.lifespan_ms,
     })
-}
-
-async fn peers(State(shared): App) -> Json<Value> {
-    let now = Instant::now();
-    let peers = shared
-        .plane
-        .read(|state| state.engine.as_ref().map(Engine::peers).unwrap_or_default());
-    let control = shared.control.lock();
-    let rows: Vec<Value> = peers
-        .iter()
-        .map(|peer| {
-            json!({
-                "flow": peer.flow, "layer": peer.flow.layer, "kind": peer.kind, "epoch": peer.epoch,
-                "version": peer.version, "state": peer_state(peer.state),
-                "last_heard_ms": peer.last_heard.map(|at| rounded(now.saturating_duration_since(at).as_secs_f64() * 1e3)),
-                "rtt_ms": peer.rtt.map(|rtt| rounded(rtt.as_secs_f64() * 1e3)),
-                "clock_offset_ms": peer.clock_offset_ns.map(|ns| rounded(ns as f64 / 1e6)),
-                "clock_error_ms": peer.clock_error.map(|error| rounded(error.as_secs_f64() * 1e3)),
-                "loss": rounded(peer.loss), "address": control.address_of(&peer.flow),
-                "in_step": control.registry().is_in_step_with(&peer.flow),
-                "outstanding_bytes": peer.outstanding_bytes, "window_bytes": peer.window_bytes, "queue_bytes": peer.queue_bytes,
-                "receiving_bytes_per_s": peer.receiving_bytes_per_s.round(),
-                "queueing_delay_ms": rounded(peer.queueing_delay.as_secs_f64() * 1e3),
-            })
-        })
-        .collect();
-    drop(control);
-    answer(&shared, json!({"peers": rows}))
-}
-
-fn peer_state(state: PeerState) -> &'static str {
-    match state {
-        PeerState::Up => "up",
-        PeerState::Suspect => "suspect",
-        PeerState::Down => "down",
-    }
 }
 
 async fn allocation(State(shared): App) -> Json<Value> {

@@ -18,7 +18,8 @@ use tokio_util::sync::CancellationToken;
 
 use super::Shared;
 use super::plane::{News, wall_ns};
-use crate::control::Output;
+use crate::control::{Duty, Output};
+use crate::registry::peers_channel;
 use crate::world::FlowState;
 
 /// How often what is due is looked for.
@@ -41,7 +42,18 @@ pub(super) struct ControlTask {
     pub(super) shared: Arc<Shared>,
     pub(super) ready: Arc<Notify>,
     pub(super) writers: HashMap<(Scope, ChannelName), Arc<dyn Publisher>>,
+    pub(super) leave: Leave,
+}
+
+/// How a flow goes, step by step.
+#[derive(Clone, Default)]
+pub(super) struct Leave {
+    /// It takes in nothing more.
     pub(super) draining: CancellationToken,
+    /// Others have been told where it stopped.
+    pub(super) handed_over: CancellationToken,
+    /// Nothing of it is left to tell.
+    pub(super) gone: CancellationToken,
 }
 
 impl ControlTask {
@@ -54,7 +66,7 @@ impl ControlTask {
         let (mut of_node, mut of_layer): (Vec<Received>, Vec<Received>) = (Vec::new(), Vec::new());
         loop {
             tokio::select! {
-                () = self.draining.cancelled() => break,
+                () = self.leave.draining.cancelled() => break,
                 _ = tick.tick() => {}
                 () = self.shared.plane.news() => {}
                 () = node.receive(&mut of_node) => {}
@@ -73,7 +85,24 @@ impl ControlTask {
             }
             self.work();
         }
+        self.drain(tick).await;
+    }
+
+    /// Takes in nothing more, but tells others how it goes on until the flow has nothing left to do.
+    async fn drain(&mut self, mut tick: tokio::time::Interval) {
         self.shared.control.lock().start_draining(Instant::now(), wall_ms());
+        loop {
+            self.work();
+            if self.shared.control.lock().has_handed_over() {
+                self.leave.handed_over.cancel();
+            }
+            tokio::select! {
+                () = self.leave.gone.cancelled() => break,
+                _ = tick.tick() => {}
+                () = self.shared.plane.news() => {}
+            }
+        }
+        self.shared.control.lock().say_goodbye();
         self.work();
     }
 
@@ -94,7 +123,6 @@ impl ControlTask {
         for (channel, other) in collisions.unwrap_or_default() {
             self.refuse_name(now, &channel, other);
         }
-        let mut outputs = Vec::new();
         {
             let mut control = self.shared.control.lock();
             for news in self.shared.plane.take_news() {
@@ -111,9 +139,11 @@ impl ControlTask {
                 }
             }
             control.tick(now, wall_ms());
-            outputs.extend(std::iter::from_fn(|| control.poll()));
         }
-        for output in outputs {
+        // Not locked meanwhile: what is carried out may have a consequence, which is carried out too.
+        loop {
+            let output = self.shared.control.lock().poll();
+            let Some(output) = output else { break };
             self.carry_out(now, output);
         }
         for (topic, writer) in self.shared.plane.with(|state| state.core.take_superseded()) {
@@ -126,7 +156,7 @@ impl ControlTask {
     fn carry_out(&mut self, now: Instant, output: Output) {
         let plane = &self.shared.plane;
         match output {
-            Output::Publish { scope, channel, body } => self.publish(scope, channel, &body),
+            Output::Publish { scope, channel, body } => self.publish(scope, channel, &body, None),
             Output::Link { to, body } => {
                 plane.with(|state| state.engine.as_mut().map(|engine| engine.send_control(now, &to, *body)));
             }
@@ -149,7 +179,22 @@ impl ControlTask {
                     self.ready.notify_one();
                 }
             }
-            Output::Plan { topic, plan, info } => self.shared.routes.apply(&topic, &plan, *info),
+            Output::Plan {
+                topic,
+                plan,
+                info,
+                duty,
+            } => {
+                let places = self.shared.routes.apply(&topic, &plan, *info, &duty);
+                if duty == Duty::GivesUp {
+                    self.shared.control.lock().given_up(now, wall_ms(), &topic, places);
+                }
+            }
+            Output::Replicas { body, deadline } => {
+                if let Some(channel) = peers_channel() {
+                    self.publish(Scope::Layer, channel, &body, deadline);
+                }
+            }
             Output::LayerScope { shared } => {
                 let said = if shared {
                     self.shared.layer_scope
@@ -215,7 +260,7 @@ impl ControlTask {
         self.shared.brokers.of(scope)?.flow_side()
     }
 
-    fn publish(&mut self, scope: Scope, channel: ChannelName, body: &Bytes) {
+    fn publish(&mut self, scope: Scope, channel: ChannelName, body: &Bytes, deadline: Option<Instant>) {
         let Some(broker) = self.shared.brokers.of(scope) else {
             return;
         };
@@ -236,7 +281,7 @@ impl ControlTask {
                 }
             },
         };
-        writer.publish_bare(body, None);
+        writer.publish_bare(body, deadline);
     }
 }
 

@@ -338,6 +338,14 @@ impl Page {
         self.link
             .with_label_values(&["kept_lease_skipped"])
             .inc_by(control.skipped_leases as f64);
+        let (handed_over, taken_over) = control.handovers();
+        for (event, count) in [
+            ("topic_handed_over", handed_over),
+            ("topic_taken_over", taken_over),
+            ("replica_message_refused", control.refused_replica_messages()),
+        ] {
+            self.link.with_label_values(&[event]).inc_by(count as f64);
+        }
     }
 
     fn text(&self) -> prometheus::Result<String> {

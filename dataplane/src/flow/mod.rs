@@ -4,7 +4,7 @@
 //! |---|---|---|
 //! | control task | control channels, link news → control core → answers, plans | 1 |
 //! | scope task | health of a local broker, the leases that it keeps → control core | per local scope |
-//! | peers task | who else uses the layer's Kafka | 1 where there is one |
+//! | peers task | who else uses the layer's Kafka, and what they say | 1 where there is one |
 //! | source task | one topic of one local scope → message path | per topic and scope that is read |
 //! | pacer thread | link engine → transport, within the budget | 1 |
 //! | transport threads | transport → link engine → message path → brokers | 3 readers and DDS's own |
@@ -32,13 +32,12 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use blaze_brokers::{Broker, BrokerKind};
-use blaze_domain::{FlowId, LayerKind, Priority, Scope};
+use blaze_domain::{FlowId, Priority, Scope};
 use blaze_proto::link::link_control::{Egress as SaidEgress, LayerScope};
 use blaze_runtime::admin::{AdminServer, Readiness};
 use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
-use tokio_util::sync::CancellationToken;
 
 use crate::control::{ControlConfig, ControlCore};
 use crate::lane::core::{DataConfig, DataCore};
@@ -47,6 +46,7 @@ use crate::link::transport::{Endpoint, Transport};
 use crate::link::{DownReason, Engine, EngineConfig, Limits, LinkEvent};
 use crate::registry::{LayerNames, peers_channel};
 use crate::world::LayerScopeId;
+use control_task::Leave;
 pub use epochs::Epochs;
 use health::{readiness, watch_health};
 use pacing::Egress;
@@ -163,7 +163,7 @@ pub struct RunningFlow {
     shared: Arc<Shared>,
     supervisor: Supervisor,
     admin: SocketAddr,
-    draining: CancellationToken,
+    leave: Leave,
     pacer: Option<TaskHandle>,
     control: TaskHandle,
 }
@@ -259,6 +259,7 @@ pub async fn start_with(
             epoch,
             node_scope: brokers.node.is_some(),
             layer_scope,
+            replicas: layer_kind == Some(BrokerKind::Kafka),
             inter_scope: settings.inter.is_some(),
             // Channels there are set up beforehand, so all answers share one.
             layer_answers_need_id: matches!(layer_kind, Some(BrokerKind::Kafka | BrokerKind::Dds)),
@@ -303,15 +304,15 @@ pub async fn start_with(
     admin.serve(&supervisor);
 
     let ready = Arc::new(Notify::new());
-    let draining = CancellationToken::new();
+    let leave = Leave::default();
     let task = control_task::ControlTask {
         shared: Arc::clone(&shared),
         ready: Arc::clone(&ready),
         writers: HashMap::new(),
-        draining: draining.clone(),
+        leave: leave.clone(),
     };
     let control = supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
-    watch_brokers(&shared, &supervisor, (settings.kind, epoch, layer_scope));
+    watch_brokers(&shared, &supervisor, epoch);
     supervisor.spawn(
         "health",
         TaskPolicy::Essential,
@@ -332,7 +333,7 @@ pub async fn start_with(
         shared,
         supervisor,
         admin: address,
-        draining,
+        leave,
         pacer,
         control,
     })
@@ -381,10 +382,10 @@ impl RunningFlow {
     pub async fn drain(&self) {
         let shared = &self.shared;
         shared.readiness.stop();
-        self.draining.cancel();
+        self.leave.draining.cancel();
         let until = Instant::now() + DRAIN;
-        // Its last act is to plan nothing any more: only then are the bridges draining.
-        let _ = tokio::time::timeout(DRAIN, self.control.finished()).await;
+        // Nothing is planned any more, and whoever comes next knows where to begin: only then are the bridges draining.
+        let _ = tokio::time::timeout(DRAIN, self.leave.handed_over.cancelled()).await;
         let still_draining = || {
             shared.plane.with(|state| {
                 state.run_timers(Instant::now());
@@ -397,6 +398,8 @@ impl RunningFlow {
         shared
             .plane
             .with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
+        self.leave.gone.cancel();
+        let _ = tokio::time::timeout(DRAIN, self.control.finished()).await;
         if shared.transport.is_some() {
             tokio::time::sleep(GOODBYE).await;
         }
@@ -449,25 +452,21 @@ fn connect(
 }
 
 /// Starts what follows the local brokers.
-fn watch_brokers(shared: &Arc<Shared>, supervisor: &Supervisor, life: (LayerKind, u64, Option<LayerScopeId>)) {
-    let (kind, epoch, layer_scope) = life;
+fn watch_brokers(shared: &Arc<Shared>, supervisor: &Supervisor, epoch: u64) {
     for scope in [Scope::Node, Scope::Layer] {
         let Some(broker) = shared.brokers.of(scope) else {
             continue;
         };
         let shares = scope == Scope::Layer && broker.kind() == BrokerKind::Kafka;
         let (tell, listened) = watch::channel(true);
-        if let (true, Some(side), Some(channel), Some(id)) = (shares, broker.flow_side(), peers_channel(), layer_scope)
-        {
+        if let (true, Some(side), Some(channel)) = (shares, broker.flow_side(), peers_channel()) {
             tell.send_replace(false);
             let peers = PeersTask {
                 broker: Arc::clone(broker),
                 side,
                 channel,
-                me: shared.me.clone(),
-                kind,
-                epoch,
-                scope: id,
+                shared: Arc::clone(shared),
+                began: epoch,
                 listened: tell,
                 stop: supervisor.shutdown_token(),
             };

@@ -1,7 +1,8 @@
-//! Flows that share a Kafka broker tell one another that they live, so that two layers never use one.
+//! Flows that share a Kafka broker hear one another there: those of one layer share its topics, and two layers never use one.
 //!
 //! ```text
-//! every 500 ms: own Hello ─► blaze/flow/peers ─► Hellos of all ─► Claims ─► stand back, or not
+//! control core: Hello, Delta, … ─► blaze/flow/peers ─┬─► Hellos of other layers ─► Claims ─► stand back, or not
+//!                                                    └─► what the own layer says ─► control core
 //! ```
 //!
 //! Of two layers with one broker and one prefix the one whose flow began first has it; the other's flows bridge nothing there
@@ -11,26 +12,25 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, Content, FlowSide, Health, PublisherOptions, Received, SubscribeOptions, Subscription};
+use blaze_brokers::{Broker, Content, FlowSide, Health, Received, SubscribeOptions, Subscription};
+use blaze_domain::FlowId;
 use blaze_domain::names::ChannelName;
-use blaze_domain::{FlowId, LayerKind};
 use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Body, Hello, Kind, LayerScope, State};
-use bytes::Bytes;
+use blaze_proto::link::link_control::Body;
 use prost::Message as _;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
+use super::Shared;
 use crate::control::LISTEN;
-use crate::world::LayerScopeId;
 
-/// Between two Hellos.
-const HELLO_EVERY: Duration = Duration::from_millis(500);
+/// How often it is looked at who has gone silent.
+const LOOK: Duration = Duration::from_millis(250);
 /// A Hello counts this long.
 const LIVE: Duration = Duration::from_millis(2500);
 /// Flows that are followed.
 const MAX_FLOWS: usize = 1024;
-/// Hellos that are taken at once.
+/// Messages that are taken at once.
 const BATCH: usize = 64;
 
 /// Who else says Hello on the layer broker.
@@ -64,10 +64,13 @@ impl Claims {
     pub(super) fn hear(&mut self, now: Instant, payload: &[u8]) {
         let Ok(LinkControl {
             body: Some(Body::Hello(hello)),
+            channel,
         }) = LinkControl::decode(payload)
         else {
             return;
         };
+        // The life on the link may have begun later than the process.
+        let began = channel.map_or(hello.epoch, |channel| channel.began);
         let Ok(flow) = format!("{}/{}", hello.layer, hello.node).parse::<FlowId>() else {
             return;
         };
@@ -76,7 +79,7 @@ impl Claims {
             Heard::Nobody | Heard::Replica => {}
             Heard::Stranger => {
                 if self.others.len() < MAX_FLOWS || self.others.contains_key(&flow) {
-                    self.others.insert(flow, (hello.epoch, now));
+                    self.others.insert(flow, (began, now));
                 }
             }
         }
@@ -109,15 +112,14 @@ impl Claims {
     }
 }
 
-/// Says Hello on the layer broker and stands back where another layer was first.
+/// Hears the flows on the layer broker, and stands back where another layer was first.
 pub(super) struct PeersTask {
+    pub(super) shared: Arc<Shared>,
     pub(super) broker: Arc<dyn Broker>,
     pub(super) side: Arc<dyn FlowSide>,
     pub(super) channel: ChannelName,
-    pub(super) me: FlowId,
-    pub(super) kind: LayerKind,
-    pub(super) epoch: u64,
-    pub(super) scope: LayerScopeId,
+    /// The epoch that this process began with.
+    pub(super) began: u64,
     /// Is told when this flow has listened long enough to know who was first.
     pub(super) listened: watch::Sender<bool>,
     pub(super) stop: CancellationToken,
@@ -125,14 +127,12 @@ pub(super) struct PeersTask {
 
 impl PeersTask {
     pub(super) async fn run(self) {
-        let mut claims = Claims::new(self.me.clone(), self.epoch);
-        let hello = self.hello();
-        let mut publisher = None;
+        let mut claims = Claims::new(self.shared.me.clone(), self.began);
         let mut subscription: Option<Subscription> = None;
         let mut since = Instant::now();
         let mut standing_back = false;
         let mut batch = Vec::with_capacity(BATCH);
-        let mut tick = tokio::time::interval(HELLO_EVERY);
+        let mut tick = tokio::time::interval(LOOK);
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         loop {
             if subscription.is_none() {
@@ -143,30 +143,13 @@ impl PeersTask {
                     .ok();
                 since = Instant::now();
             }
-            if publisher.is_none() {
-                publisher = self.broker.publisher(&self.channel, PublisherOptions::default()).ok();
-            }
             let ended = tokio::select! {
                 () = self.stop.cancelled() => return,
-                _ = tick.tick() => {
-                    if let Some(publisher) = &publisher {
-                        // One that waits longer would be followed by a newer one.
-                        publisher.publish_bare(&hello, Some(Instant::now() + HELLO_EVERY));
-                    }
-                    false
-                }
+                _ = tick.tick() => false,
                 ended = receive(&mut subscription, &mut batch) => ended,
             };
             let now = Instant::now();
-            for received in batch.drain(..) {
-                if let Content::Bare { payload, .. } = &received.content {
-                    claims.hear(now, payload);
-                }
-            }
-            let health = self.broker.status().borrow().health;
-            if !matches!(health, Health::Up | Health::InUse) {
-                claims.excuse(now);
-            }
+            self.hear(now, &mut claims, &mut batch);
             let first = claims.first(now);
             if first.is_some() != standing_back {
                 standing_back = first.is_some();
@@ -186,26 +169,28 @@ impl PeersTask {
         }
     }
 
-    fn hello(&self) -> Bytes {
-        let kind = match self.kind {
-            LayerKind::Edge => Kind::Edge,
-            LayerKind::Fog => Kind::Fog,
-            LayerKind::Cloud => Kind::Cloud,
-        };
-        let hello = Hello {
-            layer: self.me.layer.to_string(),
-            node: self.me.node.to_string(),
-            kind: kind.into(),
-            epoch: self.epoch,
-            state: State::Ready.into(),
-            layer_scope: LayerScope::Kafka.into(),
-            layer_scope_id: self.scope.0,
-            ..Hello::default()
-        };
-        let message = LinkControl {
-            body: Some(Body::Hello(hello)),
-        };
-        Bytes::from(message.encode_to_vec())
+    fn hear(&self, now: Instant, claims: &mut Claims, batch: &mut Vec<Received>) {
+        let health = self.broker.status().borrow().health;
+        let away = !matches!(health, Health::Up | Health::InUse);
+        if away {
+            claims.excuse(now);
+        }
+        if batch.is_empty() && !away {
+            return;
+        }
+        let mut control = self.shared.control.lock();
+        if away {
+            control.excuse_replicas(now);
+        }
+        for received in batch.drain(..) {
+            if let Content::Bare { payload, .. } = &received.content {
+                claims.hear(now, payload);
+                let appended_ms = received.place.and_then(|place| place.appended_ms);
+                control.replica_message(now, payload, appended_ms);
+            }
+        }
+        drop(control);
+        self.shared.plane.nudge();
     }
 }
 
@@ -219,6 +204,8 @@ async fn receive(subscription: &mut Option<Subscription>, batch: &mut Vec<Receiv
 
 #[cfg(test)]
 mod tests {
+    use blaze_proto::link::link_control::Hello;
+
     use super::*;
 
     fn hello(flow: &str, epoch: u64) -> Vec<u8> {
@@ -229,10 +216,7 @@ mod tests {
             epoch,
             ..Hello::default()
         };
-        LinkControl {
-            body: Some(Body::Hello(hello)),
-        }
-        .encode_to_vec()
+        LinkControl::from(Body::Hello(hello)).encode_to_vec()
     }
 
     /// Who is first after these Hellos, seen by `cloud/b` with epoch 10.

@@ -256,6 +256,11 @@ impl Plane {
         self.news_waits.notified().await;
     }
 
+    /// Something else has news for the control task.
+    pub fn nudge(&self) {
+        self.news_waits.notify_one();
+    }
+
     /// Link events that were dropped because the control core was slow.
     #[must_use]
     pub fn news_dropped(&self) -> u64 {

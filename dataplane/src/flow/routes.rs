@@ -4,13 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, BrokerError, PublisherOptions, SubscribeOptions};
+use blaze_brokers::{Begin, Broker, BrokerError, PublisherOptions, SubscribeOptions};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName};
 use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
 
 use super::plane::Plane;
+use crate::control::Duty;
 use crate::lane::path::{TopicId, TopicInfo};
 use crate::lane::writer::NewWriter;
 use crate::plan::{Bridge, Target, TopicPlan};
@@ -86,8 +87,9 @@ impl Routes {
         }
     }
 
-    /// Makes the bridges of a topic equal to its plan.
-    pub(super) fn apply(&self, topic: &TopicName, plan: &TopicPlan, info: TopicInfo) {
+    /// Makes the bridges of a topic equal to its plan. Where the flow gives up to carry it out of the layer: the offsets that
+    /// the next one begins at, by partition, if the broker has any.
+    pub(super) fn apply(&self, topic: &TopicName, plan: &TopicPlan, info: TopicInfo, duty: &Duty) -> Option<Vec<i64>> {
         let now = Instant::now();
         let held = self.plane.read(|state| {
             state.core.find(topic.as_str())?;
@@ -101,7 +103,7 @@ impl Routes {
         });
         if held.is_none() && plan.bridges.is_empty() {
             // A topic of other flows that this one has no part in takes no place here.
-            return;
+            return None;
         }
         let (large, held) = held.unwrap_or_else(|| {
             let large = self.plane.read(|state| state.core.is_large(topic, info.max_bytes));
@@ -122,22 +124,33 @@ impl Routes {
                 made.map_or_else(|| Err(String::new()), |at| writers.swap_remove(at).2)
             });
             state.deliver_waiting(now, id);
+            let stopped_at = state.core.stopped_at(id);
             let path = state.core.path(id);
             let reads = |scope| (scope, path.reads(scope), path.reads_kept(scope));
-            Some((id, [Scope::Node, Scope::Layer].map(reads)))
+            Some((id, [Scope::Node, Scope::Layer].map(reads), stopped_at))
         });
-        let Some((id, reads)) = applied else {
+        let Some((id, reads, stopped_at)) = applied else {
             tracing::error!(%topic, "too many topics: this one is not carried");
-            return;
+            return None;
         };
         for (scope, wanted, with_kept) in reads {
-            let options = SubscribeOptions {
-                large,
-                with_kept,
-                ..SubscribeOptions::default()
+            let begin = match duty {
+                Duty::Takes(begin) if scope == Scope::Layer => begin.clone(),
+                _ => Begin::Now,
             };
-            self.read(id, topic, scope, wanted, options);
+            self.read(
+                &Reading {
+                    id,
+                    topic,
+                    scope,
+                    large,
+                    with_kept,
+                },
+                wanted,
+                begin,
+            );
         }
+        (*duty == Duty::GivesUp && !stopped_at.is_empty()).then_some(stopped_at)
     }
 
     /// Whether what a topic's bridges read is subscribed.
@@ -198,24 +211,34 @@ impl Routes {
         Ok(NewWriter { publisher, options })
     }
 
-    fn read(&self, id: TopicId, topic: &TopicName, scope: Scope, wanted: bool, options: SubscribeOptions) {
+    /// Reads a scope for a topic, or no longer. A `begin` other than now is where bridges out of the layer begin that the topic
+    /// gets now.
+    fn read(&self, reading: &Reading<'_>, wanted: bool, begin: Begin) {
+        let &Reading {
+            id,
+            topic,
+            scope,
+            large,
+            with_kept,
+        } = reading;
         let mut sources = self.sources.lock();
         let held = sources.remove(&(id, scope));
         if !wanted {
+            drop(sources);
             if let Some(source) = held {
                 source.task.stop();
+                self.plane.read(|state| state.core.reads_no_more(id));
             }
             return;
         }
         let before = match held {
             // Who has begun with what was kept has it.
-            Some(source) if source.large == options.large && (source.with_kept || !options.with_kept) => {
+            Some(source) if source.large == large && (source.with_kept || !with_kept) && begin == Begin::Now => {
                 sources.insert((id, scope), source);
                 return;
             }
             Some(source) => {
-                let (large, with_kept) = (options.large, options.with_kept);
-                tracing::info!(%topic, %scope, large, with_kept, "subscribed anew: for the size, or for what is kept");
+                tracing::info!(%topic, %scope, large, with_kept, ?begin, "the subscription begins anew");
                 source.task.stop();
                 Some(source.task)
             }
@@ -229,13 +252,17 @@ impl Routes {
             channel: topic.into(),
             topic: id,
             scope,
-            options,
+            options: SubscribeOptions {
+                large,
+                with_kept,
+                ..SubscribeOptions::default()
+            },
             state: Arc::clone(&state),
+            begin,
             before,
         };
         let name = format!("source {scope} {topic}");
         let task = self.supervisor.spawn(name, TaskPolicy::Essential, source.run());
-        let (large, with_kept) = (options.large, options.with_kept);
         let source = Source {
             task,
             state,
@@ -244,6 +271,15 @@ impl Routes {
         };
         sources.insert((id, scope), source);
     }
+}
+
+/// What is to be read.
+struct Reading<'a> {
+    id: TopicId,
+    topic: &'a TopicName,
+    scope: Scope,
+    large: bool,
+    with_kept: bool,
 }
 
 /// Reads one topic from one scope.
@@ -255,19 +291,38 @@ struct SourceTask {
     scope: Scope,
     options: SubscribeOptions,
     state: Arc<Mutex<SourceState>>,
+    /// Where bridges out of the layer begin.
+    begin: Begin,
     /// The task that it replaces: two at a time would read everything twice.
     before: Option<TaskHandle>,
 }
 
 impl SourceTask {
     async fn run(mut self) {
+        let again = self.before.is_some();
         if let Some(before) = self.before.take() {
             before.finished().await;
         }
+        let mut begin = match self.scope {
+            Scope::Layer => self
+                .plane
+                .read(|state| state.core.begin_reading(self.topic, &self.begin, again)),
+            Scope::Node | Scope::Inter => Begin::Now,
+        };
         let mut reported = false;
         loop {
-            match self.broker.subscribe(&self.channel, self.options).await {
+            match self
+                .broker
+                .subscribe_from(&self.channel, self.options, begin.clone())
+                .await
+            {
                 Ok(mut subscription) => {
+                    // What comes after an outage begins then.
+                    begin = Begin::Now;
+                    if !subscription.starts().is_empty() && self.scope == Scope::Layer {
+                        self.plane
+                            .read(|state| state.core.reads_from(self.topic, subscription.starts()));
+                    }
                     *self.state.lock() = SourceState::Subscribed;
                     reported = false;
                     let mut batch = Vec::with_capacity(BATCH);

@@ -10,6 +10,7 @@ use bytes::Bytes;
 use super::core::{DataConfig, DataCore};
 use super::measure::micros;
 use super::path::TopicId;
+use super::reading::For;
 use super::window::DuplicateWindow;
 
 /// Where a message stands when it reaches the bridges.
@@ -24,6 +25,8 @@ pub(super) struct Admitted {
     pub(super) here_us: u64,
     /// Published before its bridges were there: only for those that take what was kept.
     pub(super) kept: bool,
+    /// Which bridges it is for.
+    pub(super) meant: For,
 }
 
 impl Admitted {
@@ -36,6 +39,7 @@ impl Admitted {
             age_us,
             here_us,
             kept: false,
+            meant: For::All,
         }
     }
 }
@@ -48,6 +52,7 @@ impl DataCore {
         topic: TopicId,
         from: Scope,
         received: Received,
+        meant: For,
     ) -> Result<Admitted, DropReason> {
         let (at, kept) = (received.at, received.kept);
         let waited_us = received.broker_age_us + micros(now.saturating_duration_since(at));
@@ -78,7 +83,8 @@ impl DataCore {
         if foreign || !self.path(topic).info.takes(&frame) {
             return Err(DropReason::ForeignOrigin);
         }
-        if !self.is_new(topic, &frame) {
+        // What is read again was noted the first time; the flow that gets it drops what it had.
+        if meant != For::Outside && !self.is_new(topic, &frame) {
             // What a flow has written carries hops; a publisher that repeats itself does not.
             return Err(if born_here {
                 DropReason::Duplicate
@@ -98,6 +104,7 @@ impl DataCore {
         let here_us = micros(now.saturating_duration_since(at));
         Ok(Admitted {
             kept,
+            meant,
             ..Admitted::new(frame, born_here, age_us, here_us)
         })
     }

@@ -9,6 +9,7 @@ use super::admit::Admitted;
 use super::core::LaneLink;
 use super::measure::RateMeter;
 use super::path::{BridgeState, Phase, Sink, TopicId};
+use super::reading::For;
 use super::stats::BridgeStats;
 use super::writer::{NewWriter, Writer};
 use crate::limit::bucket::TokenBucket;
@@ -127,6 +128,15 @@ impl BridgeState {
         let frame = &message.frame;
         self.lane
             .carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
+    }
+
+    /// Whether it is among those that a message is for.
+    pub(super) fn is_meant(&self, meant: For) -> bool {
+        match meant {
+            For::All => true,
+            For::Outside => self.receiver().is_some(),
+            For::Inside => self.receiver().is_none(),
+        }
     }
 
     pub(super) fn pass(

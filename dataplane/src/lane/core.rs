@@ -23,6 +23,7 @@ use super::kept::KeptMessages;
 use super::measure::micros;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use super::places::topic_id;
+use super::reading::For;
 use super::stats::Drops;
 use super::window::DuplicateWindow;
 use super::writer::{NewWriter, Writer};
@@ -212,7 +213,11 @@ impl DataCore {
     ) {
         for received in batch.drain(..) {
             let kept = received.kept;
-            match self.check_local(now, wall_ns, topic, from, received) {
+            let meant = match from {
+                Scope::Layer if !kept => self.path_mut(topic).places.take(received.place),
+                Scope::Layer | Scope::Node | Scope::Inter => For::All,
+            };
+            match self.check_local(now, wall_ns, topic, from, received, meant) {
                 Ok(admitted) => self.fan_out(now, topic, from, &admitted, link),
                 // What a broker keeps is read again with each subscription.
                 Err(DropReason::Duplicate | DropReason::Echo) if kept => {}
@@ -359,7 +364,7 @@ impl DataCore {
         let path = &mut self.topics[topic.0 as usize];
         let large = path.is_large(self.config.large_bytes);
         for bridge in path.bridges.iter_mut().filter(|bridge| bridge.from == from) {
-            if bridge.takes() && bridge.wants(message) {
+            if bridge.takes() && bridge.wants(message) && bridge.is_meant(message.meant) {
                 bridge.pass(now, topic, message, large, link);
             }
         }

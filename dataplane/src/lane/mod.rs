@@ -8,6 +8,7 @@ pub mod kept;
 pub mod measure;
 pub mod path;
 mod places;
+pub mod reading;
 pub mod stats;
 pub mod window;
 pub mod writer;

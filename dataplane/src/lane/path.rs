@@ -10,6 +10,7 @@ use blaze_proto::Frame;
 
 use super::core::FORGET;
 use super::measure::RateMeter;
+use super::reading::Places;
 use super::stats::{BridgeStats, Drops};
 use super::writer::Writer;
 use crate::limit::bucket::TokenBucket;
@@ -212,6 +213,8 @@ pub struct TopicPath {
     pub ingress_drops: Drops,
     /// Those at two moments, so that what happened lately can be told.
     ingress_marks: [Drops; 2],
+    /// Where the layer scope is read, if its broker keeps places.
+    pub places: Places,
     /// Identity that the flow gives to bare messages, per source scope.
     pub bare: BTreeMap<Scope, (WriterId, u64)>,
     /// Since when nobody has used it.
@@ -232,6 +235,7 @@ impl TopicPath {
             in_rate: RateMeter::new(now),
             ingress_drops: Drops::default(),
             ingress_marks: Default::default(),
+            places: Places::default(),
             bare: BTreeMap::new(),
             idle: None,
             vacant: false,

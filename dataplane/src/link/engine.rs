@@ -242,7 +242,7 @@ impl Engine {
         if !peer.is_connected() {
             return Err(DropReason::LinkDown);
         }
-        let control = LinkControl { body: Some(body) };
+        let control = LinkControl::from(body);
         if control.encoded_len() > self.config.max_datagram - HEADER_BYTES - RECORD_BYTES {
             return Err(DropReason::TooLarge);
         }

@@ -35,9 +35,9 @@ impl Engine {
         };
         if datagram.header.link_sequence == 0 {
             datagram.for_each(|_, bytes| match LinkControl::decode(bytes) {
-                Ok(LinkControl { body: Some(body) }) => self.control_received(now, &datagram.header, body),
+                Ok(LinkControl { body: Some(body), .. }) => self.control_received(now, &datagram.header, body),
                 // A newer flow may say more than this one knows.
-                Ok(LinkControl { body: None }) => {}
+                Ok(LinkControl { body: None, .. }) => {}
                 Err(_) => self.counters.decode_errors += 1,
             });
         } else {

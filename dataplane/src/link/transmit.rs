@@ -203,5 +203,5 @@ impl Engine {
 }
 
 fn put(out: &mut DatagramBuilder, body: Body) {
-    out.put_control(&LinkControl { body: Some(body) }.encode_to_vec());
+    out.put_control(&LinkControl::from(body).encode_to_vec());
 }

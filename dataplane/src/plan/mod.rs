@@ -37,6 +37,9 @@ pub struct TopicPlan {
     pub bridges: Vec<Bridge>,
     /// Requesters that get nothing, or not everything, and why; sorted, one entry per requester and code.
     pub blocked: Vec<Blocked>,
+    /// Another flow of the group carries what is published on the layer scope to other groups, or is to; `None` where this
+    /// flow does, or nobody needs to.
+    pub carrier: Option<FlowId>,
 }
 
 impl TopicPlan {
@@ -44,6 +47,12 @@ impl TopicPlan {
     #[must_use]
     pub fn uses_layer(&self) -> bool {
         self.bridges.iter().any(Bridge::uses_layer)
+    }
+
+    /// Whether this flow carries what services of the layer scope publish to other groups.
+    #[must_use]
+    pub fn carries_out(&self) -> bool {
+        self.bridges.iter().any(Bridge::carries_out)
     }
 
     /// Makes no bridge from or to the layer scope, because its broker cannot have the topic; says so to the layer, and to
@@ -71,6 +80,12 @@ impl TopicPlan {
 }
 
 impl Bridge {
+    /// Whether it carries what services of the layer scope publish to another group.
+    #[must_use]
+    pub fn carries_out(&self) -> bool {
+        self.from == Scope::Layer && self.to.receiver().is_some()
+    }
+
     /// Whether it reads or writes the layer scope.
     #[must_use]
     pub fn uses_layer(&self) -> bool {
@@ -181,8 +196,9 @@ pub struct Delivery {
 
 /// Plans what the flow `world.me` does for a topic.
 ///
-/// `previous` is the plan in effect: as long as its receivers are still eligible they are kept, so that a flow that joins
-/// moves nothing. Equal inputs give equal plans. A flow that is not `Ready` takes in nothing and has no bridges.
+/// `previous` is the plan in effect: as long as its receivers are still eligible they are kept, until a better one is
+/// [settled](crate::world::FlowView::settled). Equal inputs give equal plans. A flow that is not `Ready` takes in nothing and
+/// has no bridges.
 #[must_use]
 pub fn plan_topic(world: &World, topic: &TopicName, rules: &PlanRules, previous: Option<&TopicPlan>) -> TopicPlan {
     let Some(view) = TopicView::new(world, topic) else {
@@ -206,6 +222,7 @@ pub fn plan_topic(world: &World, topic: &TopicName, rules: &PlanRules, previous:
             .map(|((from, to), lane)| Bridge { from, to, lane })
             .collect(),
         blocked: view.blocked(),
+        carrier: view.other_carrier(),
     }
 }
 
@@ -277,7 +294,7 @@ impl Planner<'_, '_> {
         let mine: Vec<_> = self
             .view
             .publishers_outside()
-            .filter(|publisher| self.view.receiver(publisher, self.view.group, &[]) == Some(self.view.me))
+            .filter(|publisher| self.view.may_receive(publisher))
             .collect();
         let mine = || mine.iter().copied();
         if let Some(own) = self.view.own_node_requester()
@@ -304,7 +321,7 @@ impl Planner<'_, '_> {
             let lane = self
                 .lanes
                 .lane(self.view.pairs([publisher], requesters.iter().copied()));
-            let Some(receiver) = self.view.receiver(publisher, group, &kept) else {
+            let Some(receiver) = self.view.next_receiver(publisher, group, &kept) else {
                 continue;
             };
             let target = Target::Inter {

@@ -5,7 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use blaze_domain::{FlowId, LayerName, Scope, TopicName, WhyCode};
 
 use super::{Blocked, Destination, rendezvous};
-use crate::world::{Advertise, FlowState, FlowView, LayerScopeId, OriginFilter, Reach, Request, TopicEntry, World};
+use crate::world::{
+    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, TopicEntry, World,
+};
 
 /// Flows that reach each other over one layer broker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -101,6 +103,7 @@ fn differ(a: &str, b: &str) -> bool {
 
 /// Publishers and requesters of one topic.
 pub(crate) struct TopicView<'w> {
+    world: &'w World,
     topic: &'w TopicName,
     pub(crate) me: &'w FlowId,
     pub(crate) group: Group<'w>,
@@ -117,6 +120,7 @@ impl<'w> TopicView<'w> {
     pub(crate) fn new(world: &'w World, topic: &'w TopicName) -> Option<Self> {
         let (me, own) = world.flows.get_key_value(&world.me)?;
         let mut view = Self {
+            world,
             topic,
             me,
             group: Group::of(me, own),
@@ -254,18 +258,85 @@ impl<'w> TopicView<'w> {
             .or_else(|| rendezvous::choose(self.topic.as_str(), self.candidates(publisher, group)))
     }
 
+    /// The same for the sender, who leaves the one of `kept` for a better one that has settled.
+    pub(crate) fn next_receiver(
+        &self,
+        publisher: &Publisher<'w>,
+        group: Group<'w>,
+        kept: &[&FlowId],
+    ) -> Option<&'w FlowId> {
+        let held = self.receiver(publisher, group, kept)?;
+        let able = |candidate: &&FlowId| *candidate == held || self.is_settled(candidate);
+        rendezvous::choose(self.topic.as_str(), self.candidates(publisher, group).filter(able))
+    }
+
+    /// Whether this flow may get what a publisher outside sends: its sender says so, or would choose it.
+    pub(crate) fn may_receive(&self, publisher: &Publisher<'w>) -> bool {
+        let part = self.part_of(publisher.flow);
+        part.is_some_and(|part| part.receivers.contains(self.me))
+            && self.candidates(publisher, self.group).any(|flow| flow == self.me)
+            || self.receiver(publisher, self.group, &[]) == Some(self.me)
+    }
+
+    fn part_of(&self, flow: &FlowId) -> Option<&'w Part> {
+        self.world.flows.get(flow)?.parts.get(self.topic)
+    }
+
+    fn is_settled(&self, flow: &FlowId) -> bool {
+        self.world.flows.get(flow).is_some_and(|view| view.settled)
+    }
+
     /// The flow of the own group that carries what is published on the layer scope to other groups.
     pub(crate) fn owner(&self) -> Option<&'w FlowId> {
         self.owner_in(self.group)
     }
 
     /// The same of any group.
+    ///
+    /// Whoever carries the topic stays until it gives it up: only this flow itself gives up what it carries, to a better one
+    /// that has settled, or to the better one of two that both do. Of a flow that is going away its word is awaited, where
+    /// the next one begins.
     pub(crate) fn owner_in(&self, group: Group<'w>) -> Option<&'w FlowId> {
-        let on_layer = |publisher: &&Publisher<'_>| publisher.group == group && publisher.scope == Scope::Layer;
-        rendezvous::choose(
-            self.topic.as_str(),
-            self.publishers.iter().filter(on_layer).map(|publisher| publisher.flow),
-        )
+        let of_group = |publisher: &&Publisher<'_>| publisher.group == group && publisher.scope == Scope::Layer;
+        let able = || self.publishers.iter().filter(of_group).map(|publisher| publisher.flow);
+        let choose = |flows: &mut dyn Iterator<Item = &'w FlowId>| rendezvous::choose(self.topic.as_str(), flows);
+        let current = choose(&mut able().filter(|flow| self.carries_out(flow)));
+        match current {
+            Some(current) if current == self.me => {
+                choose(&mut able().filter(|flow| *flow == current || self.is_settled(flow)))
+            }
+            Some(current) => Some(current),
+            None if self.leaving_carrier(group).is_some() => None,
+            None => choose(&mut able()),
+        }
+    }
+
+    /// Whether a flow says that it carries the topic out of its layer.
+    fn carries_out(&self, flow: &FlowId) -> bool {
+        self.part_of(flow)
+            .is_some_and(|part| part.carrying == Carrying::Carries)
+    }
+
+    /// A flow of a group that is going away and has not said yet where the next one begins.
+    fn leaving_carrier(&self, group: Group<'w>) -> Option<&'w FlowId> {
+        let leaving = |(id, flow): &(&'w FlowId, &'w FlowView)| {
+            flow.state == FlowState::Draining
+                && flow.reach != Reach::Down
+                && *id != self.me
+                && Group::of(id, flow) == group
+        };
+        let mut flows = self.world.flows.iter().filter(leaving);
+        flows.find(|(id, _)| self.carries_out(id)).map(|(id, _)| id)
+    }
+
+    /// The other flow of the own group that carries what is published on the layer scope to other groups, or is to; where
+    /// nobody there wants it, nobody.
+    pub(crate) fn other_carrier(&self) -> Option<FlowId> {
+        let on_layer = |publisher: &&Publisher<'_>| publisher.group == self.group && publisher.scope == Scope::Layer;
+        let outside = || self.requesters.iter().filter(|requester| requester.group != self.group);
+        let published = self.publishers.iter().filter(on_layer);
+        self.pairs(published, outside()).next()?;
+        self.owner().filter(|owner| *owner != self.me).cloned()
     }
 
     /// Requests that this flow or its publishers have a part in and that are not served.

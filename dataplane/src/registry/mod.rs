@@ -15,10 +15,12 @@ mod kept;
 mod leases;
 mod merge;
 mod names;
+mod parts;
 mod peers;
 mod pieces;
 mod pull;
 mod remote;
+mod replicas;
 mod stored;
 mod types;
 mod wire;
@@ -38,11 +40,16 @@ use leases::LeaseTable;
 pub use leases::{LapseReason, LapsedLease, LeaseKey, LeaseView, Terms};
 use names::NameBook;
 pub use names::{LayerNames, NameFault, peers_channel};
+pub use parts::LEGACY;
+use parts::Legacies;
+pub(crate) use parts::carrying_states;
 pub use peers::MAX_FLOWS;
 pub use pieces::MAX_LINK_CONTROL_BYTES;
 use remote::Remote;
+pub use replicas::SILENT;
 pub use stored::{Restored, UnsavedLease};
 pub use types::{AnswerOut, Changes, ControlOutcome, EventDraft, RegistryConfig, RemoteLease, SyncFaults};
+pub(crate) use wire::MAX_ROUTES;
 
 use crate::world::{FlowState, FlowView, Reach, ScopeEntry, World};
 
@@ -55,6 +62,12 @@ pub struct Registry {
     remotes: BTreeMap<FlowId, Remote>,
     world: World,
     outgoing: VecDeque<(FlowId, Body)>,
+    /// For the channel of the layer broker; `None` = everybody there.
+    layer_outgoing: Vec<(Option<FlowId>, Body)>,
+    /// Where flows stopped that carried a topic out of the layer.
+    legacies: Legacies,
+    /// Topics whose carrier has changed.
+    urgent: BTreeSet<TopicName>,
     faults: SyncFaults,
     names: NameBook,
     /// Topics that a bridge of this flow reads from or writes to the layer scope.
@@ -75,6 +88,8 @@ impl Registry {
             node_scope: config.node_scope,
             layer_scope: config.layer_scope,
             topics: BTreeMap::new(),
+            settled: false,
+            parts: BTreeMap::new(),
         };
         Self {
             leases: LeaseTable::new(config.max_leases.min(MAX_LEASED_ENTRIES), config.lease_stores.clone()),
@@ -89,6 +104,9 @@ impl Registry {
                 flows: BTreeMap::from([(config.me.clone(), own)]),
             },
             outgoing: VecDeque::new(),
+            layer_outgoing: Vec::new(),
+            legacies: Legacies::new(),
+            urgent: BTreeSet::new(),
             faults: SyncFaults::default(),
             config,
         }
@@ -415,6 +433,7 @@ impl Registry {
         if same {
             return;
         }
+        self.note_own_part(now, topic, &routes);
         if routes.is_empty() {
             self.routes.remove(topic);
         } else {

@@ -9,7 +9,7 @@ use blaze_proto::link::link_control::{Body, Hello, Kind, RouteState, State};
 use super::remote::Remote;
 use super::types::RemoteLease;
 use super::{Registry, wire};
-use crate::world::{FlowState, FlowView, LayerScopeId, Reach, World};
+use crate::world::{FlowState, FlowView, LayerScopeId, Reach};
 
 /// Most other flows that are followed.
 pub const MAX_FLOWS: usize = 256;
@@ -25,8 +25,18 @@ impl Registry {
         self.announcer.announced()
     }
 
-    /// Another flow said Hello. Returns the topics to plan anew.
+    /// Another flow said Hello on the inter scope. Returns the topics to plan anew.
     pub fn on_hello(&mut self, now: Instant, from: &FlowId, hello: &Hello) -> BTreeSet<TopicName> {
+        let mut changed = self.hear(now, from, hello);
+        if let Some(remote) = self.remotes.get_mut(from) {
+            remote.ways.link.get_or_insert(Reach::Up);
+        }
+        changed.extend(self.update_reach(now, from));
+        changed
+    }
+
+    /// Another flow said Hello somewhere. Returns the topics to plan anew.
+    pub(super) fn hear(&mut self, now: Instant, from: &FlowId, hello: &Hello) -> BTreeSet<TopicName> {
         let Some(kind) = kind_of(hello).filter(|_| {
             *from != self.config.me && from.layer.as_str() == hello.layer && from.node.as_str() == hello.node
         }) else {
@@ -46,7 +56,11 @@ impl Registry {
                 return BTreeSet::new();
             }
             Some(epoch) if hello.epoch == epoch => {}
-            Some(_) => changed = self.forget(from),
+            Some(_) => {
+                // Its life before this one is over.
+                self.inherit(now, from);
+                changed = self.forget(from);
+            }
             None => changed = self.make_room(),
         }
         let is_new = !self.remotes.contains_key(from);
@@ -62,7 +76,15 @@ impl Registry {
             node_scope: false,
             layer_scope,
             topics: BTreeMap::new(),
+            settled: false,
+            parts: BTreeMap::new(),
         });
+        // One that is heard in two places may say of itself what it said before.
+        let state = if is_new || rank(state) >= rank(view.state) {
+            state
+        } else {
+            view.state
+        };
         let same = !is_new && (view.kind, view.state, view.layer_scope) == (kind, state, layer_scope);
         (view.kind, view.state, view.layer_scope) = (kind, state, layer_scope);
         let remote = self.remotes.entry(from.clone()).or_insert_with(Remote::new);
@@ -115,22 +137,27 @@ impl Registry {
             .topics
             .values()
             .any(|entry| entry.node.advertise.is_some() || entry.node.request.is_some());
+        self.note_parts(now, from, &changed);
         changed
     }
 
-    /// Whether another flow can be reached. Returns the topics to plan anew.
-    pub fn set_reach(&mut self, _now: Instant, flow: &FlowId, reach: Reach) -> BTreeSet<TopicName> {
+    /// Whether another flow can be reached over the inter scope. Returns the topics to plan anew.
+    pub fn set_reach(&mut self, now: Instant, flow: &FlowId, reach: Reach) -> BTreeSet<TopicName> {
         let Some(remote) = self.remotes.get_mut(flow) else {
             return BTreeSet::new();
         };
-        match self.world.flows.get_mut(flow) {
-            Some(view) if view.reach != reach => view.reach = reach,
-            _ => return BTreeSet::new(),
+        remote.ways.link = Some(reach);
+        self.update_reach(now, flow)
+    }
+
+    /// The link does not wait for another flow any more. One that is heard on the layer broker stays. Returns the topics to
+    /// plan anew.
+    pub fn forget_link(&mut self, now: Instant, flow: &FlowId) -> BTreeSet<TopicName> {
+        let ways = self.remotes.get(flow).map(|remote| remote.ways);
+        if ways.is_some_and(|ways| ways.over_layer()) {
+            return self.set_reach(now, flow, Reach::Down);
         }
-        if reach == Reach::Down {
-            remote.stop();
-        }
-        self.all_topics()
+        self.forget(flow)
     }
 
     /// The round trip to another flow, which decides when it is asked again.
@@ -155,6 +182,7 @@ impl Registry {
     /// What is to be sent to other flows now; each encodes to at most [`MAX_LINK_CONTROL_BYTES`](super::MAX_LINK_CONTROL_BYTES).
     pub fn poll(&mut self, now: Instant) -> Vec<(FlowId, Body)> {
         let mut messages: Vec<(FlowId, Body)> = self.outgoing.drain(..).collect();
+        let mut layer = Vec::new();
         self.announcer.tidy(now);
         let own = self.world.flows.get(&self.config.me);
         let routes = &self.routes;
@@ -164,14 +192,18 @@ impl Registry {
             (entry.is_some() || routes.is_some())
                 .then(|| wire::to_wire(topic, &entry.cloned().unwrap_or_default(), routes.unwrap_or_default()))
         });
-        for flow in self.remotes.keys().filter(|flow| is_reachable(&self.world, flow)) {
+        for (flow, _) in self.remotes.iter().filter(|(_, remote)| remote.ways.over_link()) {
             messages.extend(deltas.iter().map(|delta| (flow.clone(), Body::Delta(delta.clone()))));
+        }
+        // Those who share the layer broker hear of it there whatever becomes of the link: what is handed over must arrive.
+        if self.remotes.values().any(|remote| remote.ways.over_layer()) {
+            layer.extend(deltas.into_iter().map(|delta| (None, Body::Delta(delta))));
         }
         // First the pulls that go on: one that is given up makes room for another. Then those that waited longest.
         let mut order: Vec<(bool, Instant, FlowId)> = self
             .remotes
             .iter()
-            .filter(|(flow, _)| is_reachable(&self.world, flow))
+            .filter(|(_, remote)| is_reachable(remote))
             .filter_map(|(flow, remote)| {
                 let due = remote.next_poll().filter(|at| *at <= now)?;
                 Some((!remote.is_pulling(), due, flow.clone()))
@@ -186,7 +218,14 @@ impl Registry {
                 .and_then(|remote| remote.poll(now, may_start));
             messages.extend(request.map(|request| (flow, Body::SnapshotRequest(request))));
         }
-        messages
+        // Where there is no link, over the layer broker.
+        let (over_layer, over_link) = messages.into_iter().partition::<Vec<_>, _>(|(flow, _)| {
+            let ways = self.remotes.get(flow).map(|remote| remote.ways);
+            ways.is_some_and(|ways| !ways.over_link() && ways.over_layer())
+        });
+        layer.extend(over_layer.into_iter().map(|(flow, body)| (Some(flow), body)));
+        self.layer_outgoing = layer;
+        over_link
     }
 
     fn pulls(&self) -> usize {
@@ -204,7 +243,7 @@ impl Registry {
         let requests = self
             .remotes
             .iter()
-            .filter(|(flow, remote)| is_reachable(&self.world, flow) && (may_start || remote.is_pulling()));
+            .filter(|(_, remote)| is_reachable(remote) && (may_start || remote.is_pulling()));
         requests
             .filter_map(|(_, remote)| remote.next_poll())
             .chain(self.announcer.due())
@@ -253,8 +292,17 @@ impl Registry {
     }
 }
 
-fn is_reachable(world: &World, flow: &FlowId) -> bool {
-    world.flows.get(flow).is_some_and(|view| view.reach != Reach::Down)
+fn is_reachable(remote: &Remote) -> bool {
+    remote.ways.over_link() || remote.ways.over_layer()
+}
+
+/// A flow begins, is ready, and goes: never the other way round in one life.
+fn rank(state: FlowState) -> u8 {
+    match state {
+        FlowState::Starting => 0,
+        FlowState::Ready => 1,
+        FlowState::Draining => 2,
+    }
 }
 
 fn kind_of(hello: &Hello) -> Option<LayerKind> {

@@ -16,6 +16,7 @@ use blaze_proto::link::link_control as wire;
 use super::announce::MAX_ENTRIES;
 use super::pieces::{entry_hash, join};
 use super::pull::Pull;
+use super::replicas::Ways;
 use super::types::SyncFaults;
 use super::wire::from_wire;
 use crate::world::TopicEntry;
@@ -65,6 +66,10 @@ pub(super) struct Remote {
     /// By `to_version`, then `from_version`.
     pending: BTreeMap<(u64, u64), PartialDelta>,
     retry: Duration,
+    /// How it is reached.
+    pub(super) ways: Ways,
+    /// Since when it has been ready, without a break.
+    pub(super) ready_since: Option<Instant>,
 }
 
 /// The entries of a flow, as its view in the world has them.
@@ -84,6 +89,8 @@ impl Remote {
             failures: 0,
             pending: BTreeMap::new(),
             retry: DEFAULT_RETRY,
+            ways: Ways::default(),
+            ready_since: None,
         }
     }
 
@@ -104,6 +111,11 @@ impl Remote {
 
     pub(super) fn is_in_step(&self) -> bool {
         (self.version, self.digest) == self.heard && !self.doubt
+    }
+
+    /// When the layer broker took the last sign of life, by the server's clock.
+    pub(super) fn last_sign_ms(&self) -> Option<i64> {
+        self.ways.layer?.appended_ms
     }
 
     pub(super) fn is_pulling(&self) -> bool {

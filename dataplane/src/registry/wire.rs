@@ -19,7 +19,7 @@ const MAX_ADVERTISE_BYTES: usize = MAX_PIECE_BYTES - 212;
 /// Most services that an announced entry lists.
 const MAX_ANNOUNCED_SOURCES: usize = 8;
 /// Most routes that an entry tells of.
-pub(super) const MAX_ROUTES: usize = 16;
+pub(crate) const MAX_ROUTES: usize = 16;
 /// Longest text of a route state, in bytes; `layer/node` has 127.
 const MAX_ROUTE_TEXT: usize = 127;
 /// Longest name of a layer, node or service, in bytes.

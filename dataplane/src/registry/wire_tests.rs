@@ -94,7 +94,7 @@ fn any_entry() -> impl Strategy<Value = (TopicName, TopicEntry, Vec<wire::RouteS
 }
 
 fn encoded(body: Body) -> usize {
-    LinkControl { body: Some(body) }.encoded_len()
+    LinkControl::from(body).encoded_len()
 }
 
 proptest! {

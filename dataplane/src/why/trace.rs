@@ -48,7 +48,7 @@ impl Trace {
         let remark = || {
             self.steps
                 .iter()
-                .find(|step| step.code != WhyCode::Ok && step.code != WhyCode::NativePath)
+                .find(|step| !matches!(step.code, WhyCode::Ok | WhyCode::NativePath | WhyCode::NotOwner))
         };
         failing.or_else(remark).map_or(WhyCode::Ok, |step| step.code)
     }
@@ -84,6 +84,7 @@ impl<'w> Tracer<'_, 'w> {
             requested(requester),
         );
         if self.plan(&mut trace, publisher, requester) {
+            self.note_owner(&mut trace, publisher, requester);
             for hop in self.hops(publisher, requester) {
                 self.hop(&mut trace, &hop);
             }
@@ -138,6 +139,18 @@ impl<'w> Tracer<'_, 'w> {
         }
         self.note_broker(trace, publisher, requester);
         true
+    }
+
+    /// Of several flows that share a layer broker one carries what is published there: the others say which.
+    fn note_owner(&self, trace: &mut Trace, publisher: &Publisher<'w>, requester: &Requester<'w>) {
+        let leaves = publisher.scope == Scope::Layer && publisher.group == self.view.group;
+        if !leaves || requester.group == publisher.group || self.view.own_layer_publisher().is_none() {
+            return;
+        }
+        if let Some(owner) = self.view.owner().filter(|owner| *owner != self.view.me) {
+            let detail = format!("{owner} carries it for the layer");
+            trace.add(self.view.me, StepKind::Plan, true, WhyCode::NotOwner, detail);
+        }
     }
 
     /// A broker that loses messages of reliable topics says so.

@@ -193,6 +193,7 @@ impl<'a> Simulation<'a> {
                 epoch,
                 node_scope: true,
                 layer_scope: Some(layer_scope),
+                replicas: false,
                 inter_scope: true,
                 layer_answers_need_id: false,
                 layer_names: LayerNames::Any,
@@ -500,6 +501,7 @@ impl<'a> Simulation<'a> {
                     at: now,
                     broker_age_us: 0,
                     kept: false,
+                    place: None,
                 }];
                 flow.plane.ingest(now, wall, id, *scope, &mut batch);
             }
@@ -522,6 +524,7 @@ impl<'a> Simulation<'a> {
             match output {
                 Output::Publish { .. }
                 | Output::LayerScope { .. }
+                | Output::Replicas { .. }
                 | Output::SaveLease(_)
                 | Output::Prepare { .. }
                 | Output::Release { .. }
@@ -529,7 +532,7 @@ impl<'a> Simulation<'a> {
                 Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
                 Output::Announce { version, digest } => engine.set_registry(now, version, digest),
                 Output::State(state) => engine.set_state(now, hello_state(state)),
-                Output::Plan { topic, plan, info } => {
+                Output::Plan { topic, plan, info, .. } => {
                     let Some(id) = flow.plane.core.intern(&topic, now) else {
                         continue;
                     };

@@ -77,6 +77,7 @@ impl OpenBroker {
             content: Content::from_bytes(bytes.clone()),
             at: std::time::Instant::now(),
             broker_age_us: 0,
+            place: None,
         };
         ends.iter().filter(|end| end.send(message.clone())).count()
     }

@@ -8,6 +8,7 @@ mod demo;
 mod frozen;
 mod garbage;
 mod plain_clients;
+mod replicas;
 mod restarts;
 mod stream;
 mod support;

@@ -7,10 +7,10 @@ use rdkafka::consumer::Consumer as _;
 use rdkafka::error::KafkaError;
 use rdkafka::{Offset, TopicPartitionList};
 
-use super::{Client, Source};
+use super::{Client, Join, Source};
 use crate::kafka::directory::{Marks, TopicInfo};
 use crate::kafka::identity::TopicUuid;
-use crate::port::{Received, SubscriptionSender};
+use crate::port::SubscriptionSender;
 
 pub(super) struct Partition {
     /// Offset of the next record.
@@ -54,16 +54,34 @@ const PATIENCE: Duration = Duration::from_secs(1);
 const MOST_PATIENCE: Duration = Duration::from_secs(60);
 
 impl TopicState {
-    pub(super) fn take_in(
-        &mut self,
-        sender: SubscriptionSender,
-        starts: Vec<i64>,
-        kept: Option<&mut dyn FnMut() -> Vec<Received>>,
-    ) {
-        for received in kept.into_iter().flat_map(|kept| kept()) {
-            sender.send(received);
+    pub(super) fn take_in(&mut self, sender: SubscriptionSender, starts: Vec<i64>, join: Join<'_>) {
+        if let Join::AfterKept(kept) = join {
+            for received in kept() {
+                sender.send(received);
+            }
         }
         self.readers.push(Reader { sender, starts });
+    }
+
+    /// A reader that comes begins before what is read next: it is read again from there, and not given to those that had it.
+    pub(super) fn rewind(&mut self, starts: &[i64], client: &Client) {
+        let mut moved = false;
+        for (number, (partition, start)) in self.partitions.iter_mut().zip(starts).enumerate() {
+            if *start >= partition.next {
+                continue;
+            }
+            for reader in &mut self.readers {
+                if reader.starts.len() <= number {
+                    reader.starts.resize(number + 1, 0);
+                }
+                reader.starts[number] = reader.starts[number].max(partition.next);
+            }
+            partition.next = *start;
+            moved = true;
+        }
+        if moved && self.assigned {
+            self.reassign(client);
+        }
     }
 
     pub(super) fn identify(&mut self, uuid: Option<TopicUuid>, layer: &str) {

@@ -115,6 +115,7 @@ impl Bench {
         let plan = TopicPlan {
             bridges,
             blocked: Vec::new(),
+            carrier: None,
         };
         let out = Arc::clone(&self.out);
         self.core.apply(self.now, self.topic, info, &plan, |_| {
@@ -133,6 +134,7 @@ impl Bench {
                 at: self.now,
                 broker_age_us: 0,
                 kept: false,
+                place: None,
             })
             .collect();
         self.core
@@ -477,6 +479,7 @@ impl Bench {
         let plan = TopicPlan {
             bridges: vec![bridge(Scope::Node, Target::Layer)],
             blocked: Vec::new(),
+            carrier: None,
         };
         self.core
             .apply(self.now, self.topic, TopicInfo::default(), &plan, |_| match writer {

@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use blaze_domain::{Durability, FlowId, LayerKind, Reliability, TopicName};
 
 use crate::world::{
-    Advertise, FlowState, FlowView, LayerScopeId, OriginFilter, Reach, Request, ScopeEntry, Source, TopicEntry, World,
+    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, ScopeEntry, Source,
+    TopicEntry, World,
 };
 
 pub(crate) fn topic() -> TopicName {
@@ -71,12 +72,15 @@ pub(crate) fn flow(layer_scope: Option<u64>) -> FlowView {
         node_scope: true,
         layer_scope: layer_scope.map(LayerScopeId),
         topics: BTreeMap::new(),
+        settled: false,
+        parts: BTreeMap::new(),
     }
 }
 
 /// A world written as one line per flow: `edge/a@1 node+ layer-`: `@1` is its layer broker, `+` an advertisement on
-/// that scope, `-` a request, `-b` a request for bare payloads; `down`, `suspect`, `starting` and `draining` as they
-/// read. The first flow is `me`.
+/// that scope, `-` a request, `-b` a request for bare payloads; `down`, `suspect`, `starting`, `draining` and `settled` as
+/// they read; `carries` and `handed` say who carries the topic out of the layer, `>c/b` whom it is sent to. The first flow is
+/// `me`.
 pub(crate) fn world(lines: &[&str]) -> World {
     let mut flows = BTreeMap::new();
     let mut me = None;
@@ -89,12 +93,17 @@ pub(crate) fn world(lines: &[&str]) -> World {
         };
         let mut view = flow(broker);
         let mut entry = TopicEntry::default();
+        let mut part = Part::default();
         for word in words {
             match word {
                 "down" => view.reach = Reach::Down,
                 "suspect" => view.reach = Reach::Suspect,
                 "starting" => view.state = FlowState::Starting,
                 "draining" => view.state = FlowState::Draining,
+                "settled" => view.settled = true,
+                "carries" => part.carrying = Carrying::Carries,
+                "handed" => part.carrying = Carrying::HandedOver([7].into()),
+                word if word.starts_with('>') => part.receivers.push(id(&word[1..])),
                 "node+" => entry.node.advertise = Some(advertise()),
                 "layer+" => entry.layer.advertise = Some(advertise()),
                 "node-" => entry.node.request = Some(request()),
@@ -110,6 +119,9 @@ pub(crate) fn world(lines: &[&str]) -> World {
             }
         }
         view.topics.insert(topic(), entry);
+        if part != Part::default() {
+            view.parts.insert(topic(), part);
+        }
         me.get_or_insert_with(|| id(name));
         flows.insert(id(name), view);
     }

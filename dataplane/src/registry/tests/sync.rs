@@ -66,7 +66,7 @@ impl Net {
             Body::Feedback(_) | Body::Goodbye(_) => "other",
         };
         *self.sent.entry(name).or_default() += 1;
-        let bytes = LinkControl { body: Some(body) }.encode_to_vec();
+        let bytes = LinkControl::from(body).encode_to_vec();
         assert!(
             bytes.len() <= MAX_LINK_CONTROL_BYTES,
             "{name} has {} bytes",

@@ -1,0 +1,182 @@
+//! Flows of one layer that share a layer broker with a channel of their own (`blaze/flow/peers` on Kafka): what they say there,
+//! and what follows.
+//!
+//! ```text
+//! Hello every 500 ms and when the state changes ─┐
+//! Delta to all, SnapshotRequest and Snapshot to one ─┼─► LinkControl with a `channel`: from, epoch, to ─► ControlCore of the others
+//! Goodbye ───────────────────────────────────────┘
+//! ```
+
+use std::time::{Duration, Instant};
+
+use blaze_domain::{FlowId, LayerKind};
+use blaze_proto::link::LinkControl;
+use blaze_proto::link::link_control::{Body, Channel, Goodbye, Hello, Kind, LayerScope, State};
+use bytes::Bytes;
+use prost::Message as _;
+
+use super::{ControlCore, LISTEN, Output};
+use crate::world::FlowState;
+
+/// Between two Hellos.
+const HELLO_EVERY: Duration = Duration::from_millis(500);
+/// A flow waits so long for what others have announced before it is ready without it.
+const KNOW_OTHERS: Duration = Duration::from_secs(2);
+/// Largest message that is looked at, in bytes: those of flows have at most 1,200, and the names of sender and addressee.
+const MAX_MESSAGE: usize = 4096;
+
+/// What the core remembers of the channel.
+#[derive(Debug, Default)]
+pub(super) struct Replicas {
+    /// When the next Hello is due.
+    next_hello: Option<Instant>,
+    /// The epoch that the process began with.
+    began: u64,
+    /// Messages that could not be read.
+    refused: u64,
+}
+
+impl Replicas {
+    pub(super) fn new(began: u64) -> Self {
+        Self {
+            began,
+            ..Self::default()
+        }
+    }
+}
+
+impl ControlCore {
+    /// Takes what another flow said on the channel of the layer broker; the server took it at `appended_ms` of its clock.
+    pub fn replica_message(&mut self, now: Instant, payload: &[u8], appended_ms: Option<i64>) {
+        let message = (payload.len() <= MAX_MESSAGE).then(|| LinkControl::decode(payload));
+        let Some(Ok(message)) = message else {
+            self.replicas.refused += 1;
+            return;
+        };
+        let (Some(channel), Some(body)) = (message.channel, message.body) else {
+            return;
+        };
+        let Ok(from) = channel.from.parse::<FlowId>() else {
+            self.replicas.refused += 1;
+            return;
+        };
+        let me = &self.config.me;
+        let for_me = channel.to.is_empty() || channel.to == me.to_string();
+        if !for_me || from == *me || from.layer != me.layer {
+            return;
+        }
+        let changed = match body {
+            Body::Hello(hello) => self.registry.on_layer_hello(now, &from, &hello, appended_ms),
+            body => self.registry.on_layer_control(now, &from, channel.epoch, body),
+        };
+        self.touch(now, changed);
+        self.hurry(now);
+    }
+
+    /// The layer broker is away: that nothing is heard says nothing of who lives.
+    pub fn excuse_replicas(&mut self, now: Instant) {
+        self.registry.excuse_silence(now);
+    }
+
+    /// Messages on the channel of the layer broker that could not be read.
+    #[must_use]
+    pub fn refused_replica_messages(&self) -> u64 {
+        self.replicas.refused
+    }
+
+    /// Says on the channel of the layer broker that this flow goes.
+    pub fn say_goodbye(&mut self) {
+        if self.config.replicas {
+            let epoch = self.epoch();
+            self.say(None, Body::Goodbye(Goodbye { epoch }), None);
+        }
+    }
+
+    /// Whether what the flows next to this one have announced is known, or was waited for long enough.
+    pub(super) fn knows_replicas(&self, now: Instant) -> bool {
+        !self.config.replicas
+            || self.registry.knows_replicas()
+            || now.saturating_duration_since(self.started) >= LISTEN + KNOW_OTHERS
+    }
+
+    /// The next Hello goes at once.
+    pub(super) fn hello_now(&mut self) {
+        self.replicas.next_hello = None;
+    }
+
+    /// Says what is due on the channel. To be called after the registry was polled.
+    pub(super) fn tell_replicas(&mut self, now: Instant) {
+        let messages = self.registry.poll_layer();
+        if !self.config.replicas {
+            return;
+        }
+        for (to, body) in messages {
+            self.say(to.as_ref(), body, None);
+        }
+        if self.replicas.next_hello.is_none_or(|at| at <= now) {
+            self.replicas.next_hello = Some(now + HELLO_EVERY);
+            let hello = Body::Hello(self.hello());
+            // One that waits longer would be followed by a newer one.
+            self.say(None, hello, Some(now + HELLO_EVERY));
+        }
+    }
+
+    /// Topics whose carrier has changed are planned at once.
+    pub(super) fn hurry(&mut self, now: Instant) {
+        for topic in self.registry.take_urgent() {
+            self.touch_urgent(now, &topic);
+        }
+    }
+
+    fn epoch(&self) -> u64 {
+        self.registry.world().own().map_or(self.config.epoch, |own| own.epoch)
+    }
+
+    fn hello(&self) -> Hello {
+        let kind = match self.config.kind {
+            LayerKind::Edge => Kind::Edge,
+            LayerKind::Fog => Kind::Fog,
+            LayerKind::Cloud => Kind::Cloud,
+        };
+        let state = match self.state {
+            FlowState::Starting => State::Starting,
+            FlowState::Ready => State::Ready,
+            FlowState::Draining => State::Draining,
+        };
+        let scope = self.registry.world().own().and_then(|own| own.layer_scope);
+        let shown = if scope.is_some() {
+            LayerScope::Kafka
+        } else {
+            LayerScope::None
+        };
+        let (registry_version, registry_digest) = self.registry.announced();
+        Hello {
+            layer: self.config.me.layer.to_string(),
+            node: self.config.me.node.to_string(),
+            kind: kind.into(),
+            epoch: self.epoch(),
+            registry_version,
+            registry_digest,
+            state: state.into(),
+            layer_scope: shown.into(),
+            layer_scope_id: scope.map_or(0, |id| id.0),
+            ..Hello::default()
+        }
+    }
+
+    fn say(&mut self, to: Option<&FlowId>, body: Body, deadline: Option<Instant>) {
+        let message = LinkControl {
+            body: Some(body),
+            channel: Some(Channel {
+                from: self.config.me.to_string(),
+                epoch: self.epoch(),
+                began: self.replicas.began,
+                to: to.map(ToString::to_string).unwrap_or_default(),
+            }),
+        };
+        self.outputs.push_back(Output::Replicas {
+            body: Bytes::from(message.encode_to_vec()),
+            deadline,
+        });
+    }
+}

@@ -1,0 +1,70 @@
+//! `GET /v1/peers`: the other flows, over the inter scope and on the layer broker.
+
+use std::time::{Duration, Instant};
+
+use axum::Json;
+use axum::extract::State;
+use blaze_domain::FlowId;
+use serde_json::{Value, json};
+
+use super::{App, answer, rounded};
+use crate::control::ControlCore;
+use crate::link::{Engine, PeerState};
+use crate::world::{FlowState, Reach};
+
+pub(super) async fn peers(State(shared): App) -> Json<Value> {
+    let now = Instant::now();
+    let peers = shared
+        .plane
+        .read(|state| state.engine.as_ref().map(Engine::peers).unwrap_or_default());
+    let control = shared.control.lock();
+    let rows: Vec<Value> = peers
+        .iter()
+        .map(|peer| {
+            json!({
+                "flow": peer.flow, "layer": peer.flow.layer, "kind": peer.kind, "epoch": peer.epoch,
+                "version": peer.version, "state": peer_state(peer.state),
+                "last_heard_ms": peer.last_heard.map(|at| rounded(now.saturating_duration_since(at).as_secs_f64() * 1e3)),
+                "rtt_ms": peer.rtt.map(|rtt| rounded(rtt.as_secs_f64() * 1e3)),
+                "clock_offset_ms": peer.clock_offset_ns.map(|ns| rounded(ns as f64 / 1e6)),
+                "clock_error_ms": peer.clock_error.map(|error| rounded(error.as_secs_f64() * 1e3)),
+                "loss": rounded(peer.loss), "address": control.address_of(&peer.flow),
+                "in_step": control.registry().is_in_step_with(&peer.flow),
+                "outstanding_bytes": peer.outstanding_bytes, "window_bytes": peer.window_bytes, "queue_bytes": peer.queue_bytes,
+                "receiving_bytes_per_s": peer.receiving_bytes_per_s.round(),
+                "queueing_delay_ms": rounded(peer.queueing_delay.as_secs_f64() * 1e3),
+            })
+        })
+        .collect();
+    let replicas: Vec<Value> = control
+        .registry()
+        .replicas(now)
+        .map(|row| replica_row(&control, row))
+        .collect();
+    drop(control);
+    answer(&shared, json!({"peers": rows, "replicas": replicas}))
+}
+
+/// A flow that shares the layer broker, as it is heard there.
+fn replica_row(control: &ControlCore, (flow, silent): (&FlowId, Duration)) -> Value {
+    let view = control.world().flows.get(flow);
+    let state = view.map(|view| match (view.reach, view.state) {
+        (Reach::Down, _) => "down",
+        (_, FlowState::Starting) => "starting",
+        (_, FlowState::Ready) => "ready",
+        (_, FlowState::Draining) => "draining",
+    });
+    json!({
+        "flow": flow, "epoch": view.map(|view| view.epoch), "state": state,
+        "settled": view.is_some_and(|view| view.settled), "last_heard_ms": rounded(silent.as_secs_f64() * 1e3),
+        "in_step": control.registry().is_in_step_with(flow),
+    })
+}
+
+fn peer_state(state: PeerState) -> &'static str {
+    match state {
+        PeerState::Up => "up",
+        PeerState::Suspect => "suspect",
+        PeerState::Down => "down",
+    }
+}
