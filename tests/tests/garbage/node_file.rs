@@ -52,7 +52,6 @@ fn the_example_of_the_contract_passes_with_warnings() {
     assert_eq!(text(&output.stdout), "");
     let warnings = text(&output.stderr);
     for section in [
-        "brokers.layer.dds",
         "brokers.plugins",
         "config",
         "cache",

@@ -1,0 +1,141 @@
+//! From a DDS sample to the subscriptions of its channel.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+use rustdds::Timestamp;
+use rustdds::no_key::DeserializedCacheChange;
+
+use super::channel::Channel;
+use super::shared::{Shared, WriterFacts};
+use crate::dds::EndpointId;
+use crate::dds::participant::{endpoint_of, prefix_of};
+use crate::dds::sample::Octets;
+use crate::port::{Content, Received};
+
+/// Writers of one channel whose progress is remembered; those that are gone are forgotten first.
+const MAX_WRITERS: usize = 4096;
+/// How much older than the subscription a sample may seem and count as live: clocks are compared over the network.
+const CLOCK_SLACK: Duration = Duration::from_millis(20);
+
+/// Which of the two readers of a channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    Reliable,
+    BestEffort,
+}
+
+/// How far the readers of a channel have come.
+pub(super) struct Progress<'a> {
+    pub(super) opened: Timestamp,
+    pub(super) last: &'a mut HashMap<EndpointId, i64>,
+}
+
+impl Progress<'_> {
+    /// Notes a sample; false when it was delivered before. A topic's samples lie in one cache for both readers.
+    fn is_new(&mut self, shared: &Shared, writer: EndpointId, sequence: i64) -> bool {
+        if self.last.len() >= MAX_WRITERS && !self.last.contains_key(&writer) {
+            let known = shared.writers.read();
+            self.last.retain(|id, _| known.contains_key(id));
+            if self.last.len() >= MAX_WRITERS {
+                self.last.clear();
+            }
+        }
+        let last = self.last.entry(writer).or_insert(i64::MIN);
+        let is_new = sequence > *last;
+        *last = sequence.max(*last);
+        is_new
+    }
+}
+
+pub(super) fn deliver(
+    shared: &Shared,
+    channel: &Channel,
+    kind: Kind,
+    progress: &mut Progress<'_>,
+    sample: DeserializedCacheChange<Octets>,
+) {
+    let now = Timestamp::now();
+    let writer = endpoint_of(sample.writer_guid());
+    let facts = shared.writers.read().get(&writer).copied();
+    if kind == Kind::BestEffort && facts.is_some_and(|facts| facts.reliable) {
+        // The reliable reader has it, in order and complete.
+        return;
+    }
+    if !progress.is_new(shared, writer, i64::from(sample.sequence_number)) {
+        return;
+    }
+    if !channel.with_kept && sample.receive_instant < progress.opened {
+        return;
+    }
+    let age = age_of(shared, facts, &sample, now);
+    if !channel.with_kept && age > since(progress.opened, now) + CLOCK_SLACK {
+        return;
+    }
+    let bytes = sample.into_value().0;
+    let content = if channel.is_reserved {
+        Content::Bare {
+            payload: bytes,
+            identity: None,
+        }
+    } else {
+        Content::from_bytes(bytes)
+    };
+    let received = Received {
+        content,
+        at: Instant::now(),
+        broker_age_us: if channel.with_kept {
+            u64::try_from(age.as_micros()).unwrap_or(u64::MAX)
+        } else {
+            0
+        },
+    };
+    let mut senders = channel.senders.lock();
+    senders.retain(|sender| sender.send(received.clone()));
+}
+
+/// How long ago a sample that its writer keeps for late joiners was written; zero for all others.
+fn age_of(
+    shared: &Shared,
+    facts: Option<WriterFacts>,
+    sample: &DeserializedCacheChange<Octets>,
+    now: Timestamp,
+) -> Duration {
+    if !facts.is_some_and(|facts| facts.durable) {
+        return Duration::ZERO;
+    }
+    let Some(written) = sample.write_options.source_timestamp() else {
+        return Duration::ZERO;
+    };
+    let behind = shared.clocks.read().behind_ns(prefix_of(sample.writer_guid()));
+    let age_ns = nanos(now) - (nanos(written) + behind);
+    Duration::from_nanos(u64::try_from(age_ns.max(0)).unwrap_or(u64::MAX))
+}
+
+fn since(earlier: Timestamp, now: Timestamp) -> Duration {
+    let passed = (nanos(now) - nanos(earlier)).max(0);
+    Duration::from_nanos(u64::try_from(passed).unwrap_or(u64::MAX))
+}
+
+/// Nanoseconds since 1970.
+pub(super) fn nanos(time: Timestamp) -> i128 {
+    (i128::from(time.to_ticks()) * 1_000_000_000) >> 32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn time_of_rustdds_is_time_of_day() {
+        let now = nanos(Timestamp::now());
+        let system = std::time::SystemTime::now()
+            .duration_since(std::time::UNIX_EPOCH)
+            .unwrap()
+            .as_nanos();
+        assert!(i128::try_from(system).unwrap() - now < 1_000_000_000);
+        let later = Timestamp::from_ticks(Timestamp::now().to_ticks() + (3 << 31));
+        assert!(since(Timestamp::now(), later) > Duration::from_millis(1_490));
+        assert_eq!(since(later, Timestamp::now()), Duration::ZERO);
+    }
+}
