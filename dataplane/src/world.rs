@@ -224,7 +224,11 @@ mod tests {
     fn the_identity_of_a_kafka_broker_is_the_same_on_every_machine_and_in_every_version() {
         assert_eq!(LayerScopeId::kafka("").0, 0x7EA7_172E_AAB7_C9FB);
         assert_ne!(LayerScopeId::kafka(""), LayerScopeId::kafka("a."));
-        let domains = [LayerScopeId::dds(1, None), LayerScopeId::dds(2, None), LayerScopeId::dds(1, Some("a"))];
+        let domains = [
+            LayerScopeId::dds(1, None),
+            LayerScopeId::dds(2, None),
+            LayerScopeId::dds(1, Some("a")),
+        ];
         assert!(domains[0] != domains[1] && domains[0] != domains[2]);
         assert_eq!(LayerScopeId::dds(1, Some("a")), domains[2]);
     }

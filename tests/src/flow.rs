@@ -27,6 +27,8 @@ pub struct FlowSpec {
     pub redis: Option<(String, String)>,
     /// Address and prefix of the layer scope's Kafka.
     pub kafka: Option<(String, String)>,
+    /// DDS domain of the layer scope, on loopback.
+    pub layer_domain: Option<u16>,
     /// DDS domain of the inter scope, on loopback.
     pub domain: Option<u16>,
     /// `flow.bandwidth.limit_mbps`.
@@ -45,6 +47,7 @@ impl FlowSpec {
             node: node.to_owned(),
             redis: None,
             kafka: None,
+            layer_domain: None,
             domain: None,
             limit_mbps: 160.0,
             extra: String::new(),
@@ -62,6 +65,13 @@ impl FlowSpec {
     #[must_use]
     pub fn on_kafka(mut self, bootstrap: &str, prefix: &str) -> Self {
         self.kafka = Some((bootstrap.to_owned(), prefix.to_owned()));
+        self
+    }
+
+    /// With a DDS domain on loopback as layer scope.
+    #[must_use]
+    pub fn on_dds(mut self, domain: u16) -> Self {
+        self.layer_domain = Some(domain);
         self
     }
 
@@ -87,6 +97,12 @@ impl FlowSpec {
             let _ = writeln!(
                 text,
                 "  layer: {{ kafka: {{ bootstrap: [\"{bootstrap}\"], prefix: \"{prefix}\" }} }}"
+            );
+        }
+        if let Some(domain) = self.layer_domain {
+            let _ = writeln!(
+                text,
+                "  layer: {{ dds: {{ domain: {domain}, interface: \"127.0.0.1\" }} }}"
             );
         }
         if let Some(domain) = self.domain {

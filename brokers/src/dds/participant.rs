@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use blaze_domain::node_file::MAX_DDS_DOMAIN;
 use bytes::Bytes;
-use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::dds::WriteError;
+use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{
     DataWriterStatus, DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies, QosPolicyBuilder,
     RTPSEntity, StatusEvented, Subscriber, Timestamp, Topic, TopicKind, WriteOptionsBuilder, no_key,
@@ -19,7 +19,7 @@ use super::filter::{self, Attached, FilterError, Samples, Shape};
 use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
-use super::watch::{Endpoints, EndpointWatch, ReaderWatch, RemoteReader};
+use super::watch::{EndpointWatch, Endpoints, ReaderWatch, RemoteReader};
 use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, announcement_port, multicast_port};
 
 /// Identity of one participant on the wire; a rebuilt one has a new identity.

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
+mod dds;
 #[cfg(feature = "kafka")]
 mod kafka;
-mod dds;
 mod redis;

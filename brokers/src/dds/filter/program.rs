@@ -90,7 +90,11 @@ impl Samples {
     fn masks(self) -> Masks {
         let limit = self.largest.max(1).checked_next_power_of_two().unwrap_or(1 << 31);
         let fragments = (limit / FRAGMENT).max(1) - 1;
-        let nack = if self.repaired { fragments.max(MAX_NACK_FRAGMENT) } else { MAX_NACK_FRAGMENT };
+        let nack = if self.repaired {
+            fragments.max(MAX_NACK_FRAGMENT)
+        } else {
+            MAX_NACK_FRAGMENT
+        };
         Masks {
             sample: !(limit - 1),
             nack_fragment: !nack,

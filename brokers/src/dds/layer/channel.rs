@@ -5,21 +5,22 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
 use std::task::{Wake, Waker};
 use std::thread::{self, Thread};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use blaze_domain::names::ChannelName;
-use parking_lot::Mutex;
+use parking_lot::{Mutex, RwLock};
 use rustdds::Timestamp;
 use rustdds::no_key::SimpleDataReader;
 use tokio::sync::oneshot;
 
 use super::deliver::{Kind, Progress, deliver};
+use super::kept::History;
 use super::names;
 use super::shared::Shared;
 use crate::dds::reader::StoppableThread;
 use crate::dds::sample::{Octets, OctetsAdapter};
 use crate::dds::{DdsError, EndpointId, Profile};
-use crate::port::{BrokerError, SubscribeOptions, SubscriptionSender};
+use crate::port::{BrokerError, Content, Received, SubscribeOptions, SubscriptionSender};
 
 /// Channels that one broker reads at most.
 pub const MAX_CHANNELS: usize = 4096;
@@ -28,7 +29,7 @@ const TURN: usize = 256;
 /// A safety net only: RustDDS wakes the thread.
 const LONGEST_SLEEP: Duration = Duration::from_millis(250);
 /// Samples that wait for the reading thread. RustDDS keeps that many whether they wait or not.
-const SMALL_DEPTH: u16 = 512;
+const SMALL_DEPTH: u16 = 2048;
 /// The same where they may be large.
 const LARGE_DEPTH: u16 = 16;
 
@@ -44,6 +45,7 @@ pub(super) struct Readers {
     pub(super) opened: Option<Timestamp>,
     /// The last sequence number of each writer.
     pub(super) last: HashMap<EndpointId, i64>,
+    pub(super) history: History,
 }
 
 /// A channel that is read.
@@ -116,10 +118,12 @@ impl Channel {
             best_effort,
             opened,
             last,
+            history,
         } = &mut *readers;
         let mut progress = Progress {
             opened: opened.unwrap_or(Timestamp::ZERO),
             last,
+            history,
         };
         let mut again = false;
         for (reader, kind) in [(reliable, Kind::Reliable), (best_effort, Kind::BestEffort)] {
@@ -129,9 +133,24 @@ impl Channel {
             // What came before the waker was set woke nobody.
             again |= self.drain_one(shared, reader, kind, &mut progress);
         }
+        let quiet = progress.history.quiet(Instant::now());
         drop(readers);
+        for received in quiet {
+            self.send(received);
+        }
         if again {
             self.note_samples();
+        }
+    }
+
+    /// Hands a message to all who subscribed.
+    pub(super) fn send(&self, received: Received) {
+        let mut senders = self.senders.lock();
+        if let [sender] = &senders[..] {
+            // Mostly there is one; one that has ended is swept later.
+            sender.send(received);
+        } else {
+            senders.retain(|sender| sender.send(received.clone()));
         }
     }
 
@@ -178,6 +197,8 @@ struct ChannelKey {
 #[derive(Default)]
 pub(super) struct Channels {
     all: Mutex<HashMap<ChannelKey, Arc<Channel>>>,
+    /// The same by their topics, for what this participant publishes itself.
+    by_topic: RwLock<HashMap<Arc<str>, Vec<Arc<Channel>>>>,
     ready: [Arc<Ready>; 2],
     closed: AtomicBool,
     next: AtomicU64,
@@ -206,7 +227,7 @@ impl Channels {
         }
         let found = all.entry(key).or_insert_with_key(|key| {
             let ready = Arc::clone(&self.ready[usize::from(options.large)]);
-            Arc::new_cyclic(|weak| Channel {
+            let made = Arc::new_cyclic(|weak| Channel {
                 topic: Arc::clone(&key.topic),
                 is_reserved: channel.is_reserved(),
                 large: options.large,
@@ -217,7 +238,13 @@ impl Channels {
                 is_ready: AtomicBool::new(false),
                 ready,
                 weak: weak.clone(),
-            })
+            });
+            let mut by_topic = self.by_topic.write();
+            by_topic
+                .entry(Arc::clone(&key.topic))
+                .or_default()
+                .push(Arc::clone(&made));
+            made
         });
         // In this order, as the thread that opens it locks them.
         let readers = found.readers.lock();
@@ -245,7 +272,30 @@ impl Channels {
             }
             used
         });
+        let mut by_topic = self.by_topic.write();
+        for gone in &unused {
+            if let Some(channels) = by_topic.get_mut(&gone.topic) {
+                channels.retain(|channel| !Arc::ptr_eq(channel, gone));
+                if channels.is_empty() {
+                    by_topic.remove(&gone.topic);
+                }
+            }
+        }
+        drop(by_topic);
         unused
+    }
+
+    /// Hands an own message to the own readers of its topic. `content` is asked for once for each.
+    pub(super) fn deliver_own(&self, topic: &str, content: impl Fn() -> Content) {
+        let by_topic = self.by_topic.read();
+        for channel in by_topic.get(topic).into_iter().flatten() {
+            let received = Received {
+                content: content(),
+                at: Instant::now(),
+                broker_age_us: 0,
+            };
+            channel.send(received);
+        }
     }
 
     /// Takes out all readers, whose participant has died.

@@ -7,6 +7,7 @@ use rustdds::Timestamp;
 use rustdds::no_key::DeserializedCacheChange;
 
 use super::channel::Channel;
+use super::kept::History;
 use super::shared::{Shared, WriterFacts};
 use crate::dds::EndpointId;
 use crate::dds::participant::{endpoint_of, prefix_of};
@@ -29,6 +30,7 @@ pub(super) enum Kind {
 pub(super) struct Progress<'a> {
     pub(super) opened: Timestamp,
     pub(super) last: &'a mut HashMap<EndpointId, i64>,
+    pub(super) history: &'a mut History,
 }
 
 impl Progress<'_> {
@@ -48,6 +50,7 @@ impl Progress<'_> {
     }
 }
 
+/// Takes a sample of another participant, or what an own writer keeps. Own live messages come by another way.
 pub(super) fn deliver(
     shared: &Shared,
     channel: &Channel,
@@ -65,11 +68,14 @@ pub(super) fn deliver(
     if !progress.is_new(shared, writer, i64::from(sample.sequence_number)) {
         return;
     }
-    if !channel.with_kept && sample.receive_instant < progress.opened {
-        return;
-    }
+    let own = facts.is_some_and(|facts| facts.own);
     let age = age_of(shared, facts, &sample, now);
-    if !channel.with_kept && age > since(progress.opened, now) + CLOCK_SLACK {
+    let is_old = age > since(progress.opened, now) + if own { Duration::ZERO } else { CLOCK_SLACK };
+    if channel.with_kept {
+        if own && !is_old {
+            return;
+        }
+    } else if own || is_old || sample.receive_instant < progress.opened {
         return;
     }
     let bytes = sample.into_value().0;
@@ -81,17 +87,23 @@ pub(super) fn deliver(
     } else {
         Content::from_bytes(bytes)
     };
-    let received = Received {
+    let at = Instant::now();
+    let mut received = Received {
         content,
-        at: Instant::now(),
-        broker_age_us: if channel.with_kept {
-            u64::try_from(age.as_micros()).unwrap_or(u64::MAX)
-        } else {
-            0
-        },
+        at,
+        broker_age_us: 0,
     };
-    let mut senders = channel.senders.lock();
-    senders.retain(|sender| sender.send(received.clone()));
+    if is_old {
+        received.broker_age_us = u64::try_from(age.as_micros()).unwrap_or(u64::MAX);
+        if let Some(received) = progress.history.hold(at, writer, received) {
+            channel.send(received);
+        }
+        return;
+    }
+    for kept in progress.history.of_writer(writer) {
+        channel.send(kept);
+    }
+    channel.send(received);
 }
 
 /// How long ago a sample that its writer keeps for late joiners was written; zero for all others.

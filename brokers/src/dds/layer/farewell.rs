@@ -89,7 +89,10 @@ mod tests {
         let message = datagram(GuidPrefix(*b"abcdefghijkl"), 7);
         assert_eq!(&message[..8], b"RTPS\x02\x04\x01\x12");
         assert_eq!(&message[8..20], b"abcdefghijkl");
-        assert_eq!(usize::from(u16::from_le_bytes([message[22], message[23]])), message.len() - 24);
+        assert_eq!(
+            usize::from(u16::from_le_bytes([message[22], message[23]])),
+            message.len() - 24
+        );
         let place = message.windows(12).rposition(|part| part == b"abcdefghijkl").unwrap();
         assert_eq!(&message[place - 4..place], &PARTICIPANT_GUID);
         assert_eq!(&message[place + 12..place + 16], &PARTICIPANT);

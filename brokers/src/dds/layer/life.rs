@@ -1,7 +1,6 @@
 //! The thread that owns the participant: it makes writers and readers, watches over RustDDS and over those who have gone,
 //! and builds everything anew when RustDDS dies.
 
-use std::collections::HashSet;
 use std::net::UdpSocket;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -103,7 +102,9 @@ impl Lifecycle {
         }
         let slots = self.shared.slots.live();
         generation.expel(&self.shared, now, &full(&slots, now));
-        drop(self.shared.slots.take_gone(now));
+        for writer in self.shared.slots.take_gone(now) {
+            self.shared.writers.write().remove(&writer.id());
+        }
         drop(self.shared.channels.take_unused());
         let others = generation.presence.lock().count();
         let detail = format!(
@@ -130,7 +131,11 @@ impl Lifecycle {
     }
 
     fn bury(&mut self, reason: &str) {
-        tracing::error!(domain = self.shared.domain, reason, "DDS participant ended, building a new one");
+        tracing::error!(
+            domain = self.shared.domain,
+            reason,
+            "DDS participant ended, building a new one"
+        );
         self.shared.set_status(Health::Down, reason);
         self.lay_aside();
         // One that dies at once is not built in a tight circle.
@@ -197,15 +202,8 @@ fn make_missing(shared: &Arc<Shared>, generation: &Generation, now: Instant) -> 
     for slot in slots.iter().filter(|slot| slot.needs_writer()) {
         generation.fill(shared, slot, now)?;
     }
-    // A reliable reader matches no best-effort writer, not even one of this participant.
-    let own: HashSet<&str> = slots
-        .iter()
-        .filter(|slot| !slot.key.reliable)
-        .map(|slot| &*slot.key.topic)
-        .collect();
     for channel in shared.channels.list() {
-        let topic = &*channel.topic;
-        let best_effort = own.contains(topic) || shared.best_effort.read().contains(topic);
+        let best_effort = shared.best_effort.read().contains(&*channel.topic);
         generation.open(&channel, best_effort)?;
     }
     Ok(())

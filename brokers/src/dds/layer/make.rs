@@ -27,7 +27,7 @@ use crate::dds::{
 /// Between two signs of life.
 const SIGN: Duration = Duration::from_millis(500);
 /// Between two questions to the hosts of other participants.
-const PROBE: Duration = Duration::from_millis(200);
+const PROBE: Duration = Duration::from_millis(100);
 /// Bytes of the largest sample: the largest payload with the largest header.
 const LARGEST_SAMPLE: usize = MAX_PAYLOAD_BYTES + 8 * 1024;
 /// Room for what RustDDS sends at once; the system caps it (`net.core.wmem_max`).
@@ -59,12 +59,11 @@ impl Generation {
         })?;
         let pulse = Pulse::start(&participant)?;
         let profile = Profile::best_effort(SIGNS);
-        let farewell = Farewell::new(shared.address, participant.port()).map_err(|error: io::Error| {
-            DdsError::Create {
+        let farewell =
+            Farewell::new(shared.address, participant.port()).map_err(|error: io::Error| DdsError::Create {
                 what: "socket",
                 error: error.to_string(),
-            }
-        })?;
+            })?;
         let presence = Arc::<parking_lot::Mutex<Presence>>::default();
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
         Ok(Self {
@@ -95,6 +94,7 @@ impl Generation {
         let facts = WriterFacts {
             reliable: profile.reliable,
             durable: profile.transient_local,
+            own: true,
         };
         shared.writers.write().insert(writer.id(), facts);
         slot.put(writer, now);
@@ -124,7 +124,12 @@ impl Generation {
     pub(super) fn exchange_signs(&mut self, shared: &Shared, now: Instant) -> bool {
         if now >= self.next_sign {
             self.next_sign = now + SIGN;
-            let gone: Vec<String> = self.presence.lock().gone(now).map(|prefix| prefix.to_string()).collect();
+            let gone: Vec<String> = self
+                .presence
+                .lock()
+                .gone(now)
+                .map(|prefix| prefix.to_string())
+                .collect();
             let time_ns = u64::try_from(nanos(Timestamp::now())).unwrap_or(0);
             let sign = json!({ "time_ns": time_ns, "gone": gone });
             self.sign.write(Bytes::from(sign.to_string()));
@@ -200,15 +205,15 @@ impl Generation {
 /// Takes over what other participants have.
 fn note_endpoints(shared: &Shared, presence: &parking_lot::Mutex<Presence>, endpoints: &Endpoints) {
     presence.lock().set_readers(&endpoints.readers);
-    let own: HashSet<_> = shared.slots.ids().into_iter().collect();
     let mut best_effort = HashSet::new();
     {
         let mut writers = shared.writers.write();
-        writers.retain(|id, _| own.contains(id));
+        writers.retain(|_, facts| facts.own);
         for writer in &endpoints.writers {
             let facts = WriterFacts {
                 reliable: writer.reliable,
                 durable: writer.durable,
+                own: false,
             };
             writers.insert(writer.id, facts);
             if !writer.reliable {

@@ -14,6 +14,7 @@
 mod channel;
 mod deliver;
 mod farewell;
+mod kept;
 mod life;
 mod make;
 mod names;

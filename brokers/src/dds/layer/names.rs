@@ -5,7 +5,7 @@ use std::sync::Arc;
 use blaze_domain::names::ChannelName;
 
 /// Stands before user topics.
-const USER_PREFIX: &str = "bt/";
+pub(super) const USER_PREFIX: &str = "bt/";
 /// Tells others that a participant lives, and its time of day: JSON `{"time_ns":…,"gone":[…]}`.
 pub(super) const ALIVE: &str = "blaze/layer/alive";
 

@@ -103,7 +103,11 @@ impl Presence {
                 *number = peer.number.max(*number);
             }
         }
-        let is_superseded = |peer: &Peer| peer.sockets.iter().any(|socket| newest.get(socket) > Some(&peer.number));
+        let is_superseded = |peer: &Peer| {
+            peer.sockets
+                .iter()
+                .any(|socket| newest.get(socket) > Some(&peer.number))
+        };
         let old = self.peers.iter().filter(|(_, peer)| is_superseded(peer));
         old.map(|(prefix, _)| *prefix).collect()
     }
@@ -127,7 +131,8 @@ impl Presence {
 
     /// Remembers one that was given up and may come back.
     pub(super) fn note_gone(&mut self, now: Instant, prefix: GuidPrefix) {
-        self.gone.retain(|(gone, at)| *gone != prefix && now.saturating_duration_since(*at) < TELL);
+        self.gone
+            .retain(|(gone, at)| *gone != prefix && now.saturating_duration_since(*at) < TELL);
         if self.gone.len() >= MAX_GONE {
             self.gone.pop_front();
         }
@@ -155,7 +160,8 @@ impl Clocks {
     pub(super) fn compare(&mut self, now: Instant, prefix: GuidPrefix, sent_ns: i128, received_ns: i128) {
         let behind = received_ns - sent_ns;
         if self.behind.len() >= MAX_PEERS && !self.behind.contains_key(&prefix) {
-            self.behind.retain(|_, (_, at)| now.saturating_duration_since(*at) < 2 * COMPARE_EVERY);
+            self.behind
+                .retain(|_, (_, at)| now.saturating_duration_since(*at) < 2 * COMPARE_EVERY);
             if self.behind.len() >= MAX_PEERS {
                 return;
             }
@@ -193,7 +199,12 @@ mod tests {
     fn silence_matters_only_where_a_window_is_full() {
         let now = Instant::now();
         let mut presence = Presence::default();
-        presence.set_readers(&[reader(1, "a", 1), reader(2, "a", 2), reader(3, "b", 3), reader(4, "a", 4)]);
+        presence.set_readers(&[
+            reader(1, "a", 1),
+            reader(2, "a", 2),
+            reader(3, "b", 3),
+            reader(4, "a", 4),
+        ]);
         for (number, at) in [(1, now), (2, now + Duration::from_secs(3)), (3, now)] {
             presence.sign(at, prefix(number));
         }

@@ -25,7 +25,8 @@ impl Probe {
         // The answer to the last one shows at either call.
         let sent = self.socket.send(&NOTHING);
         let received = self.socket.recv(&mut [0; 1]);
-        let refused = |result: io::Result<usize>| result.is_err_and(|error| error.kind() == ErrorKind::ConnectionRefused);
+        let refused =
+            |result: io::Result<usize>| result.is_err_and(|error| error.kind() == ErrorKind::ConnectionRefused);
         refused(sent) | refused(received)
     }
 }

@@ -14,19 +14,20 @@ use bytes::{BufMut, Bytes, BytesMut};
 use lru::LruCache;
 use parking_lot::Mutex;
 
+use super::names;
 use super::shared::Shared;
 use super::slot::{Attempt, Slot, SlotKey};
 use crate::dds::DdsError;
 use crate::dds::reader::{StoppableThread, unpark_waker};
 use crate::outbox::{Body, Fate, Waiting};
-use crate::port::PublisherOptions;
+use crate::port::{Content, PublisherOptions};
 
 /// Messages and bytes of one turn; one message always fits.
 const TURN_MESSAGES: usize = 64;
 const TURN_BYTES: usize = 256 * 1024;
 /// A full turn takes at least this long: RustDDS neither paces nor tells when it is behind, and what it sends at once must
-/// fit into the buffers of sockets and readers. So up to 64,000 messages and 256 MB per second.
-const TURN: Duration = Duration::from_millis(1);
+/// fit into the buffers of sockets and readers. So up to 32,000 messages and 128 MB per second.
+const TURN: Duration = Duration::from_millis(2);
 /// Between attempts to write what a writer could not take.
 const AGAIN: Duration = Duration::from_millis(2);
 /// The same where an attempt copies much.
@@ -169,7 +170,11 @@ impl Sender {
             return;
         }
         let is_large = |queue: &VecDeque<Waiting<Target>>| queue.front().is_some_and(|it| it.size() > LARGE_BYTES);
-        let pause = if self.held.values().all(is_large) { LARGE_AGAIN } else { AGAIN };
+        let pause = if self.held.values().all(is_large) {
+            LARGE_AGAIN
+        } else {
+            AGAIN
+        };
         // What is published meanwhile may go to another writer.
         wait(self.shared.outbox.filled(), pause);
     }
@@ -218,9 +223,27 @@ fn attempt(shared: &Shared, waiting: &Waiting<Target>, now: Instant) -> Option<F
     }
     let slot = waiting.to.slot_of(shared, &waiting.body);
     match slot.write(now, || octets(waiting, now)) {
-        Attempt::Done => Some(Fate::Delivered),
+        Attempt::Done => {
+            let is_reserved = !slot.key.topic.starts_with(names::USER_PREFIX);
+            shared
+                .channels
+                .deliver_own(&slot.key.topic, || content(waiting, now, is_reserved));
+            Some(Fate::Delivered)
+        }
         Attempt::Failed => Some(Fate::Dropped(DropReason::BrokerError)),
         Attempt::NotNow => None,
+    }
+}
+
+/// The message as own readers receive it.
+fn content(waiting: &Waiting<Target>, now: Instant, is_reserved: bool) -> Content {
+    match &waiting.body {
+        Body::Frame(frame) => Content::Frame(Waiting::<Target>::aged(frame, waiting.since, now)),
+        Body::Bare(payload) if is_reserved => Content::Bare {
+            payload: payload.clone(),
+            identity: None,
+        },
+        Body::Bare(payload) => Content::from_bytes(payload.clone()),
     }
 }
 

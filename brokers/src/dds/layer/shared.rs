@@ -34,6 +34,8 @@ const LIMITS: OutboxLimits = OutboxLimits {
 pub(super) struct WriterFacts {
     pub(super) reliable: bool,
     pub(super) durable: bool,
+    /// Of this participant.
+    pub(super) own: bool,
 }
 
 /// Counters of [`DdsCounts`].

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use rustdds::Timestamp;
 
-use crate::dds::{EndpointId, Profile, Writer, Written};
+use crate::dds::{Profile, Writer, Written};
 
 /// How long a new writer waits for its first reader: discovery takes that long where there is one.
 const MEET: Duration = Duration::from_millis(300);
@@ -184,7 +184,9 @@ impl Slots {
         let writers: Vec<Arc<Writer>> = {
             let live = self.live();
             let current = live.iter().filter_map(|slot| slot.state.lock().writer.clone());
-            current.chain(self.retired.0.lock().iter().map(|(writer, _)| Arc::clone(writer))).collect()
+            current
+                .chain(self.retired.0.lock().iter().map(|(writer, _)| Arc::clone(writer)))
+                .collect()
         };
         writers.iter().all(|writer| writer.is_acknowledged())
     }
@@ -196,8 +198,9 @@ impl Slots {
             let passed = now.saturating_duration_since(at);
             passed >= LONGEST_LINGER || (passed >= LINGER && writer.is_acknowledged())
         };
-        let (gone, stays): (Vec<_>, Vec<_>) =
-            std::mem::take(&mut *retired).into_iter().partition(|(writer, at)| is_gone(writer, *at));
+        let (gone, stays): (Vec<_>, Vec<_>) = std::mem::take(&mut *retired)
+            .into_iter()
+            .partition(|(writer, at)| is_gone(writer, *at));
         *retired = stays;
         gone.into_iter().map(|(writer, _)| writer).collect()
     }
@@ -211,13 +214,5 @@ impl Slots {
             .collect();
         writers.extend(self.retired.0.lock().drain(..).map(|(writer, _)| writer));
         writers
-    }
-
-    /// Identities of all writers.
-    pub(super) fn ids(&self) -> Vec<EndpointId> {
-        let live = self.live();
-        let current = live.iter().filter_map(|slot| slot.state.lock().writer.as_ref().map(|writer| writer.id()));
-        let retired = self.retired.0.lock();
-        current.chain(retired.iter().map(|(writer, _)| writer.id())).collect()
     }
 }

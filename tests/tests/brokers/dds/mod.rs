@@ -1,5 +1,6 @@
 //! DDS as a broker: the rules for all adapters, and what is special to a network without a server.
 
+mod gone;
 mod support;
 
 /// The rules for all adapters, each in a domain of its own.

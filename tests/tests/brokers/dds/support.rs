@@ -2,14 +2,18 @@
 
 use std::net::Ipv4Addr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
 use blaze_brokers::conformance::{Capabilities, Fixture};
 use blaze_brokers::dds::layer::{DdsBroker, MAX_QUEUE_BYTES};
 use blaze_brokers::{Broker, Health};
+use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::DdsLayerBroker as Section;
+use blaze_domain::{Origin, WriterId};
+use blaze_proto::{Frame, Header};
 use blaze_tests::flow::free_domain;
+use bytes::Bytes;
 use tokio::sync::{Mutex, MutexGuard};
 
 /// How long a condition may take; spent only where a test fails.
@@ -27,7 +31,7 @@ impl Domain {
         static TURN: Mutex<()> = Mutex::const_new(());
         let turn = TURN.lock().await;
         Self {
-            id: free_domain(),
+            id: free_domain().unwrap(),
             _turn: turn,
         }
     }
@@ -76,10 +80,10 @@ impl Fixture for Domain {
     }
 
     async fn leftovers(&self) -> Vec<String> {
-        let until = std::time::Instant::now() + DEADLINE;
+        let until = Instant::now() + DEADLINE;
         loop {
             let threads = own_threads();
-            if threads.is_empty() || std::time::Instant::now() > until {
+            if threads.is_empty() || Instant::now() > until {
                 return threads;
             }
             tokio::time::sleep(Duration::from_millis(10)).await;
@@ -105,4 +109,21 @@ pub(super) async fn wait_for(broker: &dyn Broker, health: Health) -> String {
         Ok(status) => status.unwrap().detail.clone(),
         Err(_) => panic!("not {health:?} within {DEADLINE:?}: {:?}", broker.status().borrow()),
     }
+}
+
+/// Waits until something holds.
+pub(super) async fn eventually<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+    let until = Instant::now() + DEADLINE;
+    loop {
+        if let Some(found) = look() {
+            return found;
+        }
+        assert!(Instant::now() < until, "{what}: not within {DEADLINE:?}");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
+pub(super) fn frame(channel: &ChannelName, writer: u8, sequence: u64, bytes: usize) -> Frame {
+    let header = Header::new(channel.as_str(), Origin::default(), WriterId([writer; 16]), sequence, 0);
+    Frame::new(&header, Bytes::from(vec![b'x'; bytes])).unwrap()
 }
