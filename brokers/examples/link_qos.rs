@@ -42,6 +42,7 @@ impl Arguments {
             reliable: self.has("reliable"),
             depth: self.get("depth", 4096),
             transient_local: false,
+            window: 0,
         }
     }
 }

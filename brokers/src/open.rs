@@ -4,6 +4,8 @@ use std::sync::Arc;
 
 use blaze_domain::node_file::{LayerBroker, NodeBroker};
 
+use crate::dds::DdsError;
+use crate::dds::layer::DdsBroker;
 use crate::port::{Broker, Role};
 
 /// Why a broker of the node file cannot be used at all. A server that is merely away is no error.
@@ -35,7 +37,8 @@ pub enum OpenError {
 /// As [`open_layer`], but for adapters that live inside one process.
 pub fn check_layer(section: &LayerBroker) -> Result<(), OpenError> {
     match section {
-        LayerBroker::Memory | LayerBroker::Dds(_) => Ok(()),
+        LayerBroker::Memory => Ok(()),
+        LayerBroker::Dds(dds) => DdsBroker::check(dds).map_err(dds_error),
         #[cfg(feature = "kafka")]
         LayerBroker::Kafka(kafka) => crate::kafka::KafkaBroker::check(kafka),
         #[cfg(not(feature = "kafka"))]
@@ -54,13 +57,14 @@ pub fn open_node(section: &NodeBroker, role: &Role) -> Result<Arc<dyn Broker>, O
     }
 }
 
-/// Connects to the server of a layer scope, in the background.
+/// Connects to the server of a layer scope, or takes part in its DDS domain, in the background.
 ///
 /// # Errors
 /// [`OpenError`] where it can never work.
 pub fn open_layer(section: &LayerBroker, role: &Role) -> Result<Arc<dyn Broker>, OpenError> {
     match section {
-        LayerBroker::Memory | LayerBroker::Dds(_) => Err(OpenError::InProcess),
+        LayerBroker::Memory => Err(OpenError::InProcess),
+        LayerBroker::Dds(dds) => Ok(Arc::new(DdsBroker::open(dds).map_err(dds_error)?)),
         #[cfg(feature = "kafka")]
         LayerBroker::Kafka(kafka) => Ok(Arc::new(crate::kafka::KafkaBroker::open(kafka, role)?)),
         #[cfg(not(feature = "kafka"))]
@@ -68,5 +72,17 @@ pub fn open_layer(section: &LayerBroker, role: &Role) -> Result<Arc<dyn Broker>,
             let _ = role;
             Err(OpenError::NotBuilt { feature: "kafka" })
         }
+    }
+}
+
+fn dds_error(error: DdsError) -> OpenError {
+    let key = match &error {
+        DdsError::Domain(_) => "dds.domain",
+        DdsError::Address(_) | DdsError::AddressMissing { .. } => "dds.interface",
+        DdsError::Create { .. } | DdsError::Panicked(_) => "dds",
+    };
+    OpenError::Setting {
+        key: key.to_owned(),
+        reason: error.to_string(),
     }
 }

@@ -109,6 +109,8 @@ pub(crate) struct Waiting<C> {
     pub(crate) to: Arc<C>,
     /// When it was handed over.
     pub(crate) since: Instant,
+    /// When it is of no use any more, and what it then counts as.
+    pub(crate) expires: Option<(Instant, DropReason)>,
     counts: Option<Arc<Counts>>,
 }
 
@@ -358,6 +360,7 @@ impl<C> Outbox<C> {
                     body: entry.body,
                     to: Arc::clone(&queue.to),
                     since: entry.since,
+                    expires: entry.expires,
                     counts: Some(Arc::clone(&queue.counts)),
                 });
             }

@@ -185,8 +185,10 @@ fn layer_broker(
             let hub = MemoryHub::new(settings.me.layer.to_string());
             (Arc::new(hub.broker()), LayerScopeId::private(), String::new())
         }
-        LayerSection::Dds(_) => {
-            anyhow::bail!("brokers.layer.dds: this version has no DDS layer broker; use kafka or memory: {{}}")
+        LayerSection::Dds(dds) => {
+            let broker = open_layer(section, role).context("brokers.layer")?;
+            let host = dds.interface.is_loopback().then(this_host);
+            (broker, LayerScopeId::dds(dds.domain, host.as_deref()), String::new())
         }
         LayerSection::Kafka(kafka) => {
             let broker = open_layer(section, role).context("brokers.layer")?;
@@ -194,6 +196,13 @@ fn layer_broker(
         }
     };
     Ok((Some(LayerBroker { broker, id }), prefix))
+}
+
+/// What is the same for all processes that share a loopback interface: the boot of the host and the network namespace.
+fn this_host() -> String {
+    let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    let namespace = std::fs::read_link("/proc/self/ns/net").unwrap_or_default();
+    format!("{}|{}", boot.trim(), namespace.display())
 }
 
 /// Takes over what may change while the process runs; a faulty file changes nothing and shows on `/readyz`.

@@ -79,7 +79,21 @@ impl LayerScopeId {
     /// Identity of the Kafka broker of a layer: the same for all flows of the layer that give their names this prefix.
     #[must_use]
     pub fn kafka(prefix: &str) -> Self {
-        let digest = Sha256::digest(format!("kafka|{prefix}"));
+        Self::of(&format!("kafka|{prefix}"))
+    }
+
+    /// Identity of the DDS domain of a layer: the same for all flows of the layer that use it on its network. A domain on
+    /// loopback is one of this host only, which `host` tells apart from others.
+    #[must_use]
+    pub fn dds(domain: u16, host: Option<&str>) -> Self {
+        match host {
+            None => Self::of(&format!("dds|{domain}")),
+            Some(host) => Self::of(&format!("dds|{domain}|{host}")),
+        }
+    }
+
+    fn of(text: &str) -> Self {
+        let digest = Sha256::digest(text);
         let mut id = [0; 8];
         id.copy_from_slice(&digest[..8]);
         Self(u64::from_le_bytes(id).max(1))
@@ -240,5 +254,12 @@ mod tests {
     fn the_identity_of_a_kafka_broker_is_the_same_on_every_machine_and_in_every_version() {
         assert_eq!(LayerScopeId::kafka("").0, 0x7EA7_172E_AAB7_C9FB);
         assert_ne!(LayerScopeId::kafka(""), LayerScopeId::kafka("a."));
+        let domains = [
+            LayerScopeId::dds(1, None),
+            LayerScopeId::dds(2, None),
+            LayerScopeId::dds(1, Some("a")),
+        ];
+        assert!(domains[0] != domains[1] && domains[0] != domains[2]);
+        assert_eq!(LayerScopeId::dds(1, Some("a")), domains[2]);
     }
 }

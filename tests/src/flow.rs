@@ -29,6 +29,8 @@ pub struct FlowSpec {
     pub redis: Option<(String, String)>,
     /// Address and prefix of the layer scope's Kafka.
     pub kafka: Option<(String, String)>,
+    /// DDS domain of the layer scope, on loopback.
+    pub layer_domain: Option<u16>,
     /// DDS domain of the inter scope, on loopback or its host's address.
     pub domain: Option<u16>,
     /// The host of a network that it runs on; absent = this machine.
@@ -53,6 +55,7 @@ impl FlowSpec {
             node: node.to_owned(),
             redis: None,
             kafka: None,
+            layer_domain: None,
             domain: None,
             host: None,
             peers: Vec::new(),
@@ -73,6 +76,13 @@ impl FlowSpec {
     #[must_use]
     pub fn on_kafka(mut self, bootstrap: &str, prefix: &str) -> Self {
         self.kafka = Some((bootstrap.to_owned(), prefix.to_owned()));
+        self
+    }
+
+    /// With a DDS domain on loopback as layer scope.
+    #[must_use]
+    pub fn on_dds(mut self, domain: u16) -> Self {
+        self.layer_domain = Some(domain);
         self
     }
 
@@ -106,6 +116,12 @@ impl FlowSpec {
             let _ = writeln!(
                 text,
                 "  layer: {{ kafka: {{ bootstrap: [\"{bootstrap}\"], prefix: \"{prefix}\" }} }}"
+            );
+        }
+        if let Some(domain) = self.layer_domain {
+            let _ = writeln!(
+                text,
+                "  layer: {{ dds: {{ domain: {domain}, interface: \"127.0.0.1\" }} }}"
             );
         }
         if let Some(domain) = self.domain {

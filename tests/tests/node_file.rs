@@ -57,7 +57,6 @@ fn the_documented_example_has_no_fault_and_a_warning_for_each_section_without_ef
     assert_eq!(
         found,
         [
-            (5, "brokers.layer.dds", NOT_YET),
             (7, "brokers.plugins", NOT_YET),
             (9, "admin", &keys("worker, monitor")),
             (10, "config", NOT_YET),

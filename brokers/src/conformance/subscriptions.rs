@@ -6,8 +6,8 @@ use bytes::Bytes;
 
 use super::Fixture;
 use super::tools::{
-    Outcome, Reader, channel, connected, describe, eventually, frame, numbered, open_publisher, open_publisher_with,
-    publish, writer,
+    Outcome, Reader, channel, connected, describe, eventually, frame, numbered, numbered_to_keep, open_publisher,
+    open_publisher_with, publish, writer,
 };
 use crate::port::{Broker, Content, PublisherOptions, SubscribeOptions};
 
@@ -166,7 +166,8 @@ pub async fn late_joiners_get_what_is_kept(fixture: &dyn Fixture) -> Outcome {
     }
     for sequence in 1..=5 {
         for (number, publisher) in (1..).zip(&publishers) {
-            publish(publisher.as_ref(), &numbered(&channel, writer(number), sequence)?)?;
+            let frame = numbered_to_keep(&channel, writer(number), sequence, options.depth)?;
+            publish(publisher.as_ref(), &frame)?;
             witness.next_frame("a message of a writer that keeps three").await?;
         }
     }
@@ -182,7 +183,8 @@ pub async fn late_joiners_get_what_is_kept(fixture: &dyn Fixture) -> Outcome {
         plain.meet(fixture, publisher.as_ref(), false).await?;
     }
     for (number, publisher) in (1..).zip(&publishers) {
-        publish(publisher.as_ref(), &numbered(&channel, writer(number), 6)?)?;
+        let frame = numbered_to_keep(&channel, writer(number), 6, options.depth)?;
+        publish(publisher.as_ref(), &frame)?;
     }
     for _ in 1..=2 {
         let first = plain.next_frame("a live message for a late joiner").await?;

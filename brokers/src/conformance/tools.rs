@@ -44,6 +44,11 @@ pub(super) fn writer(number: u8) -> WriterId {
 
 /// A frame with all that must survive.
 pub(super) fn frame(channel: &ChannelName, writer: WriterId, sequence: u64, payload: Bytes) -> Outcome<Frame> {
+    frame_to_keep(channel, writer, sequence, payload, 0)
+}
+
+/// A frame of a writer that keeps the last `depth`.
+fn frame_to_keep(channel: &ChannelName, writer: WriterId, sequence: u64, payload: Bytes, depth: u32) -> Outcome<Frame> {
     let origin = Origin {
         layer: "edge".to_owned(),
         node: "robot-1".to_owned(),
@@ -53,6 +58,7 @@ pub(super) fn frame(channel: &ChannelName, writer: WriterId, sequence: u64, payl
     };
     let header = Header {
         encoding: "application/octet-stream".to_owned(),
+        depth,
         ..Header::new(channel.as_str(), origin, writer, sequence, 1_700_000_000_000_000_000)
     };
     Frame::new(&header, payload).map_err(|error| format!("cannot make a frame: {error}"))
@@ -61,6 +67,11 @@ pub(super) fn frame(channel: &ChannelName, writer: WriterId, sequence: u64, payl
 /// A small frame whose payload is its sequence.
 pub(super) fn numbered(channel: &ChannelName, writer: WriterId, sequence: u64) -> Outcome<Frame> {
     frame(channel, writer, sequence, Bytes::from(sequence.to_string()))
+}
+
+/// As [`numbered`], of a writer that keeps the last `depth`.
+pub(super) fn numbered_to_keep(channel: &ChannelName, writer: WriterId, sequence: u64, depth: u32) -> Outcome<Frame> {
+    frame_to_keep(channel, writer, sequence, Bytes::from(sequence.to_string()), depth)
 }
 
 /// Bytes that look like no frame, differ at each place, and differ for each seed.
@@ -189,15 +200,30 @@ impl Reader {
             let wait = self.subscription.receive(&mut batch, 64);
             let _ = tokio::time::timeout(Duration::from_millis(50), wait).await;
             if batch.iter().any(is_probe) {
-                self.waiting
-                    .extend(batch.into_iter().filter(|message| !is_probe(message)));
-                return Ok(());
+                return self.meet_last(batch, sequence).await;
             }
             if Instant::now() > until {
                 break;
             }
         }
         Err("a publisher never found its reader".to_owned())
+    }
+
+    /// Takes the probes that are still under way: up to the last one, or until there is silence where they have no number.
+    async fn meet_last(&mut self, mut batch: Vec<Received>, last: u64) -> Outcome {
+        loop {
+            let is_last = |message: &Received| match &message.content {
+                Content::Frame(frame) => is_probe(message) && frame.sequence() >= last,
+                Content::Bare { .. } | Content::Malformed { .. } => false,
+            };
+            let ends = batch.iter().any(is_last);
+            self.waiting
+                .extend(batch.drain(..).filter(|message| !is_probe(message)));
+            let more = self.subscription.receive(&mut batch, 64);
+            if ends || tokio::time::timeout(SILENCE, more).await.is_err() {
+                return Ok(());
+            }
+        }
     }
 
     /// The next message; `None` = the subscription ended.

@@ -5,7 +5,7 @@
 //! |---|---|
 //! | DATA_FRAG | the sample is larger than any that flows send, the fragment size is not RustDDS' own, the fragment number or count is 0 |
 //! | HEARTBEAT, GAP | a sequence number is not within 0 to 2³¹ − 1, or the range is wider than any that RustDDS sends |
-//! | ACKNACK, NACK_FRAG, HEARTBEAT_FRAG | a sequence number is negative or above 2³² − 1, the bitmap or fragment number is beyond all that RustDDS sends |
+//! | ACKNACK, NACK_FRAG, HEARTBEAT_FRAG | a sequence number is negative or above 2³² − 1, the bitmap or fragment number is beyond all that RustDDS sends for the samples of its topics |
 //!
 //! Everything else passes; what RustDDS' parser refuses is left to it. The walk over the submessages is unrolled, since a
 //! filter has no loops, so datagrams with more submessages than there are steps are dropped, too. A *full* step knows
@@ -20,7 +20,7 @@ mod tests;
 
 use std::io;
 
-pub(super) use program::Shape;
+pub(super) use program::{Samples, Shape};
 pub(super) use socket::{Attached, attach};
 
 /// Why datagrams are not filtered.

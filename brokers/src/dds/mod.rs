@@ -15,6 +15,7 @@ mod announcement;
 #[cfg(feature = "fault-injection")]
 mod fault;
 mod filter;
+pub mod layer;
 mod participant;
 mod pulse;
 mod reader;
@@ -28,11 +29,11 @@ use blaze_domain::node_file::MAX_DDS_DOMAIN;
 
 #[cfg(feature = "fault-injection")]
 pub use fault::Fault;
-pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile, Writer};
+pub use participant::{EndpointId, GuidPrefix, Participant, ParticipantConfig, Profile, Writer, Written};
 pub use pulse::{Illness, Pulse};
 pub use reader::{Reader, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
-pub use watch::{ReaderWatch, RemoteReader};
+pub use watch::{EndpointWatch, Endpoints, FoundReader, FoundWriter, ReaderWatch, RemoteReader};
 
 /// The type of all samples, IDL `sequence<octet>`.
 pub const FRAME_TYPE: &str = "blaze::v1::Frame";

@@ -8,17 +8,18 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use blaze_domain::node_file::MAX_DDS_DOMAIN;
 use bytes::Bytes;
+use rustdds::dds::WriteError;
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{
     DataWriterStatus, DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies, QosPolicyBuilder,
-    RTPSEntity, StatusEvented, Subscriber, Topic, TopicKind, no_key,
+    RTPSEntity, StatusEvented, Subscriber, Timestamp, Topic, TopicKind, WriteOptionsBuilder, no_key,
 };
 
-use super::filter::{self, Attached, FilterError, Shape};
+use super::filter::{self, Attached, FilterError, Samples, Shape};
 use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
-use super::watch::{ReaderWatch, RemoteReader};
+use super::watch::{EndpointWatch, Endpoints, ReaderWatch, RemoteReader};
 use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, announcement_port, multicast_port};
 
 /// Identity of one participant on the wire; a rebuilt one has a new identity.
@@ -52,6 +53,8 @@ pub struct ParticipantConfig {
     /// Bytes of the largest sample that comes in fragments. RustDDS takes memory for a whole sample when the first
     /// fragment comes, from any sender, so larger ones (than the next power of two) are dropped before it sees them.
     pub largest_sample: u32,
+    /// Whether single fragments of such samples are asked for again, as readers of reliable writers do.
+    pub repairs_fragments: bool,
 }
 
 impl ParticipantConfig {
@@ -64,6 +67,14 @@ impl ParticipantConfig {
             send_buffer_bytes: 64 * 1024,
             receive_buffer_bytes: DomainParticipantBuilder::DEFAULT_SOCKET_RECEIVE_BUFFER_SIZE,
             largest_sample: 64 * 1024,
+            repairs_fragments: false,
+        }
+    }
+
+    fn samples(&self) -> Samples {
+        Samples {
+            largest: self.largest_sample,
+            repaired: self.repairs_fragments,
         }
     }
 
@@ -96,6 +107,9 @@ pub struct Profile {
     pub depth: u16,
     /// Late joiners get the last `depth` samples.
     pub transient_local: bool,
+    /// Reliable writers: samples that may be under way at once, acknowledged by some readers and not by others; at least
+    /// `depth`. RustDDS keeps them, and those of the last six seconds, in memory.
+    pub window: u16,
 }
 
 impl Profile {
@@ -106,11 +120,13 @@ impl Profile {
             reliable: false,
             depth,
             transient_local: false,
+            window: 0,
         }
     }
 
     fn qos(self) -> QosPolicies {
         let depth = i32::from(self.depth.max(1));
+        let samples = depth.max(i32::from(self.window));
         let durability = if self.transient_local {
             Durability::TransientLocal
         } else {
@@ -120,9 +136,9 @@ impl Profile {
             .durability(durability)
             .history(History::KeepLast { depth })
             .resource_limits(ResourceLimits {
-                max_samples: depth,
+                max_samples: samples,
                 max_instances: 1,
-                max_samples_per_instance: depth,
+                max_samples_per_instance: samples,
             });
         if self.reliable {
             builder.reliable(Duration::ZERO).build()
@@ -184,7 +200,7 @@ impl Participant {
         }
         let port = announcement_port(config.domain, id);
         let multicast = multicast_port(config.domain);
-        let filter = filter::attach(&[port, port + 1, multicast, multicast + 1], config.largest_sample);
+        let filter = filter::attach(&[port, port + 1, multicast, multicast + 1], config.samples());
         warn_once(&filter);
         Ok(Self {
             prefix: prefix_of(dds.guid()),
@@ -265,6 +281,14 @@ impl Participant {
             sink,
             Arc::clone(&self.failed),
         )
+    }
+
+    /// Calls `sink` with the readers and writers of other participants, whenever one comes or goes, and once a second.
+    ///
+    /// # Errors
+    /// [`DdsError`] when there is no thread for it.
+    pub fn watch_endpoints(&self, sink: Box<dyn Fn(Endpoints) + Send>) -> Result<EndpointWatch, DdsError> {
+        EndpointWatch::start(self.dds.clone(), self.prefix, sink, Arc::clone(&self.failed))
     }
 
     /// Whether its threads are alive, as far as that shows without traffic: a panic anywhere was seen, the event loop
@@ -353,6 +377,30 @@ pub(super) fn prefix_of(guid: rustdds::GUID) -> GuidPrefix {
     GuidPrefix(prefix)
 }
 
+/// Identity of a reader or writer on the wire: its participant's and four bytes.
+pub type EndpointId = [u8; 16];
+
+pub(super) fn endpoint_of(guid: rustdds::GUID) -> EndpointId {
+    guid.to_bytes()
+}
+
+/// What became of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Written {
+    /// RustDDS has it.
+    Taken,
+    /// Nobody reads the topic.
+    NoReader,
+    /// The window is full: a reader has not acknowledged, or the socket takes nothing.
+    Full,
+    /// RustDDS refused, or has died.
+    Failed,
+}
+
+/// A best-effort sample up to this size is sent at once or not at all; a larger one waits for room in the socket, and
+/// RustDDS then keeps it for six seconds.
+const AT_ONCE_BYTES: usize = 2 * 1024 * 1024;
+
 /// Writes one topic. Never waits.
 pub struct Writer {
     writer: no_key::DataWriter<Octets, OctetsAdapter>,
@@ -370,6 +418,40 @@ impl Writer {
             ((self.is_matched_now() || self.keeps) && self.writer.write(Octets(octets), None).is_ok()).then_some(())
         })
         .is_some()
+    }
+
+    /// As [`write`](Self::write), and tells why it was not taken. `written` travels with the sample.
+    pub fn write_at(&self, octets: Bytes, written: Option<Timestamp>) -> Written {
+        self.contain(|| {
+            if !(self.is_matched_now() || self.keeps) {
+                return Some(Written::NoReader);
+            }
+            // Best effort gives up a sample of which the socket cannot take the rest at once.
+            let waits = octets.len() > AT_ONCE_BYTES;
+            let mut options = WriteOptionsBuilder::new().best_effort_may_block(waits);
+            if let Some(written) = written {
+                options = options.source_timestamp(written);
+            }
+            match self.writer.write_with_options(Octets(octets), options.build()) {
+                Ok(_) => Some(Written::Taken),
+                Err(WriteError::WouldBlock { .. }) => Some(Written::Full),
+                Err(_) => Some(Written::Failed),
+            }
+        })
+        .unwrap_or(Written::Failed)
+    }
+
+    /// Whether all readers have acknowledged all samples; always true for best effort.
+    #[must_use]
+    pub fn is_acknowledged(&self) -> bool {
+        self.contain(|| self.writer.wait_for_acknowledgments(std::time::Duration::ZERO).ok())
+            .unwrap_or(true)
+    }
+
+    /// Its identity on the wire.
+    #[must_use]
+    pub fn id(&self) -> EndpointId {
+        endpoint_of(self.writer.guid())
     }
 
     /// Whether a reader is there.

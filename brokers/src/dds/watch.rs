@@ -1,4 +1,4 @@
-//! Which readers other participants have.
+//! Which readers and writers other participants have.
 
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use futures::Stream;
 use rustdds::{DomainParticipant, DomainParticipantStatusEvent as Event, StatusEvented};
 
-use super::participant::prefix_of;
+use super::participant::{EndpointId, endpoint_of, prefix_of};
 use super::reader::{StoppableThread, unpark_waker};
 use super::{DdsError, GuidPrefix};
 
@@ -27,6 +27,60 @@ pub struct RemoteReader {
     pub topic: String,
     /// Where it takes data.
     pub addresses: Vec<IpAddr>,
+}
+
+/// A reader of another participant, of any topic.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FoundReader {
+    /// Its participant.
+    pub participant: GuidPrefix,
+    /// Its topic.
+    pub topic: String,
+    /// Whether it acknowledges.
+    pub reliable: bool,
+    /// Where it takes data.
+    pub sockets: Vec<SocketAddr>,
+}
+
+/// A writer of another participant, of any topic.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FoundWriter {
+    /// Its identity.
+    pub id: EndpointId,
+    /// Its topic.
+    pub topic: String,
+    /// Whether it repairs losses.
+    pub reliable: bool,
+    /// Whether it keeps samples for late joiners.
+    pub durable: bool,
+}
+
+/// All that other participants have.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Endpoints {
+    /// Their readers.
+    pub readers: Vec<FoundReader>,
+    /// Their writers.
+    pub writers: Vec<FoundWriter>,
+}
+
+/// Watches all endpoints until it is dropped.
+pub struct EndpointWatch {
+    _thread: StoppableThread,
+}
+
+impl EndpointWatch {
+    pub(super) fn start(
+        participant: DomainParticipant,
+        own: GuidPrefix,
+        sink: Box<dyn Fn(Endpoints) + Send>,
+        failed: Arc<AtomicBool>,
+    ) -> Result<Self, DdsError> {
+        let thread = StoppableThread::start("dds-watch", failed, move |stop| {
+            watch(&participant, stop, || sink(endpoints(&participant, own)));
+        })?;
+        Ok(Self { _thread: thread })
+    }
 }
 
 /// Watches until it is dropped.
@@ -61,9 +115,13 @@ fn watch(participant: &DomainParticipant, stop: &AtomicBool, look: impl Fn()) {
         let mut changed = false;
         while let Poll::Ready(event) = Pin::new(&mut events).poll_next(&mut context) {
             match event {
-                Some(Event::ReaderDetected { .. } | Event::ReaderLost { .. } | Event::ParticipantLost { .. }) => {
-                    changed = true;
-                }
+                Some(
+                    Event::ReaderDetected { .. }
+                    | Event::ReaderLost { .. }
+                    | Event::WriterDetected { .. }
+                    | Event::WriterLost { .. }
+                    | Event::ParticipantLost { .. },
+                ) => changed = true,
                 Some(_) => {}
                 // Both threads of RustDDS have gone; whoever watches the participant sees that too.
                 None => return,
@@ -97,4 +155,44 @@ fn remote_readers(participant: &DomainParticipant, own: GuidPrefix, topics: &str
         })
         .filter(|reader| reader.participant != own)
         .collect()
+}
+
+fn endpoints(participant: &DomainParticipant, own: GuidPrefix) -> Endpoints {
+    let readers = participant.discovered_readers();
+    let writers = participant.discovered_writers();
+    let is_foreign = |guid: rustdds::GUID| guid.entity_id.kind().is_user_defined() && prefix_of(guid) != own;
+    Endpoints {
+        readers: readers
+            .iter()
+            .filter(|reader| is_foreign(reader.reader_proxy.remote_reader_guid))
+            .map(|reader| FoundReader {
+                participant: prefix_of(reader.reader_proxy.remote_reader_guid),
+                topic: reader.subscription_topic_data.topic_name().clone(),
+                reliable: reader.subscription_topic_data.qos().is_reliable(),
+                sockets: reader
+                    .reader_proxy
+                    .unicast_locator_list
+                    .iter()
+                    .filter(|locator| locator.is_udp())
+                    .map(|locator| SocketAddr::from(*locator))
+                    .collect(),
+            })
+            .collect(),
+        writers: writers
+            .iter()
+            .filter(|writer| is_foreign(writer.writer_proxy.remote_writer_guid))
+            .map(|writer| FoundWriter {
+                id: endpoint_of(writer.writer_proxy.remote_writer_guid),
+                topic: writer.publication_topic_data.topic_name.clone(),
+                reliable: matches!(
+                    writer.publication_topic_data.reliability,
+                    Some(rustdds::policy::Reliability::Reliable { .. })
+                ),
+                durable: writer
+                    .publication_topic_data
+                    .durability
+                    .is_some_and(|durability| durability != rustdds::policy::Durability::Volatile),
+            })
+            .collect(),
+    }
 }

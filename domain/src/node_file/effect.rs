@@ -8,7 +8,6 @@ const NOT_YET: &str = "not in effect in this version";
 
 /// Sections without effect, each worth one warning.
 const SECTIONS: &[&str] = &[
-    "brokers.layer.dds",
     "brokers.plugins",
     "config",
     "cache",

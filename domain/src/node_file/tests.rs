@@ -83,7 +83,6 @@ fn the_example_is_read_whole() {
     assert_eq!(
         places,
         [
-            "brokers.layer.dds",
             "brokers.plugins",
             "config",
             "cache",

@@ -6,6 +6,8 @@
 #![allow(clippy::expect_used, reason = "the helpers of a test fail like the test")]
 
 mod drain;
+#[cfg(feature = "kafka")]
+mod edge_to_edge;
 mod lossy_link;
 mod meeting;
 mod pace;

@@ -29,10 +29,10 @@ const HIGH_BIT_OF_HALF: u32 = 0x8000;
 
 /// RustDDS cuts samples into fragments of this many bytes.
 const FRAGMENT: u32 = 256;
-/// First fragment that a NACK_FRAG may ask for. Samples whose fragments are repaired are those of discovery, which have
-/// less than one packet. RustDDS allocates a bit for each fragment before it.
+/// First fragment that a NACK_FRAG may ask for where only samples of discovery are repaired, which have less than one
+/// packet. RustDDS allocates a bit for each fragment before it.
 const MAX_NACK_FRAGMENT: u32 = 0x3ff;
-/// Last fragment of a HEARTBEAT_FRAG.
+/// Last fragment of a HEARTBEAT_FRAG, at least.
 const MAX_FRAGMENT: u32 = 0xffff;
 /// Bits of a bitmap. RustDDS takes 256 and no more; this only is the next power of two.
 const MAX_BITS: u32 = 0x1ff;
@@ -69,8 +69,42 @@ impl Shape {
     pub(in super::super) const SMALL: Self = Self { full: 2, quick: 24 };
 }
 
-/// Makes the filter. DATA_FRAG passes up to the next power of two above `largest_sample` bytes.
-pub(super) fn program(shape: Shape, largest_sample: u32) -> Result<Vec<Instruction>, AssembleError> {
+/// The samples that come in fragments.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in super::super) struct Samples {
+    /// Bytes of the largest: DATA_FRAG passes up to the next power of two.
+    pub(in super::super) largest: u32,
+    /// Whether single fragments are asked for again.
+    pub(in super::super) repaired: bool,
+}
+
+/// Bits that must not be set.
+#[derive(Debug, Clone, Copy)]
+struct Masks {
+    sample: u32,
+    nack_fragment: u32,
+    fragment: u32,
+}
+
+impl Samples {
+    fn masks(self) -> Masks {
+        let limit = self.largest.max(1).checked_next_power_of_two().unwrap_or(1 << 31);
+        let fragments = (limit / FRAGMENT).max(1) - 1;
+        let nack = if self.repaired {
+            fragments.max(MAX_NACK_FRAGMENT)
+        } else {
+            MAX_NACK_FRAGMENT
+        };
+        Masks {
+            sample: !(limit - 1),
+            nack_fragment: !nack,
+            fragment: !fragments.max(MAX_FRAGMENT),
+        }
+    }
+}
+
+/// Makes the filter.
+pub(super) fn program(shape: Shape, samples: Samples) -> Result<Vec<Instruction>, AssembleError> {
     let mut asm = Assembler::default();
     let is_rtps = asm.label();
     asm.op(Op::LoadWordAt, UDP_HEADER);
@@ -78,9 +112,9 @@ pub(super) fn program(shape: Shape, largest_sample: u32) -> Result<Vec<Instructi
     asm.op(Op::Return, DROP);
     asm.place(is_rtps);
     asm.op(Op::IndexConstant, UDP_HEADER + RTPS_HEADER);
-    let too_large = !(largest_sample.max(1).checked_next_power_of_two().unwrap_or(1 << 31) - 1);
+    let masks = samples.masks();
     for _ in 0..shape.full {
-        full_step(&mut asm, too_large);
+        full_step(&mut asm, masks);
     }
     let other = asm.label();
     for _ in 0..shape.quick {
@@ -88,7 +122,7 @@ pub(super) fn program(shape: Shape, largest_sample: u32) -> Result<Vec<Instructi
     }
     asm.place(other);
     for _ in 0..shape.full {
-        full_step(&mut asm, too_large);
+        full_step(&mut asm, masks);
     }
     pass_at_end(&mut asm);
     asm.op(Op::Return, DROP);
@@ -137,7 +171,7 @@ fn quick_step(asm: &mut Assembler, other: Label) {
 }
 
 /// Looks at one submessage of any kind.
-fn full_step(asm: &mut Assembler, too_large: u32) {
+fn full_step(asm: &mut Assembler, masks: Masks) {
     pass_at_end(asm);
     let [data_frag, heartbeat, gap, acknack, nack_frag, heartbeat_frag] = [(); 6].map(|()| asm.label());
     let [range, good, bad, next] = [(); 4].map(|()| asm.label());
@@ -157,7 +191,7 @@ fn full_step(asm: &mut Assembler, too_large: u32) {
     zero(asm, 16, bad);
     not_zero(asm, 24, bad);
     fragment_shape(asm, bad);
-    no_bits(asm, 32, too_large, bad);
+    no_bits(asm, 32, masks.sample, bad);
     asm.jump(good);
 
     asm.place(acknack);
@@ -168,13 +202,13 @@ fn full_step(asm: &mut Assembler, too_large: u32) {
     asm.place(nack_frag);
     zero(asm, 12, bad);
     not_zero(asm, 20, bad);
-    no_bits(asm, 20, !MAX_NACK_FRAGMENT, bad);
+    no_bits(asm, 20, masks.nack_fragment, bad);
     no_bits(asm, 24, !MAX_BITS, bad);
     asm.jump(good);
 
     asm.place(heartbeat_frag);
     zero(asm, 12, bad);
-    no_bits(asm, 20, !MAX_FRAGMENT, bad);
+    no_bits(asm, 20, masks.fragment, bad);
     asm.jump(good);
 
     asm.place(heartbeat);

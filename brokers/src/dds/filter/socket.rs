@@ -12,7 +12,7 @@ use rustix::process::{PidfdFlags, PidfdGetfdFlags, getpid, pidfd_getfd, pidfd_op
 use socket2::{SockFilter, Socket};
 
 use super::assembler::Instruction;
-use super::program::{Shape, program};
+use super::program::{Samples, Shape, program};
 use super::{FilterError, system};
 
 /// The UDP sockets of the calling thread's network namespace, IPv4.
@@ -84,7 +84,7 @@ fn own_sockets() -> std::io::Result<HashMap<u64, RawFd>> {
 }
 
 /// Attaches the filter to all UDP sockets of this process that are bound to one of the ports.
-pub(in super::super) fn attach(ports: &[u16], largest_sample: u32) -> Result<Attached, FilterError> {
+pub(in super::super) fn attach(ports: &[u16], samples: Samples) -> Result<Attached, FilterError> {
     let own = own_sockets().map_err(system("the own sockets are not known"))?;
     let all = udp_sockets().map_err(system("the UDP sockets are not known"))?;
     let this = pidfd_open(getpid(), PidfdFlags::empty()).map_err(errno("pidfd_open"))?;
@@ -98,7 +98,7 @@ pub(in super::super) fn attach(ports: &[u16], largest_sample: u32) -> Result<Att
         };
         let duplicate = pidfd_getfd(&this, *descriptor, PidfdGetfdFlags::empty()).map_err(errno("pidfd_getfd"))?;
         if let Some(socket) = still_bound(duplicate, found.port) {
-            attach_one(&socket, largest_sample, &mut attached.shape)?;
+            attach_one(&socket, samples, &mut attached.shape)?;
             attached.inodes.insert(found.inode);
         }
     }
@@ -116,16 +116,16 @@ fn still_bound(duplicate: OwnedFd, port: u16) -> Option<Socket> {
 }
 
 /// Attaches the largest filter for which the system has room.
-fn attach_one(socket: &Socket, largest_sample: u32, shape: &mut Shape) -> Result<(), FilterError> {
+fn attach_one(socket: &Socket, samples: Samples, shape: &mut Shape) -> Result<(), FilterError> {
     if *shape == Shape::LARGE {
-        match socket.attach_filter(&filters(&program(Shape::LARGE, largest_sample)?)) {
+        match socket.attach_filter(&filters(&program(Shape::LARGE, samples)?)) {
             Ok(()) => return Ok(()),
             Err(error) if Errno::from_io_error(&error) == Some(Errno::NOMEM) => *shape = Shape::SMALL,
             Err(error) => return Err(system("the filter was refused")(error)),
         }
     }
     socket
-        .attach_filter(&filters(&program(*shape, largest_sample)?))
+        .attach_filter(&filters(&program(*shape, samples)?))
         .map_err(system("the filter was refused"))
 }
 

@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, UdpSocket};
 use std::time::Duration;
 
 use super::assembler::{AssembleError, Assembler, Instruction, JUMP, Op, Test};
-use super::program::{Shape, program};
+use super::program::{Samples, Shape, program};
 use super::socket::{UdpSocketLine, attach};
 
 /// Runs a program over a packet; the result is what `Return` says, 0 for a load beyond the packet.
@@ -70,11 +70,15 @@ fn interpret(program: &[Instruction], packet: &[u8]) -> u32 {
 }
 
 const LARGEST: u32 = 60 * 1024 + 8;
+const SAMPLES: Samples = Samples {
+    largest: LARGEST,
+    repaired: false,
+};
 
 fn passes_shape(shape: Shape, datagram: &[u8]) -> bool {
     let mut packet = vec![0; 8];
     packet.extend_from_slice(datagram);
-    interpret(&program(shape, LARGEST).unwrap(), &packet) != 0
+    interpret(&program(shape, SAMPLES).unwrap(), &packet) != 0
 }
 
 /// Whether a datagram passes; both shapes must agree.
@@ -414,7 +418,7 @@ fn the_kernel_takes_the_filter_and_drops_what_it_must() {
     let receiver = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
     receiver.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
     let port = receiver.local_addr().unwrap().port();
-    let attached = attach(&[port], LARGEST).unwrap();
+    let attached = attach(&[port], SAMPLES).unwrap();
     let sender = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
     let mut buffer = vec![0; 65_536];
     for e in BOTH {
@@ -441,5 +445,23 @@ fn the_kernel_takes_the_filter_and_drops_what_it_must() {
         }
         assert_eq!(attached.dropped() - before, bad.len() as u64);
     }
-    assert!(attach(&[1], LARGEST).is_err(), "no socket of this process has port 1");
+    assert!(attach(&[1], SAMPLES).is_err(), "no socket of this process has port 1");
+}
+
+#[test]
+fn fragments_of_large_samples_are_asked_for_where_they_are_repaired() {
+    let samples = |repaired| Samples {
+        largest: 16 << 20,
+        repaired,
+    };
+    for e in BOTH {
+        for (fragment, passes) in [(1, true), (1023, true), (1024, false), (65_535, false)] {
+            let packet = [vec![0; 8], message(&[e.nack_frag(1, fragment, 1)])].concat();
+            let run = |samples| interpret(&program(Shape::LARGE, samples).unwrap(), &packet) != 0;
+            assert_eq!(run(samples(false)), passes, "{fragment}");
+            assert!(run(samples(true)), "{fragment}");
+        }
+        let beyond = [vec![0; 8], message(&[e.nack_frag(1, 1 << 17, 1)])].concat();
+        assert_eq!(interpret(&program(Shape::LARGE, samples(true)).unwrap(), &beyond), 0);
+    }
 }

@@ -1,0 +1,353 @@
+//! Subscribed channels: their DDS readers, and the threads that empty them.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock, Weak};
+use std::task::{Wake, Waker};
+use std::thread::{self, Thread};
+use std::time::{Duration, Instant};
+
+use blaze_domain::names::ChannelName;
+use parking_lot::{Mutex, RwLock};
+use rustdds::Timestamp;
+use rustdds::no_key::SimpleDataReader;
+use tokio::sync::oneshot;
+
+use super::deliver::{Kind, Progress, deliver};
+use super::kept::History;
+use super::names;
+use super::shared::Shared;
+use crate::dds::reader::StoppableThread;
+use crate::dds::sample::{Octets, OctetsAdapter};
+use crate::dds::{DdsError, EndpointId, Profile};
+use crate::port::{BrokerError, Content, Received, SubscribeOptions, SubscriptionSender};
+
+/// Channels that one broker reads at most.
+pub const MAX_CHANNELS: usize = 4096;
+/// Samples that one channel gives before the next has its turn.
+const TURN: usize = 256;
+/// A safety net only: RustDDS wakes the thread.
+const LONGEST_SLEEP: Duration = Duration::from_millis(250);
+/// Samples that wait for the reading thread. RustDDS keeps that many whether they wait or not.
+const SMALL_DEPTH: u16 = 2048;
+/// The same where they may be large.
+const LARGE_DEPTH: u16 = 16;
+
+pub(super) type RawReader = SimpleDataReader<Octets, OctetsAdapter>;
+
+/// The readers of a channel, and how far they have come.
+#[derive(Default)]
+pub(super) struct Readers {
+    pub(super) reliable: Option<RawReader>,
+    /// Where a best-effort writer is known: a reliable reader does not match it.
+    pub(super) best_effort: Option<RawReader>,
+    /// What came before is not delivered: RustDDS keeps samples of a topic for readers to come.
+    pub(super) opened: Option<Timestamp>,
+    /// The last sequence number of each writer.
+    pub(super) last: HashMap<EndpointId, i64>,
+    pub(super) history: History,
+}
+
+/// A channel that is read.
+pub(super) struct Channel {
+    pub(super) topic: Arc<str>,
+    pub(super) is_reserved: bool,
+    pub(super) large: bool,
+    /// Begin with what is kept for late joiners.
+    pub(super) with_kept: bool,
+    pub(super) senders: Mutex<Vec<SubscriptionSender>>,
+    pub(super) readers: Mutex<Readers>,
+    /// Who waits until it is read.
+    waiting: Mutex<Vec<oneshot::Sender<()>>>,
+    /// It stands in the list of those with samples.
+    is_ready: AtomicBool,
+    ready: Arc<Ready>,
+    weak: Weak<Self>,
+}
+
+/// Channels with samples, and the thread that empties them.
+#[derive(Default)]
+struct Ready {
+    queue: Mutex<Vec<Arc<Channel>>>,
+    thread: OnceLock<Thread>,
+}
+
+impl Channel {
+    pub(super) fn profile(&self, reliable: bool) -> Profile {
+        Profile {
+            reliable,
+            depth: if self.large { LARGE_DEPTH } else { SMALL_DEPTH },
+            transient_local: self.with_kept && reliable,
+            window: 0,
+        }
+    }
+
+    /// It is read now: whoever waits for that is told, and what came meanwhile is looked for.
+    pub(super) fn opened(&self) {
+        for waiting in self.waiting.lock().drain(..) {
+            // Nobody waits any more when the subscription was given up.
+            let _ = waiting.send(());
+        }
+        self.note_samples();
+    }
+
+    fn is_used(&self) -> bool {
+        let mut senders = self.senders.lock();
+        senders.retain(|sender| !sender.is_closed());
+        !senders.is_empty()
+    }
+
+    /// Its thread is to look for samples.
+    fn note_samples(&self) {
+        if let Some(this) = self.weak.upgrade()
+            && !self.is_ready.swap(true, Ordering::AcqRel)
+        {
+            self.ready.queue.lock().push(this);
+        }
+        if let Some(thread) = self.ready.thread.get() {
+            thread.unpark();
+        }
+    }
+
+    /// Takes samples until there is none, or its turn is over.
+    fn drain(&self, shared: &Shared) {
+        self.is_ready.store(false, Ordering::Release);
+        let mut readers = self.readers.lock();
+        let Readers {
+            reliable,
+            best_effort,
+            opened,
+            last,
+            history,
+        } = &mut *readers;
+        let mut progress = Progress {
+            opened: opened.unwrap_or(Timestamp::ZERO),
+            last,
+            history,
+        };
+        let mut again = false;
+        for (reader, kind) in [(reliable, Kind::Reliable), (best_effort, Kind::BestEffort)] {
+            let Some(reader) = reader else { continue };
+            again |= self.drain_one(shared, reader, kind, &mut progress);
+            reader.set_waker(Some(Waker::from(Arc::new(Bell(self.weak.clone())))));
+            // What came before the waker was set woke nobody.
+            again |= self.drain_one(shared, reader, kind, &mut progress);
+        }
+        let quiet = progress.history.quiet(Instant::now());
+        drop(readers);
+        for received in quiet {
+            self.send(received);
+        }
+        if again {
+            self.note_samples();
+        }
+    }
+
+    /// Hands a message to all who subscribed.
+    pub(super) fn send(&self, received: Received) {
+        let mut senders = self.senders.lock();
+        if let [sender] = &senders[..] {
+            // Mostly there is one; one that has ended is swept later.
+            sender.send(received);
+        } else {
+            senders.retain(|sender| sender.send(received.clone()));
+        }
+    }
+
+    /// Returns whether there may be more.
+    fn drain_one(&self, shared: &Shared, reader: &RawReader, kind: Kind, progress: &mut Progress<'_>) -> bool {
+        reader.drain_read_notifications();
+        for _ in 0..TURN {
+            match reader.try_take_one() {
+                Ok(Some(sample)) => deliver(shared, self, kind, progress, sample),
+                Ok(None) => return false,
+                Err(_) => {
+                    shared.counters.malformed.fetch_add(1, Ordering::Relaxed);
+                }
+            }
+        }
+        true
+    }
+}
+
+/// Wakes the reading thread for one channel.
+struct Bell(Weak<Channel>);
+
+impl Wake for Bell {
+    fn wake(self: Arc<Self>) {
+        self.wake_by_ref();
+    }
+
+    fn wake_by_ref(self: &Arc<Self>) {
+        if let Some(channel) = self.0.upgrade() {
+            channel.note_samples();
+        }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct ChannelKey {
+    topic: Arc<str>,
+    large: bool,
+    /// One that begins with what is kept shares its reader with nobody.
+    alone: Option<u64>,
+}
+
+/// All channels that one broker reads.
+#[derive(Default)]
+pub(super) struct Channels {
+    all: Mutex<HashMap<ChannelKey, Arc<Channel>>>,
+    /// The same by their topics, for what this participant publishes itself.
+    by_topic: RwLock<HashMap<Arc<str>, Vec<Arc<Channel>>>>,
+    ready: [Arc<Ready>; 2],
+    closed: AtomicBool,
+    next: AtomicU64,
+}
+
+impl Channels {
+    /// Adds a reader; it hears of it when the channel is read.
+    pub(super) fn add(
+        &self,
+        channel: &ChannelName,
+        sender: SubscriptionSender,
+        options: SubscribeOptions,
+    ) -> Result<oneshot::Receiver<()>, BrokerError> {
+        let (confirm, confirmed) = oneshot::channel();
+        let key = ChannelKey {
+            topic: names::topic(channel),
+            large: options.large,
+            alone: options.with_kept.then(|| self.next.fetch_add(1, Ordering::Relaxed)),
+        };
+        let mut all = self.all.lock();
+        if self.closed.load(Ordering::Acquire) {
+            return Err(BrokerError::Closed);
+        }
+        if all.len() >= MAX_CHANNELS && !all.contains_key(&key) {
+            return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
+        }
+        let found = all.entry(key).or_insert_with_key(|key| {
+            let ready = Arc::clone(&self.ready[usize::from(options.large)]);
+            let made = Arc::new_cyclic(|weak| Channel {
+                topic: Arc::clone(&key.topic),
+                is_reserved: channel.is_reserved(),
+                large: options.large,
+                with_kept: options.with_kept,
+                senders: Mutex::default(),
+                readers: Mutex::default(),
+                waiting: Mutex::default(),
+                is_ready: AtomicBool::new(false),
+                ready,
+                weak: weak.clone(),
+            });
+            let mut by_topic = self.by_topic.write();
+            by_topic
+                .entry(Arc::clone(&key.topic))
+                .or_default()
+                .push(Arc::clone(&made));
+            made
+        });
+        // In this order, as the thread that opens it locks them.
+        let readers = found.readers.lock();
+        found.senders.lock().push(sender);
+        if readers.reliable.is_some() {
+            let _ = confirm.send(());
+        } else {
+            found.waiting.lock().push(confirm);
+        }
+        drop(readers);
+        Ok(confirmed)
+    }
+
+    pub(super) fn list(&self) -> Vec<Arc<Channel>> {
+        self.all.lock().values().map(Arc::clone).collect()
+    }
+
+    /// Takes out the channels that nobody reads any more.
+    pub(super) fn take_unused(&self) -> Vec<Arc<Channel>> {
+        let mut unused = Vec::new();
+        self.all.lock().retain(|_, channel| {
+            let used = channel.is_used();
+            if !used {
+                unused.push(Arc::clone(channel));
+            }
+            used
+        });
+        let mut by_topic = self.by_topic.write();
+        for gone in &unused {
+            if let Some(channels) = by_topic.get_mut(&gone.topic) {
+                channels.retain(|channel| !Arc::ptr_eq(channel, gone));
+                if channels.is_empty() {
+                    by_topic.remove(&gone.topic);
+                }
+            }
+        }
+        drop(by_topic);
+        unused
+    }
+
+    /// Hands an own message to the own readers of its topic. `content` is asked for once for each.
+    pub(super) fn deliver_own(&self, topic: &str, content: impl Fn() -> Content) {
+        let by_topic = self.by_topic.read();
+        for channel in by_topic.get(topic).into_iter().flatten() {
+            let received = Received {
+                content: content(),
+                at: Instant::now(),
+                broker_age_us: 0,
+            };
+            channel.send(received);
+        }
+    }
+
+    /// Takes out all readers, whose participant has died.
+    pub(super) fn take_readers(&self) -> Vec<RawReader> {
+        let take = |channel: Arc<Channel>| {
+            let readers = std::mem::take(&mut *channel.readers.lock());
+            [readers.reliable, readers.best_effort]
+        };
+        self.list().into_iter().flat_map(take).flatten().collect()
+    }
+
+    /// Ends all subscriptions; what waits in them is still read.
+    pub(super) fn close(&self) {
+        let all = self.all.lock();
+        self.closed.store(true, Ordering::Release);
+        for channel in all.values() {
+            for sender in channel.senders.lock().iter() {
+                sender.close();
+            }
+            channel.waiting.lock().clear();
+        }
+        drop(all);
+        for ready in &self.ready {
+            if let Some(thread) = ready.thread.get() {
+                thread.unpark();
+            }
+        }
+    }
+}
+
+/// Starts the thread that reads the channels with small or large messages.
+pub(super) fn start(shared: &Arc<Shared>, large: bool) -> Result<StoppableThread, DdsError> {
+    let shared = Arc::clone(shared);
+    let name = if large { "dds-read-large" } else { "dds-read" };
+    StoppableThread::start(name, Arc::default(), move |stop| {
+        let ready = Arc::clone(&shared.channels.ready[usize::from(large)]);
+        let _ = ready.thread.set(thread::current());
+        while !stop.load(Ordering::Relaxed) && !shared.stop.load(Ordering::Acquire) {
+            let channels = std::mem::take(&mut *ready.queue.lock());
+            let idle = channels.is_empty();
+            for channel in channels {
+                channel.drain(&shared);
+            }
+            if idle {
+                thread::park_timeout(LONGEST_SLEEP);
+                if ready.queue.lock().is_empty() {
+                    for channel in shared.channels.list().iter().filter(|channel| channel.large == large) {
+                        channel.drain(&shared);
+                    }
+                }
+            }
+        }
+        ready.queue.lock().clear();
+    })
+}

@@ -1,0 +1,210 @@
+//! The thread that owns the participant: it makes writers and readers, watches over RustDDS and over those who have gone,
+//! and builds everything anew when RustDDS dies.
+
+use std::net::UdpSocket;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use super::make::Generation;
+use super::presence::SILENT;
+use super::shared::Shared;
+use super::slot::Slot;
+use crate::dds::DdsError;
+use crate::dds::reader::StoppableThread;
+use crate::port::Health;
+
+const TICK: Duration = Duration::from_millis(100);
+const RETRY: Duration = Duration::from_secs(1);
+const GOOD_BYE: Duration = Duration::from_secs(1);
+/// How often it is looked whether the interface still has its address.
+const INTERFACE: Duration = Duration::from_secs(1);
+/// A window that is full for a moment is the network's pace.
+const PRESSURE: Duration = Duration::from_millis(50);
+
+pub(super) fn start(shared: &Arc<Shared>) -> Result<StoppableThread, DdsError> {
+    let shared = Arc::clone(shared);
+    let failed = Arc::<AtomicBool>::default();
+    StoppableThread::start("dds-layer", failed, move |stop| {
+        let _ = shared.lifecycle.set(thread::current());
+        Lifecycle::new(shared).run(stop);
+    })
+}
+
+struct Lifecycle {
+    shared: Arc<Shared>,
+    generation: Option<Generation>,
+    next_attempt: Instant,
+    /// When the last participant was built.
+    built: Instant,
+    had_life: bool,
+    next_look: Instant,
+    last_tick: Instant,
+}
+
+impl Lifecycle {
+    fn new(shared: Arc<Shared>) -> Self {
+        let now = Instant::now();
+        Self {
+            shared,
+            generation: None,
+            next_attempt: now,
+            built: now,
+            had_life: false,
+            next_look: now + INTERFACE,
+            last_tick: now,
+        }
+    }
+
+    fn run(mut self, stop: &AtomicBool) {
+        while !stop.load(Ordering::Relaxed) && !self.shared.stop.load(Ordering::Acquire) {
+            // A panic of RustDDS in this thread is one more way of its death.
+            if catch_unwind(AssertUnwindSafe(|| self.tick())).is_err() {
+                self.bury("RustDDS panicked in a call");
+            }
+            thread::park_timeout(TICK);
+        }
+        // Others are told of the end, unless RustDDS hangs.
+        if let Some(done) = self.lay_aside() {
+            let _ = done.recv_timeout(GOOD_BYE);
+        }
+    }
+
+    fn tick(&mut self) {
+        let now = Instant::now();
+        let paused = now.saturating_duration_since(self.last_tick);
+        self.last_tick = now;
+        #[cfg(feature = "fault-injection")]
+        if let Some(fault) = self.shared.fault.lock().take()
+            && let Some(generation) = &self.generation
+        {
+            generation.participant.inject(fault).ok();
+        }
+        if let Some(reason) = self.illness(now) {
+            self.bury(&reason);
+        }
+        if self.generation.is_none() && now >= self.next_attempt {
+            self.give_birth(now);
+        }
+        let Some(generation) = &mut self.generation else { return };
+        if paused > SILENT / 2 {
+            generation.presence.lock().excuse(now);
+        }
+        if generation.exchange_signs(&self.shared, now) && now.saturating_duration_since(self.built) > SILENT {
+            self.bury("others had given this participant up");
+            return;
+        }
+        if let Err(error) = make_missing(&self.shared, generation, now) {
+            tracing::warn!(domain = self.shared.domain, %error, "RustDDS refuses");
+        }
+        let slots = self.shared.slots.live();
+        generation.expel(&self.shared, now, &full(&slots, now));
+        for writer in self.shared.slots.take_gone(now) {
+            self.shared.writers.write().remove(&writer.id());
+        }
+        drop(self.shared.channels.take_unused());
+        let others = generation.presence.lock().count();
+        let detail = format!(
+            "DDS domain {} on {}, {others} other participants with readers",
+            self.shared.domain, self.shared.address
+        );
+        self.shared.set_status(Health::Up, &detail);
+    }
+
+    /// Why the participant must be replaced, if so.
+    fn illness(&mut self, now: Instant) -> Option<String> {
+        let generation = self.generation.as_mut()?;
+        if let Some(illness) = generation.illness() {
+            return Some(illness.to_string());
+        }
+        if now >= self.next_look {
+            self.next_look = now + INTERFACE;
+            let address = self.shared.address;
+            if let Err(error) = UdpSocket::bind((address, 0)) {
+                return Some(format!("no interface has {address} any more: {error}"));
+            }
+        }
+        None
+    }
+
+    fn bury(&mut self, reason: &str) {
+        tracing::error!(
+            domain = self.shared.domain,
+            reason,
+            "DDS participant ended, building a new one"
+        );
+        self.shared.set_status(Health::Down, reason);
+        self.lay_aside();
+        // One that dies at once is not built in a tight circle.
+        self.next_attempt = self.built + RETRY;
+    }
+
+    /// Drops the participant and all that belongs to it. Its end may hang, so it is left to a thread of its own, which
+    /// tells when it is over.
+    fn lay_aside(&mut self) -> Option<Receiver<()>> {
+        let writers = self.shared.slots.take_all();
+        let readers = self.shared.channels.take_readers();
+        self.shared.writers.write().clear();
+        self.shared.best_effort.write().clear();
+        let remains = (writers, readers, self.generation.take());
+        let (done, receiver) = sync_channel(1);
+        let thread = thread::Builder::new().name("dds-remains".into()).spawn(move || {
+            let _ = catch_unwind(AssertUnwindSafe(|| drop(remains)));
+            let _ = done.send(());
+        });
+        match thread {
+            Ok(_) => Some(receiver),
+            Err(error) => {
+                tracing::error!(%error, "no thread for the end of a DDS participant");
+                None
+            }
+        }
+    }
+
+    fn give_birth(&mut self, now: Instant) {
+        match Generation::start(&self.shared, now) {
+            Ok(generation) => {
+                tracing::info!(domain = self.shared.domain, participant = ?generation.participant, "DDS participant started");
+                if let Some(weakness) = generation.participant.filter_weakness() {
+                    tracing::debug!(weakness, "hostile datagrams may reach RustDDS");
+                }
+                self.generation = Some(generation);
+                self.built = now;
+                if std::mem::replace(&mut self.had_life, true) {
+                    self.shared.counters.rebuilds.fetch_add(1, Ordering::Relaxed);
+                }
+            }
+            Err(error) => {
+                tracing::warn!(domain = self.shared.domain, %error, "DDS participant cannot start, trying again");
+                self.shared.set_status(Health::Down, &error.to_string());
+                self.next_attempt = now + RETRY;
+            }
+        }
+    }
+}
+
+/// Topics whose window is full, and since when.
+fn full(slots: &[Arc<Slot>], now: Instant) -> Vec<(&str, Instant)> {
+    let since = |slot: &Arc<Slot>| {
+        slot.full_since()
+            .filter(|since| now.saturating_duration_since(*since) >= PRESSURE)
+    };
+    let full = slots.iter().filter_map(|slot| Some((&*slot.key.topic, since(slot)?)));
+    full.collect()
+}
+
+/// Makes the writers and readers that are wanted and missing.
+fn make_missing(shared: &Arc<Shared>, generation: &Generation, now: Instant) -> Result<(), DdsError> {
+    let slots = shared.slots.live();
+    for slot in slots.iter().filter(|slot| slot.needs_writer()) {
+        generation.fill(shared, slot, now)?;
+    }
+    for channel in shared.channels.list() {
+        let best_effort = shared.best_effort.read().contains(&*channel.topic);
+        generation.open(&channel, best_effort)?;
+    }
+    Ok(())
+}

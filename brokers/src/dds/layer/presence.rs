@@ -1,0 +1,259 @@
+//! Which other participants there are, and which of them are gone without having said so.
+//!
+//! | sign | verdict |
+//! |---|---|
+//! | their host says that nothing listens on their port | dead |
+//! | a newer participant has their port | dead |
+//! | a writer's window is full, and they have been silent for 2 s (those that send signs of life) | given up |
+//! | a writer's window has been full for 2 s, they read its topic and never send signs of life | given up |
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use crate::dds::{FoundReader, GuidPrefix};
+
+/// Signs of life come every 500 ms.
+pub(super) const SILENT: Duration = Duration::from_secs(2);
+/// How long a full window stands still before those without signs of life are given up.
+const STUCK: Duration = Duration::from_secs(2);
+/// How long those that were given up are told so, if they come back.
+const TELL: Duration = Duration::from_secs(60);
+/// Participants that are followed, and that were given up.
+const MAX_PEERS: usize = 1024;
+const MAX_GONE: usize = 64;
+
+/// Another participant.
+#[derive(Debug)]
+struct Peer {
+    /// Order in which they were found.
+    number: u64,
+    sockets: BTreeSet<SocketAddr>,
+    /// Topics that it reads and acknowledges.
+    acknowledges: BTreeSet<String>,
+    last_sign: Option<Instant>,
+}
+
+/// The other participants of one domain.
+#[derive(Debug, Default)]
+pub(super) struct Presence {
+    peers: BTreeMap<GuidPrefix, Peer>,
+    next: u64,
+    gone: VecDeque<(GuidPrefix, Instant)>,
+}
+
+impl Presence {
+    /// Takes over which readers there are.
+    pub(super) fn set_readers(&mut self, readers: &[FoundReader]) {
+        let mut found: BTreeMap<GuidPrefix, (BTreeSet<SocketAddr>, BTreeSet<String>)> = BTreeMap::new();
+        for reader in readers {
+            let (sockets, topics) = found.entry(reader.participant).or_default();
+            sockets.extend(reader.sockets.iter().copied());
+            if reader.reliable {
+                topics.insert(reader.topic.clone());
+            }
+        }
+        self.peers.retain(|prefix, _| found.contains_key(prefix));
+        for (prefix, (sockets, acknowledges)) in found {
+            if let Some(peer) = self.peers.get_mut(&prefix) {
+                peer.sockets = sockets;
+                peer.acknowledges = acknowledges;
+            } else if self.peers.len() < MAX_PEERS {
+                self.next += 1;
+                let peer = Peer {
+                    number: self.next,
+                    sockets,
+                    acknowledges,
+                    last_sign: None,
+                };
+                self.peers.insert(prefix, peer);
+            }
+        }
+    }
+
+    /// A sign of life.
+    pub(super) fn sign(&mut self, now: Instant, prefix: GuidPrefix) {
+        if let Some(peer) = self.peers.get_mut(&prefix) {
+            peer.last_sign = Some(now);
+        }
+    }
+
+    /// This process stood still: silence says nothing.
+    pub(super) fn excuse(&mut self, now: Instant) {
+        for peer in self.peers.values_mut() {
+            peer.last_sign = peer.last_sign.map(|_| now);
+        }
+    }
+
+    pub(super) fn count(&self) -> usize {
+        self.peers.len()
+    }
+
+    /// Where each takes its data.
+    pub(super) fn sockets(&self) -> impl Iterator<Item = (GuidPrefix, &BTreeSet<SocketAddr>)> {
+        self.peers.iter().map(|(prefix, peer)| (*prefix, &peer.sockets))
+    }
+
+    /// Those whose port a newer one has.
+    pub(super) fn superseded(&self) -> Vec<GuidPrefix> {
+        let mut newest: HashMap<SocketAddr, u64> = HashMap::new();
+        for peer in self.peers.values() {
+            for socket in &peer.sockets {
+                let number = newest.entry(*socket).or_insert(peer.number);
+                *number = peer.number.max(*number);
+            }
+        }
+        let is_superseded = |peer: &Peer| {
+            peer.sockets
+                .iter()
+                .any(|socket| newest.get(socket) > Some(&peer.number))
+        };
+        let old = self.peers.iter().filter(|(_, peer)| is_superseded(peer));
+        old.map(|(prefix, _)| *prefix).collect()
+    }
+
+    /// Those that are given up, since the windows of some topics have been full: each topic and since when.
+    pub(super) fn given_up(&self, now: Instant, full: &[(&str, Instant)]) -> Vec<GuidPrefix> {
+        if full.is_empty() {
+            return Vec::new();
+        }
+        let passed = |at: Instant| now.saturating_duration_since(at);
+        let is_given_up = |peer: &Peer| {
+            let mut blocked = full.iter().filter(|(topic, _)| peer.acknowledges.contains(*topic));
+            match peer.last_sign {
+                Some(at) => passed(at) >= SILENT && blocked.next().is_some(),
+                None => blocked.any(|(_, since)| passed(*since) >= STUCK),
+            }
+        };
+        let lost = self.peers.iter().filter(|(_, peer)| is_given_up(peer));
+        lost.map(|(prefix, _)| *prefix).collect()
+    }
+
+    /// Remembers one that was given up and may come back.
+    pub(super) fn note_gone(&mut self, now: Instant, prefix: GuidPrefix) {
+        self.gone
+            .retain(|(gone, at)| *gone != prefix && now.saturating_duration_since(*at) < TELL);
+        if self.gone.len() >= MAX_GONE {
+            self.gone.pop_front();
+        }
+        self.gone.push_back((prefix, now));
+    }
+
+    /// Those that were given up not long ago.
+    pub(super) fn gone(&mut self, now: Instant) -> impl Iterator<Item = GuidPrefix> + '_ {
+        self.gone.retain(|(_, at)| now.saturating_duration_since(*at) < TELL);
+        self.gone.iter().map(|(prefix, _)| *prefix)
+    }
+}
+
+/// How far the clocks of other participants are behind ours.
+#[derive(Debug, Default)]
+pub(super) struct Clocks {
+    behind: HashMap<GuidPrefix, (i128, Instant)>,
+}
+
+/// A comparison of clocks is replaced by a worse one after this time, as clocks drift and are set.
+const COMPARE_EVERY: Duration = Duration::from_secs(5);
+
+impl Clocks {
+    /// Takes a time of day that was sent, and ours when it came. The less of it was spent on the way, the better.
+    pub(super) fn compare(&mut self, now: Instant, prefix: GuidPrefix, sent_ns: i128, received_ns: i128) {
+        let behind = received_ns - sent_ns;
+        if self.behind.len() >= MAX_PEERS && !self.behind.contains_key(&prefix) {
+            self.behind
+                .retain(|_, (_, at)| now.saturating_duration_since(*at) < 2 * COMPARE_EVERY);
+            if self.behind.len() >= MAX_PEERS {
+                return;
+            }
+        }
+        let known = self.behind.entry(prefix).or_insert((behind, now));
+        if behind <= known.0 || now.saturating_duration_since(known.1) >= COMPARE_EVERY {
+            *known = (behind, now);
+        }
+    }
+
+    /// What must be added to a participant's time of day; 0 where that is not known.
+    pub(super) fn behind_ns(&self, prefix: GuidPrefix) -> i128 {
+        self.behind.get(&prefix).map_or(0, |(behind, _)| *behind)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn prefix(number: u8) -> GuidPrefix {
+        GuidPrefix([number; 12])
+    }
+
+    fn reader(participant: u8, topic: &str, port: u16) -> FoundReader {
+        FoundReader {
+            participant: prefix(participant),
+            topic: topic.to_owned(),
+            reliable: true,
+            sockets: vec![([127, 0, 0, 1], port).into()],
+        }
+    }
+
+    #[test]
+    fn silence_matters_only_where_a_window_is_full() {
+        let now = Instant::now();
+        let mut presence = Presence::default();
+        presence.set_readers(&[
+            reader(1, "a", 1),
+            reader(2, "a", 2),
+            reader(3, "b", 3),
+            reader(4, "a", 4),
+        ]);
+        for (number, at) in [(1, now), (2, now + Duration::from_secs(3)), (3, now)] {
+            presence.sign(at, prefix(number));
+        }
+        let later = now + Duration::from_secs(3);
+        assert_eq!(presence.given_up(later, &[]), []);
+        assert_eq!(presence.given_up(later, &[("a", later)]), [prefix(1)]);
+        assert_eq!(presence.given_up(later, &[("b", later)]), [prefix(3)]);
+        let stuck = now + Duration::from_secs(1);
+        assert_eq!(
+            presence.given_up(later, &[("a", stuck)]),
+            [prefix(1), prefix(4)],
+            "one without signs of life has time until the window has stood still for long"
+        );
+        presence.excuse(later);
+        assert_eq!(presence.given_up(later, &[("a", later)]), []);
+    }
+
+    #[test]
+    fn a_port_belongs_to_the_newest() {
+        let mut presence = Presence::default();
+        presence.set_readers(&[reader(9, "a", 1), reader(5, "a", 2)]);
+        assert_eq!(presence.superseded(), []);
+        presence.set_readers(&[reader(9, "a", 1), reader(5, "a", 2), reader(1, "b", 1)]);
+        assert_eq!(presence.superseded(), [prefix(9)]);
+        presence.set_readers(&[reader(5, "a", 2), reader(1, "b", 1)]);
+        assert_eq!((presence.superseded(), presence.count()), (vec![], 2));
+    }
+
+    #[test]
+    fn those_that_were_given_up_are_told_for_a_minute_and_are_bounded() {
+        let now = Instant::now();
+        let mut presence = Presence::default();
+        for number in 0..=255 {
+            presence.note_gone(now, prefix(number));
+        }
+        assert_eq!(presence.gone(now).count(), MAX_GONE);
+        assert_eq!(presence.gone(now + Duration::from_secs(61)).count(), 0);
+    }
+
+    #[test]
+    fn the_shortest_way_tells_the_time_best() {
+        let now = Instant::now();
+        let mut clocks = Clocks::default();
+        assert_eq!(clocks.behind_ns(prefix(1)), 0);
+        clocks.compare(now, prefix(1), 1_000, 6_000);
+        clocks.compare(now, prefix(1), 2_000, 6_500);
+        clocks.compare(now, prefix(1), 3_000, 9_000);
+        assert_eq!(clocks.behind_ns(prefix(1)), 4_500);
+        clocks.compare(now + COMPARE_EVERY, prefix(1), 3_000, 9_000);
+        assert_eq!(clocks.behind_ns(prefix(1)), 6_000);
+    }
+}

@@ -1,0 +1,270 @@
+//! The thread that hands messages to DDS writers.
+
+use std::collections::{HashMap, VecDeque};
+use std::pin::pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::task::Context;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use blaze_domain::{DropReason, WriterId};
+use blaze_proto::Frame;
+use bytes::{BufMut, Bytes, BytesMut};
+use lru::LruCache;
+use parking_lot::Mutex;
+
+use super::names;
+use super::shared::Shared;
+use super::slot::{Attempt, Slot, SlotKey};
+use crate::dds::DdsError;
+use crate::dds::reader::{StoppableThread, unpark_waker};
+use crate::outbox::{Body, Fate, Waiting};
+use crate::port::{Content, PublisherOptions};
+
+/// Messages and bytes of one turn; one message always fits.
+const TURN_MESSAGES: usize = 64;
+const TURN_BYTES: usize = 256 * 1024;
+/// A full turn takes at least this long: RustDDS neither paces nor tells when it is behind, and what it sends at once must
+/// fit into the buffers of sockets and readers. So up to 32,000 messages and 128 MB per second.
+const TURN: Duration = Duration::from_millis(2);
+/// Between attempts to write what a writer could not take.
+const AGAIN: Duration = Duration::from_millis(2);
+/// The same where an attempt copies much.
+const LARGE_AGAIN: Duration = Duration::from_millis(20);
+const LARGE_BYTES: usize = 64 * 1024;
+/// How often what is over its time is looked for while nothing else happens.
+const IDLE: Duration = Duration::from_millis(100);
+/// Origins of one transient_local publisher that have a writer each; the one that wrote longest ago gives way.
+const MAX_ORIGINS: usize = 256;
+/// Most samples that are kept per origin.
+const MAX_DEPTH: u32 = 1024;
+
+/// Where a publisher's messages go.
+pub(super) struct Target {
+    id: u64,
+    key: SlotKey,
+    /// The writer of all origins; none where each has its own.
+    slot: Option<Arc<Slot>>,
+    origins: Mutex<LruCache<WriterId, Arc<Slot>>>,
+}
+
+impl Target {
+    pub(super) fn new(shared: &Arc<Shared>, topic: Arc<str>, options: PublisherOptions) -> Self {
+        static IDS: AtomicU64 = AtomicU64::new(0);
+        let depth = u16::try_from(options.depth.min(MAX_DEPTH)).unwrap_or(u16::MAX);
+        let key = SlotKey {
+            topic,
+            reliable: options.reliable || depth > 0,
+            large: options.large,
+            depth: 0,
+            origin: None,
+        };
+        let slot = shared.slots.get(key.clone());
+        shared.wake_lifecycle();
+        Self {
+            id: IDS.fetch_add(1, Ordering::Relaxed),
+            key: SlotKey { depth, ..key },
+            slot: Some(slot).filter(|_| depth == 0),
+            origins: Mutex::new(LruCache::unbounded()),
+        }
+    }
+
+    /// The writer of a message.
+    fn slot_of(&self, shared: &Shared, body: &Body) -> Arc<Slot> {
+        if let Some(slot) = &self.slot {
+            return Arc::clone(slot);
+        }
+        let origin = match body {
+            Body::Frame(frame) => Some(frame.writer()),
+            Body::Bare(_) => None,
+        };
+        let Some(origin) = origin else {
+            // Without an origin there is nothing to keep for late joiners.
+            return shared.slots.get(SlotKey {
+                depth: 0,
+                ..self.key.clone()
+            });
+        };
+        let mut origins = self.origins.lock();
+        if let Some(slot) = origins.get(&origin) {
+            return Arc::clone(slot);
+        }
+        if origins.len() >= MAX_ORIGINS {
+            origins.pop_lru();
+            shared.counters.writers_forgotten.fetch_add(1, Ordering::Relaxed);
+        }
+        let slot = shared.slots.get(SlotKey {
+            origin: Some(origin),
+            ..self.key.clone()
+        });
+        origins.put(origin, Arc::clone(&slot));
+        shared.wake_lifecycle();
+        slot
+    }
+}
+
+pub(super) fn start(shared: &Arc<Shared>) -> Result<StoppableThread, DdsError> {
+    let shared = Arc::clone(shared);
+    let failed = Arc::<AtomicBool>::default();
+    StoppableThread::start("dds-send", failed, move |stop| {
+        let mut sender = Sender {
+            shared,
+            held: HashMap::new(),
+            taken: Vec::with_capacity(TURN_MESSAGES),
+        };
+        while !stop.load(Ordering::Relaxed) && !sender.shared.stop.load(Ordering::Acquire) {
+            sender.turn();
+        }
+        sender.held.clear();
+        sender.shared.held.store(0, Ordering::Release);
+        sender.shared.outbox.clear(DropReason::BrokerError);
+    })
+}
+
+struct Sender {
+    shared: Arc<Shared>,
+    /// By target: what its writer could not take, in order.
+    held: HashMap<u64, VecDeque<Waiting<Target>>>,
+    taken: Vec<Waiting<Target>>,
+}
+
+impl Sender {
+    fn turn(&mut self) {
+        let begin = Instant::now();
+        let retried = self.retry(begin);
+        let bytes = self.shared.outbox.take_ready(
+            begin,
+            TURN_MESSAGES,
+            TURN_BYTES,
+            true,
+            |target| !self.held.contains_key(&target.id),
+            &mut self.taken,
+        );
+        // Until they are written they are nowhere else.
+        self.shared.held.fetch_add(self.taken.len(), Ordering::AcqRel);
+        let count = self.taken.len();
+        for waiting in std::mem::take(&mut self.taken) {
+            self.write(waiting, begin);
+        }
+        self.note_held();
+        if count + retried >= TURN_MESSAGES / 2 || bytes >= TURN_BYTES / 2 {
+            let turns = u32::try_from(bytes.div_ceil(TURN_BYTES)).unwrap_or(u32::MAX).max(1);
+            if let Some(rest) = (TURN * turns).checked_sub(begin.elapsed()) {
+                thread::sleep(rest);
+            }
+        } else if count == 0 {
+            self.rest();
+        }
+    }
+
+    fn note_held(&self) {
+        let held = self.held.values().map(VecDeque::len).sum();
+        self.shared.held.store(held, Ordering::Release);
+    }
+
+    /// Waits for something to do.
+    fn rest(&self) {
+        if self.held.is_empty() {
+            wait(self.shared.outbox.filled(), IDLE);
+            return;
+        }
+        let is_large = |queue: &VecDeque<Waiting<Target>>| queue.front().is_some_and(|it| it.size() > LARGE_BYTES);
+        let pause = if self.held.values().all(is_large) {
+            LARGE_AGAIN
+        } else {
+            AGAIN
+        };
+        // What is published meanwhile may go to another writer.
+        wait(self.shared.outbox.filled(), pause);
+    }
+
+    /// Writes what was held. Returns how many messages went.
+    fn retry(&mut self, now: Instant) -> usize {
+        let mut gone = 0;
+        let shared = &self.shared;
+        self.held.retain(|_, queue| {
+            while let Some(waiting) = queue.pop_front() {
+                match attempt(shared, &waiting, now) {
+                    Some(fate) => {
+                        waiting.settle(fate);
+                        gone += 1;
+                    }
+                    None => {
+                        queue.push_front(waiting);
+                        break;
+                    }
+                }
+            }
+            !queue.is_empty()
+        });
+        gone
+    }
+
+    fn write(&mut self, waiting: Waiting<Target>, now: Instant) {
+        let id = waiting.to.id;
+        if let Some(queue) = self.held.get_mut(&id) {
+            queue.push_back(waiting);
+            return;
+        }
+        match attempt(&self.shared, &waiting, now) {
+            Some(fate) => waiting.settle(fate),
+            None => self.held.entry(id).or_default().push_back(waiting),
+        }
+    }
+}
+
+/// Writes a message. `None`: not now.
+fn attempt(shared: &Shared, waiting: &Waiting<Target>, now: Instant) -> Option<Fate> {
+    if let Some((at, reason)) = waiting.expires
+        && at <= now
+    {
+        return Some(Fate::Dropped(reason));
+    }
+    let slot = waiting.to.slot_of(shared, &waiting.body);
+    match slot.write(now, || octets(waiting, now)) {
+        Attempt::Done => {
+            let is_reserved = !slot.key.topic.starts_with(names::USER_PREFIX);
+            shared
+                .channels
+                .deliver_own(&slot.key.topic, || content(waiting, now, is_reserved));
+            Some(Fate::Delivered)
+        }
+        Attempt::Failed => Some(Fate::Dropped(DropReason::BrokerError)),
+        Attempt::NotNow => None,
+    }
+}
+
+/// The message as own readers receive it.
+fn content(waiting: &Waiting<Target>, now: Instant, is_reserved: bool) -> Content {
+    match &waiting.body {
+        Body::Frame(frame) => Content::Frame(Waiting::<Target>::aged(frame, waiting.since, now)),
+        Body::Bare(payload) if is_reserved => Content::Bare {
+            payload: payload.clone(),
+            identity: None,
+        },
+        Body::Bare(payload) => Content::from_bytes(payload.clone()),
+    }
+}
+
+/// The message as one piece.
+fn octets(waiting: &Waiting<Target>, now: Instant) -> Bytes {
+    let frame: Frame = match &waiting.body {
+        Body::Bare(payload) => return payload.clone(),
+        Body::Frame(frame) => Waiting::<Target>::aged(frame, waiting.since, now),
+    };
+    let head = frame.head_to_write();
+    let mut bytes = BytesMut::with_capacity(head.len() + frame.payload().len());
+    bytes.put_slice(&head);
+    bytes.put_slice(frame.payload());
+    bytes.freeze()
+}
+
+/// Waits in this thread, at most for a time.
+fn wait(future: impl Future<Output = ()>, longest: Duration) {
+    let waker = unpark_waker();
+    let mut future = pin!(future);
+    if future.as_mut().poll(&mut Context::from_waker(&waker)).is_pending() {
+        thread::park_timeout(longest);
+    }
+}

@@ -1,0 +1,157 @@
+//! What the threads of one broker share.
+
+use std::collections::{HashMap, HashSet};
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::thread::Thread;
+use std::time::Instant;
+
+use parking_lot::{Mutex, RwLock};
+use tokio::sync::watch;
+
+use super::DdsCounts;
+use super::channel::Channels;
+use super::presence::Clocks;
+use super::send::Target;
+use super::slot::Slots;
+use crate::dds::EndpointId;
+use crate::outbox::{Outbox, OutboxLimits};
+use crate::port::{BrokerStatus, Health};
+
+/// Most bytes that wait for the network, of one publisher and of all together.
+pub const MAX_QUEUE_BYTES: usize = 64 * 1024 * 1024;
+
+const LIMITS: OutboxLimits = OutboxLimits {
+    lane_messages: 16_384,
+    lane_bytes: MAX_QUEUE_BYTES,
+    total_bytes: MAX_QUEUE_BYTES,
+};
+
+/// What a writer offers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct WriterFacts {
+    pub(super) reliable: bool,
+    pub(super) durable: bool,
+    /// Of this participant.
+    pub(super) own: bool,
+}
+
+/// Counters of [`DdsCounts`].
+#[derive(Debug, Default)]
+pub(super) struct Counters {
+    pub(super) malformed: AtomicU64,
+    pub(super) rebuilds: AtomicU64,
+    pub(super) expelled: AtomicU64,
+    pub(super) writers_forgotten: AtomicU64,
+}
+
+impl Counters {
+    pub(super) fn read(&self) -> DdsCounts {
+        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        DdsCounts {
+            malformed: get(&self.malformed),
+            rebuilds: get(&self.rebuilds),
+            expelled: get(&self.expelled),
+            writers_forgotten: get(&self.writers_forgotten),
+        }
+    }
+}
+
+pub(super) struct Shared {
+    pub(super) domain: u16,
+    pub(super) address: Ipv4Addr,
+    pub(super) status: watch::Sender<BrokerStatus>,
+    pub(super) outbox: Arc<Outbox<Target>>,
+    /// Messages that the sender holds, because their writer cannot take them now.
+    pub(super) held: AtomicUsize,
+    pub(super) slots: Slots,
+    pub(super) channels: Channels,
+    /// What the writers that are known offer, our own included.
+    pub(super) writers: RwLock<HashMap<EndpointId, WriterFacts>>,
+    /// Topics with a best-effort writer of another participant.
+    pub(super) best_effort: RwLock<HashSet<String>>,
+    pub(super) clocks: RwLock<Clocks>,
+    pub(super) counters: Counters,
+    pub(super) closing: AtomicBool,
+    pub(super) stop: AtomicBool,
+    pub(super) lifecycle: OnceLock<Thread>,
+    #[cfg(feature = "fault-injection")]
+    pub(super) fault: Mutex<Option<crate::dds::Fault>>,
+    /// Guards changes of the status: once closed, it stays so.
+    changing: Mutex<()>,
+}
+
+impl Shared {
+    pub(super) fn new(domain: u16, address: Ipv4Addr) -> Arc<Self> {
+        let status = BrokerStatus {
+            health: Health::Connecting,
+            detail: String::new(),
+            since: Instant::now(),
+        };
+        Arc::new(Self {
+            domain,
+            address,
+            status: watch::Sender::new(status),
+            outbox: Outbox::new(LIMITS),
+            held: AtomicUsize::new(0),
+            slots: Slots::default(),
+            channels: Channels::default(),
+            writers: RwLock::default(),
+            best_effort: RwLock::default(),
+            clocks: RwLock::default(),
+            counters: Counters::default(),
+            closing: AtomicBool::new(false),
+            stop: AtomicBool::new(false),
+            lifecycle: OnceLock::new(),
+            #[cfg(feature = "fault-injection")]
+            fault: Mutex::default(),
+            changing: Mutex::default(),
+        })
+    }
+
+    pub(super) fn wake_lifecycle(&self) {
+        if let Some(thread) = self.lifecycle.get() {
+            thread.unpark();
+        }
+    }
+
+    pub(super) fn set_status(&self, health: Health, detail: &str) {
+        let _changing = self.changing.lock();
+        self.status.send_if_modified(|status| {
+            let changes = status.health != Health::Closed && (status.health != health || status.detail != detail);
+            if changes {
+                if status.health != health {
+                    status.since = Instant::now();
+                }
+                status.health = health;
+                detail.clone_into(&mut status.detail);
+            }
+            changes
+        });
+    }
+
+    pub(super) fn is_up(&self) -> bool {
+        self.status.borrow().health == Health::Up
+    }
+
+    /// Whether what is published is dropped at once. While it starts for the first time, messages wait.
+    pub(super) fn is_down(&self) -> bool {
+        matches!(self.status.borrow().health, Health::Down | Health::Closed)
+    }
+
+    /// Whether nothing waits to be written.
+    pub(super) fn is_drained(&self) -> bool {
+        self.outbox.is_empty() && self.held.load(Ordering::Acquire) == 0
+    }
+
+    /// Ends what can be ended without waiting; the threads follow.
+    pub(super) fn end(&self) {
+        self.outbox.close();
+        self.set_status(Health::Closed, "closed");
+        self.channels.close();
+        self.stop.store(true, Ordering::Release);
+        self.wake_lifecycle();
+    }
+}

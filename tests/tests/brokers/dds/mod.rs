@@ -1,0 +1,11 @@
+//! DDS as a broker: the rules for all adapters, and what is special to a network without a server.
+
+mod gone;
+mod support;
+
+/// The rules for all adapters, each in a domain of its own.
+mod conformance {
+    use super::support::Domain;
+
+    blaze_brokers::conformance_tests!(Domain::start());
+}
