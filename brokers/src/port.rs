@@ -177,6 +177,20 @@ pub struct Received {
     pub place: Option<Place>,
 }
 
+impl Received {
+    /// A message that was published just now, on a server without places.
+    #[must_use]
+    pub fn live(content: Content, at: Instant) -> Self {
+        Self {
+            content,
+            at,
+            broker_age_us: 0,
+            kept: false,
+            place: None,
+        }
+    }
+}
+
 /// Where a message lies on a server that keeps messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Place {

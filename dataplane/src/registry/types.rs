@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use blaze_domain::control::{ControlError, Event, EventKind};
 use blaze_domain::names::ChannelName;
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
 use serde_json::Value;
 

@@ -289,12 +289,7 @@ impl Channels {
     pub(super) fn deliver_own(&self, topic: &str, content: impl Fn() -> Content) {
         let by_topic = self.by_topic.read();
         for channel in by_topic.get(topic).into_iter().flatten() {
-            let received = Received {
-                content: content(),
-                at: Instant::now(),
-                broker_age_us: 0,
-            };
-            channel.send(received);
+            channel.send(Received::live(content(), Instant::now()));
         }
     }
 

@@ -88,12 +88,9 @@ pub(super) fn deliver(
         Content::from_bytes(bytes)
     };
     let at = Instant::now();
-    let mut received = Received {
-        content,
-        at,
-        broker_age_us: 0,
-    };
+    let mut received = Received::live(content, at);
     if is_old {
+        received.kept = true;
         received.broker_age_us = u64::try_from(age.as_micros()).unwrap_or(u64::MAX);
         if let Some(received) = progress.history.hold(at, writer, received) {
             channel.send(received);

@@ -82,11 +82,7 @@ mod tests {
             depth,
             ..Header::new("t", Origin::default(), WriterId([1; 16]), sequence, 0)
         };
-        Received {
-            content: Content::Frame(Frame::new(&header, Bytes::new()).unwrap()),
-            at,
-            broker_age_us: 0,
-        }
+        Received::live(Content::Frame(Frame::new(&header, Bytes::new()).unwrap()), at)
     }
 
     fn sequences(received: impl IntoIterator<Item = Received>) -> Vec<u64> {

@@ -138,7 +138,7 @@ impl Sender {
             TURN_MESSAGES,
             TURN_BYTES,
             true,
-            |target| !self.held.contains_key(&target.id),
+            |target| (!self.held.contains_key(&target.id)).then_some(usize::MAX),
             &mut self.taken,
         );
         // Until they are written they are nowhere else.
