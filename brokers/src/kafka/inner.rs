@@ -275,7 +275,13 @@ impl Inner {
                 let key = message.key()?;
                 record::is_kept(key).then(|| receive(channel, message, payload, None, &self.clock))
             })?;
-            let mut kept = || -> Vec<Received> { reader.take_latest().into_iter().map(|(_, message)| as_kept(message)).collect() };
+            let mut kept = || -> Vec<Received> {
+                reader
+                    .take_latest()
+                    .into_iter()
+                    .map(|(_, message)| as_kept(message))
+                    .collect()
+            };
             match consumer.add(&source, &info, starts, sender.clone(), Join::AfterKept(&mut kept)) {
                 Ok(()) => return Ok(subscription),
                 Err(Refused::Behind(next)) => ends = next,

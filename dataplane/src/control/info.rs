@@ -42,7 +42,9 @@ pub(super) fn durable_sources(world: &World, topic: &TopicName) -> BTreeSet<Orig
         let Some(entry) = view.topics.get(topic) else {
             continue;
         };
-        let offers = [&entry.node, &entry.layer].into_iter().filter_map(|scope| scope.advertise.as_ref());
+        let offers = [&entry.node, &entry.layer]
+            .into_iter()
+            .filter_map(|scope| scope.advertise.as_ref());
         for offer in offers.filter(|offer| offer.durability == Durability::TransientLocal) {
             found.extend(offer.sources.iter().map(|source| OriginFilter {
                 layer: Some(flow.layer.to_string()),

@@ -1,7 +1,7 @@
 //! The control core as a flow with real brokers drives it.
 
-use blaze_domain::node_file::AccessRules;
 use blaze_domain::LayerKind;
+use blaze_domain::node_file::AccessRules;
 use serde_json::{Value, json};
 
 use super::*;
@@ -339,9 +339,11 @@ fn leases_that_new_rules_do_not_allow_end() {
     bench.send(Scope::Layer, &lease("request", "cmd/vel"));
     bench.step(300);
     assert_eq!(bench.bridges("cmd/vel"), ["node>Layer"]);
-    bench
-        .core
-        .set_access(bench.now, 0, access(json!([{"match": "cmd/*", "request": {"allow": []}}])));
+    bench.core.set_access(
+        bench.now,
+        0,
+        access(json!([{"match": "cmd/*", "request": {"allow": []}}])),
+    );
     bench.step(300);
     assert_eq!(bench.bridges("cmd/vel"), [""; 0]);
     assert_eq!(bench.core.registry().lease_count(), 1);

@@ -251,7 +251,10 @@ impl ControlTask {
 
     /// What the own brokers keep of a writer goes.
     fn forget_writer(&self, topic: &TopicName, writer: WriterId) {
-        for side in [Scope::Node, Scope::Layer].into_iter().filter_map(|scope| self.side(scope)) {
+        for side in [Scope::Node, Scope::Layer]
+            .into_iter()
+            .filter_map(|scope| self.side(scope))
+        {
             side.forget_writer(&topic.into(), writer);
         }
     }

@@ -78,7 +78,9 @@ impl Default for KeptMessages {
 impl KeptMessages {
     /// Keeps a message, if its writer is transient_local.
     pub(super) fn keep(&mut self, now: Instant, topic: TopicId, from: Scope, message: &Admitted) {
-        let depth = usize::try_from(message.frame.depth()).unwrap_or(MAX_DEPTH).min(MAX_DEPTH);
+        let depth = usize::try_from(message.frame.depth())
+            .unwrap_or(MAX_DEPTH)
+            .min(MAX_DEPTH);
         if depth == 0 {
             return;
         }
@@ -137,7 +139,8 @@ impl KeptMessages {
             *at == topic && writer.messages.back().is_some_and(earlier)
         });
         let room = MAX_SUPERSEDED.saturating_sub(self.superseded.len());
-        self.superseded.extend(gone.into_iter().take(room).map(|writer| (topic, writer)));
+        self.superseded
+            .extend(gone.into_iter().take(room).map(|writer| (topic, writer)));
     }
 
     /// Forgets the writer that was silent longest.
@@ -223,7 +226,10 @@ mod tests {
 
     fn sequences(kept: &KeptMessages, now: Instant) -> Vec<(u8, u64)> {
         let found = kept.of(now, TOPIC, Scope::Node);
-        found.iter().map(|m| (m.frame.writer().0[0], m.frame.sequence())).collect()
+        found
+            .iter()
+            .map(|m| (m.frame.writer().0[0], m.frame.sequence()))
+            .collect()
     }
 
     #[test]
@@ -263,7 +269,12 @@ mod tests {
     fn what_is_kept_is_bounded() {
         let (mut kept, now) = (KeptMessages::default(), Instant::now());
         for writer in 0..100 {
-            kept.keep(now, TOPIC, Scope::Node, &message(writer, &format!("s{writer}"), 1, 1, 1_000_000));
+            kept.keep(
+                now,
+                TOPIC,
+                Scope::Node,
+                &message(writer, &format!("s{writer}"), 1, 1, 1_000_000),
+            );
         }
         assert!(kept.bytes <= MAX_BYTES, "{}", kept.bytes);
         assert!(kept.evicted >= 33 && kept.writers.len() >= 60);

@@ -132,7 +132,9 @@ impl DataCore {
     /// Writers of earlier lives of their services, since the last call: what brokers keep of them goes, too.
     pub fn take_superseded(&mut self) -> Vec<(TopicName, WriterId)> {
         let superseded = std::mem::take(&mut self.kept.superseded);
-        let named = superseded.into_iter().map(|(topic, writer)| (self.path(topic).name.clone(), writer));
+        let named = superseded
+            .into_iter()
+            .map(|(topic, writer)| (self.path(topic).name.clone(), writer));
         named.collect()
     }
 

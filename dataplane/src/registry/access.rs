@@ -6,10 +6,10 @@ use blaze_domain::control::{ControlError, ControlMessage, ErrorCode, EventKind, 
 use blaze_domain::node_file::{AccessRules, TopicAccess};
 use blaze_domain::{Scope, TopicName};
 
+use super::Registry;
 use super::holder::key_of;
 use super::leases::{LapseReason, LapsedLease, LeaseKey};
 use super::types::{Changes, EventDraft};
-use super::Registry;
 
 impl Registry {
     /// What the rules say of a topic.

@@ -13,9 +13,9 @@ use std::time::{Duration, Instant};
 use blaze_brokers::{
     Broker, BrokerKind, Content, Health, Later, PublishOutcome, PublisherOptions, Received, SubscribeOptions,
 };
-use blaze_domain::node_file::AccessRules;
 use blaze_domain::LayerKind;
 use blaze_domain::names::ChannelName;
+use blaze_domain::node_file::AccessRules;
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
 use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
 use blaze_flow::plan::PlanRules;

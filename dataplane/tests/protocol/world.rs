@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{Content, PublishOutcome, Publisher, PublisherOptions, Received};
-use blaze_domain::node_file::AccessRules;
 use blaze_domain::names::ChannelName;
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, LayerKind, Origin, Priority, Scope, TopicName, WriterId};
 use blaze_flow::control::{ControlConfig, ControlCore, Output};
 use blaze_flow::flow::plane::PlaneState;

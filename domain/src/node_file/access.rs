@@ -62,7 +62,9 @@ impl OriginPattern {
     #[must_use]
     pub fn matches(&self, layer: &str, node: &str, service: &str) -> bool {
         let wanted = self.0.iter().zip([layer, node, service]);
-        wanted.into_iter().all(|(part, name)| part.as_deref().is_none_or(|part| part == name))
+        wanted
+            .into_iter()
+            .all(|(part, name)| part.as_deref().is_none_or(|part| part == name))
     }
 }
 
@@ -200,7 +202,11 @@ mod tests {
             ("fog/*/slam", "fog", "", "slam", true),
         ] {
             let parsed: OriginPattern = pattern.parse().unwrap();
-            assert_eq!(parsed.matches(layer, node, service), fits, "{pattern} {layer}/{node}/{service}");
+            assert_eq!(
+                parsed.matches(layer, node, service),
+                fits,
+                "{pattern} {layer}/{node}/{service}"
+            );
         }
         for wrong in ["", "edge/", "/edge", "a/b/c/d", "Edge", "ed*", "edge//slam"] {
             assert!(wrong.parse::<OriginPattern>().is_err(), "{wrong:?}");

@@ -10,8 +10,8 @@ use blaze_brokers::{
     Broker, BrokerError, BrokerKind, BrokerStatus, Content, Publisher, PublisherOptions, Received, SubscribeOptions,
     Subscription, SubscriptionSender,
 };
-use blaze_domain::node_file::AccessRules;
 use blaze_domain::names::ChannelName;
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, LayerKind, Origin, Scope, WriterId};
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
 use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
@@ -73,12 +73,7 @@ impl OpenBroker {
     /// Hands bytes to whoever reads the channel, as an adapter that found them on its server. Returns how many read.
     pub(crate) fn inject(&self, channel: &str, bytes: &Bytes) -> usize {
         let ends = self.ends.of(&channel.parse().unwrap());
-        let message = Received {
-            content: Content::from_bytes(bytes.clone()),
-            at: std::time::Instant::now(),
-            broker_age_us: 0,
-            place: None,
-        };
+        let message = Received::live(Content::from_bytes(bytes.clone()), std::time::Instant::now());
         ends.iter().filter(|end| end.send(message.clone())).count()
     }
 }

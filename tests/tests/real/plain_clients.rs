@@ -319,7 +319,11 @@ fn commands_come_only_from_whom_the_rules_allow() -> anyhow::Result<()> {
     assert_eq!(refused["error"]["code"], "access_denied", "{refused}");
     assert_eq!(refused["error"]["pointer"], "/service");
     let why = flow.why(TOPIC, None)?;
-    assert_eq!((&why["code"], &why["verdict"]), (&json!("access_denied"), &json!("not_flowing")), "{why}");
+    assert_eq!(
+        (&why["code"], &why["verdict"]),
+        (&json!("access_denied"), &json!("not_flowing")),
+        "{why}"
+    );
     tell("blaze/flow/control", &op("advertise", "joystick"))?;
     assert_eq!(answers.next_json(SOON)?["ok"], true);
     flow.wait_bridge(TOPIC, SOON)?;
