@@ -112,13 +112,36 @@ fn period() -> Duration {
     Duration::from_secs(if blaze_tests::long() { 20 } else { 5 })
 }
 
+/// How often the comparison of latencies is made: a machine that is busy with something else for one of the two windows says
+/// nothing of the flow, which would hold up the other route each time.
+const ATTEMPTS: usize = 3;
+
 /// Freezes a server for a while and checks what must hold.
 fn freeze(
     rig: &Rig,
     what: &str,
-    freeze: impl FnOnce() -> anyhow::Result<()>,
-    thaw: impl FnOnce() -> anyhow::Result<()>,
+    freeze: impl Fn() -> anyhow::Result<()>,
+    thaw: impl Fn() -> anyhow::Result<()>,
 ) -> anyhow::Result<()> {
+    let mut seen = Vec::new();
+    while seen.len() < ATTEMPTS {
+        let (calm, frozen) = freeze_once(rig, what, &freeze, &thaw)?;
+        // The margin beside the factor is what the clock of two busy cores resolves.
+        if frozen <= calm.mul_f64(1.2) + Duration::from_millis(5) {
+            return Ok(());
+        }
+        seen.push((calm, frozen));
+    }
+    anyhow::bail!("{what}: each time the other route was slower while it was frozen: {seen:?}")
+}
+
+/// Gives the other route's p99 before and while the server was frozen.
+fn freeze_once(
+    rig: &Rig,
+    what: &str,
+    freeze: impl Fn() -> anyhow::Result<()>,
+    thaw: impl Fn() -> anyhow::Result<()>,
+) -> anyhow::Result<(Duration, Duration)> {
     let calm_from = Instant::now();
     std::thread::sleep(period());
     let calm_to = Instant::now();
@@ -138,11 +161,6 @@ fn freeze(
     let (twice, reordered) = rig.other.faults();
     assert_eq!((twice.len(), reordered), (0, 0), "the other route");
     assert!(!frozen.is_zero(), "the other route went on");
-    // The margin beside the factor is what the clock of two busy cores resolves.
-    assert!(
-        frozen <= calm.mul_f64(1.2) + Duration::from_millis(5),
-        "{frozen:?} against {calm:?}"
-    );
     for (flow, (before, during)) in rig.flows.iter().zip(before.iter().zip(&during)) {
         println!(
             "{what}: {} {before} KiB before, {during} KiB while it was frozen",
@@ -154,7 +172,7 @@ fn freeze(
             flow.spec.node
         );
     }
-    Ok(())
+    Ok((calm, frozen))
 }
 
 /// What arrived after the thaw although it was older than its lifespan.
