@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 pub use rustix::process::Signal;
-use rustix::process::{Pid, kill_process};
+use rustix::process::{Pid, kill_process, setpriority_process};
 
 use crate::admin::Admin;
 use crate::{network, wait};
@@ -34,6 +34,14 @@ pub fn binary(name: &str) -> anyhow::Result<PathBuf> {
         path.display()
     );
     Ok(path)
+}
+
+/// Puts this thread, and those that it starts from now on, before all others where the system lets it. For what keeps or
+/// measures time: on a busy machine it would be late by a time slice of somebody else.
+pub fn hurry() {
+    const HIGHEST: i32 = -20;
+    // Without the right to it times are less exact on a busy machine, and nothing else.
+    let _ = setpriority_process(None, HIGHEST);
 }
 
 type Lines = Arc<Mutex<Vec<String>>>;

@@ -3,7 +3,6 @@
 use std::fs::File;
 use std::io::Write as _;
 use std::net::{SocketAddr, TcpStream};
-use std::os::unix::process::CommandExt as _;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -88,7 +87,6 @@ pub(super) fn batch(namespace: &str, lines: &[String]) -> anyhow::Result<()> {
         .stdin(Stdio::piped())
         .stdout(Stdio::null())
         .stderr(Stdio::piped())
-        .process_group(0)
         .spawn()
         .context("starting ip")?;
     // It reads all before it says much, and what it says is short: neither side waits for the other.
@@ -159,7 +157,7 @@ pub fn check_rights() -> anyhow::Result<()> {
     let user = run("id -u")?;
     anyhow::ensure!(
         user.trim() == "0",
-        "this test makes network namespaces and must be run by root: `sudo -E env PATH=\"$PATH\" cargo test -p blaze-tests --test e2e`"
+        "this test makes network namespaces and must be run by root: `sudo -E env PATH=\"$PATH\" cargo test --workspace --test NAME`"
     );
     for tool in ["ip", "nft"] {
         anyhow::ensure!(

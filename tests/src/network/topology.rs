@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use anyhow::Context as _;
 
 use super::link::{Link, LinkProcess};
-use super::namespace::{Namespace, batch};
+use super::namespace::{Namespace, batch, check_rights};
 use super::plan::Plan;
 use super::routes::{Network, networks, routes};
 
@@ -40,6 +40,7 @@ impl Topology {
     /// When the plan has faults, or the machine does not allow it: namespaces need root and iproute2, links `/dev/net/tun`.
     pub fn build(plan: &Plan) -> anyhow::Result<Self> {
         static NEXT: AtomicU32 = AtomicU32::new(0);
+        check_rights()?;
         let networks = networks(plan)?;
         let run = format!("blaze-{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         let mut namespaces = Vec::new();

@@ -78,7 +78,10 @@ impl Listener {
                 self.socket = None;
                 self.end(Ending::Close, Mode::Cut);
             }
-            Order::Reset => self.end(Ending::Reset, self.settings.borrow().mode),
+            Order::Reset => {
+                let mode = self.settings.borrow().mode;
+                self.end(Ending::Reset, mode);
+            }
             Order::Stall => {
                 self.open().await?;
                 self.settings.send_modify(|settings| settings.mode = Mode::Stall);

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::{Broker, BrokerKind, Fault, Flow, Report, Route, Scenario, Service, Stream};
 use crate::flow::{FlowProcess, FlowSpec};
-use crate::network::{Host, Topology, check_rights};
+use crate::network::{Host, Topology};
 use crate::process::{Process, Signal};
 use crate::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer};
 use crate::wait;
@@ -27,7 +27,6 @@ const SPARE: Duration = Duration::from_secs(600);
 /// # Errors
 /// When the machine does not allow it, something does not start, or a route does not come up.
 pub fn run(scenario: &Scenario) -> anyhow::Result<Report> {
-    check_rights()?;
     let mut running = Running::start(scenario)?;
     running
         .play(scenario)

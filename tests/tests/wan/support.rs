@@ -7,6 +7,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use blaze_tests::network::{Host, inside};
+use blaze_tests::process::hurry;
 use parking_lot::Mutex as PlainMutex;
 
 static TURN: Mutex<()> = Mutex::new(());
@@ -75,6 +76,7 @@ impl Sink {
         let arrivals = Arc::<PlainMutex<Vec<Arrival>>>::default();
         let (stopped, kept) = (Arc::clone(&stop), Arc::clone(&arrivals));
         let thread = std::thread::spawn(move || {
+            hurry();
             let mut buffer = [0; 2_000];
             while !stopped.load(Ordering::Relaxed) {
                 let Ok((length, from)) = socket.recv_from(&mut buffer) else {
@@ -114,6 +116,7 @@ impl Sink {
 
     /// Sends packets of so many payload bytes from a socket, at a pace.
     pub(crate) fn send(&self, from: &UdpSocket, count: u64, bytes: usize, gap: Duration) -> anyhow::Result<()> {
+        hurry();
         let begin = Instant::now();
         for number in 0..count {
             let due = begin + gap.mul_f64(number as f64);
@@ -140,6 +143,7 @@ impl Drop for Sink {
 /// Round trips of small packets to a host that echoes, one after another; those that do not come back are left out.
 pub(crate) fn ping(from: &UdpSocket, to: &Sink, count: usize) -> anyhow::Result<Vec<Duration>> {
     let mut trips = Vec::new();
+    hurry();
     from.set_read_timeout(Some(Duration::from_millis(500)))?;
     for number in 0..count {
         let mut buffer = [0; 100];

@@ -53,10 +53,7 @@ pub(crate) async fn publish(service: &ServiceManager, options: &Options) -> anyh
         sources.push(Source::open(service, topic).await?);
     }
     let mut rows = tokio::time::interval(ROW);
-    loop {
-        let Some(next) = sources.iter_mut().min_by_key(|source| source.due) else {
-            break;
-        };
+    while let Some(next) = sources.iter_mut().min_by_key(|source| source.due) {
         tokio::select! {
             () = tokio::time::sleep_until(next.due.into()) => {
                 next.publisher.publish(next.payload.clone());

@@ -8,9 +8,6 @@ use blaze_tests::network::inside;
 use parking_lot::Mutex;
 use tun::Device;
 
-/// Nicer processes wait: on a busy machine a packet would be late by a time slice of theirs.
-const PRIORITY: i32 = -20;
-
 /// A TUN device. Its file stays valid whatever namespace the thread that uses it is in.
 pub(crate) struct Tun {
     device: Device,
@@ -62,12 +59,6 @@ fn missed(text: &str, name: &str) -> Option<u64> {
         (interface.trim() == name).then_some(numbers)
     })?;
     line.split_whitespace().nth(11)?.parse().ok()
-}
-
-/// Puts this thread, and those that it starts, before others where the system lets it.
-pub(crate) fn hurry() {
-    // Without the right to it packets are later on a busy machine, and nothing else.
-    let _ = rustix::process::setpriority_process(None, PRIORITY);
 }
 
 #[cfg(test)]

@@ -17,6 +17,7 @@ use std::sync::Arc;
 
 use anyhow::Context as _;
 use blaze_runtime::{Supervisor, TaskPolicy};
+use blaze_tests::process::hurry;
 use blaze_tests::wan::{Command, Shape, Ways};
 use clap::Parser;
 use serde_json::json;
@@ -69,7 +70,8 @@ fn main() -> ExitCode {
 }
 
 async fn run(options: Options) -> anyhow::Result<()> {
-    device::hurry();
+    // The threads that it starts inherit it.
+    hurry();
     let link = Arc::new(Link::open(&options)?);
     for command in &options.run {
         link.obey(command)?;
