@@ -44,6 +44,7 @@ async fn slow_reader(fixture: &dyn Fixture, options: SubscribeOptions, size: usi
     let publisher = open_publisher(client.as_ref(), &channel)?;
     slow.meet(fixture, publisher.as_ref(), false).await?;
     witness.meet(fixture, publisher.as_ref(), false).await?;
+    slow.skip_probes(fixture).await;
     let payload = Bytes::from(vec![b'x'; size]);
     for sequence in 1..=MESSAGES {
         publish(

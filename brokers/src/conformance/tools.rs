@@ -202,11 +202,27 @@ impl Reader {
             if batch.iter().any(is_probe) {
                 return self.meet_last(batch, sequence).await;
             }
+            // Of another publisher.
+            self.waiting.append(&mut VecDeque::from(batch));
             if Instant::now() > until {
                 break;
             }
         }
         Err("a publisher never found its reader".to_owned())
+    }
+
+    /// Takes the probes by which other readers of the channel met its publishers.
+    pub(super) async fn skip_probes(&mut self, fixture: &dyn Fixture) {
+        let late = fixture.capabilities().finds_readers_late;
+        let mut batch = Vec::new();
+        while late
+            && tokio::time::timeout(SILENCE, self.subscription.receive(&mut batch, 64))
+                .await
+                .is_ok_and(|count| count > 0)
+        {
+            self.waiting
+                .extend(batch.drain(..).filter(|message| !is_probe(message)));
+        }
     }
 
     /// Takes the probes that are still under way: up to the last one, or until there is silence where they have no number.

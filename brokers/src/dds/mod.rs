@@ -22,6 +22,7 @@ mod reader;
 mod relay;
 mod sample;
 mod watch;
+mod writer;
 
 use std::net::IpAddr;
 
@@ -29,11 +30,12 @@ use blaze_domain::node_file::MAX_DDS_DOMAIN;
 
 #[cfg(feature = "fault-injection")]
 pub use fault::Fault;
-pub use participant::{EndpointId, GuidPrefix, Participant, ParticipantConfig, Profile, Writer, Written};
+pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile};
 pub use pulse::{Illness, Pulse};
 pub use reader::{Reader, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
 pub use watch::{EndpointWatch, Endpoints, FoundReader, FoundWriter, ReaderWatch, RemoteReader};
+pub use writer::{EndpointId, Writer, Written};
 
 /// The type of all samples, IDL `sequence<octet>`.
 pub const FRAME_TYPE: &str = "blaze::v1::Frame";

@@ -7,12 +7,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use blaze_domain::node_file::MAX_DDS_DOMAIN;
-use bytes::Bytes;
-use rustdds::dds::WriteError;
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{
-    DataWriterStatus, DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies, QosPolicyBuilder,
-    RTPSEntity, StatusEvented, Subscriber, Timestamp, Topic, TopicKind, WriteOptionsBuilder, no_key,
+    DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies, QosPolicyBuilder, RTPSEntity,
+    Subscriber, Topic, TopicKind, no_key,
 };
 
 use super::filter::{self, Attached, FilterError, Samples, Shape};
@@ -20,6 +18,7 @@ use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
 use super::watch::{EndpointWatch, Endpoints, ReaderWatch, RemoteReader};
+use super::writer::Writer;
 use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, announcement_port, multicast_port};
 
 /// Identity of one participant on the wire; a rebuilt one has a new identity.
@@ -248,12 +247,7 @@ impl Participant {
             self.publisher
                 .create_datawriter_no_key::<Octets, OctetsAdapter>(&topic, Some(profile.qos()))
         })?;
-        Ok(Writer {
-            writer,
-            matched: AtomicBool::new(false),
-            keeps: profile.transient_local,
-            failed: Arc::clone(&self.failed),
-        })
+        Ok(Writer::new(writer, profile.transient_local, Arc::clone(&self.failed)))
     }
 
     /// Makes a reader of a topic, and the thread that hands its samples to `sink`.
@@ -375,104 +369,4 @@ pub(super) fn prefix_of(guid: rustdds::GUID) -> GuidPrefix {
     let mut prefix = [0; 12];
     prefix.copy_from_slice(&guid.to_bytes()[..12]);
     GuidPrefix(prefix)
-}
-
-/// Identity of a reader or writer on the wire: its participant's and four bytes.
-pub type EndpointId = [u8; 16];
-
-pub(super) fn endpoint_of(guid: rustdds::GUID) -> EndpointId {
-    guid.to_bytes()
-}
-
-/// What became of a sample.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Written {
-    /// RustDDS has it.
-    Taken,
-    /// Nobody reads the topic.
-    NoReader,
-    /// The window is full: a reader has not acknowledged, or the socket takes nothing.
-    Full,
-    /// RustDDS refused, or has died.
-    Failed,
-}
-
-/// A best-effort sample up to this size is sent at once or not at all; a larger one waits for room in the socket, and
-/// RustDDS then keeps it for six seconds.
-const AT_ONCE_BYTES: usize = 2 * 1024 * 1024;
-
-/// Writes one topic. Never waits.
-pub struct Writer {
-    writer: no_key::DataWriter<Octets, OctetsAdapter>,
-    matched: AtomicBool,
-    /// Late joiners get what was written before they came, so it is written without a reader, too.
-    keeps: bool,
-    failed: Arc<AtomicBool>,
-}
-
-impl Writer {
-    /// Hands a sample to RustDDS. Returns whether it was taken: not without a reader, unless it is kept for late joiners,
-    /// and not into the full window of a reliable writer. Best effort lets the oldest that still wait give way.
-    pub fn write(&self, octets: Bytes) -> bool {
-        self.contain(|| {
-            ((self.is_matched_now() || self.keeps) && self.writer.write(Octets(octets), None).is_ok()).then_some(())
-        })
-        .is_some()
-    }
-
-    /// As [`write`](Self::write), and tells why it was not taken. `written` travels with the sample.
-    pub fn write_at(&self, octets: Bytes, written: Option<Timestamp>) -> Written {
-        self.contain(|| {
-            if !(self.is_matched_now() || self.keeps) {
-                return Some(Written::NoReader);
-            }
-            // Best effort gives up a sample of which the socket cannot take the rest at once.
-            let waits = octets.len() > AT_ONCE_BYTES;
-            let mut options = WriteOptionsBuilder::new().best_effort_may_block(waits);
-            if let Some(written) = written {
-                options = options.source_timestamp(written);
-            }
-            match self.writer.write_with_options(Octets(octets), options.build()) {
-                Ok(_) => Some(Written::Taken),
-                Err(WriteError::WouldBlock { .. }) => Some(Written::Full),
-                Err(_) => Some(Written::Failed),
-            }
-        })
-        .unwrap_or(Written::Failed)
-    }
-
-    /// Whether all readers have acknowledged all samples; always true for best effort.
-    #[must_use]
-    pub fn is_acknowledged(&self) -> bool {
-        self.contain(|| self.writer.wait_for_acknowledgments(std::time::Duration::ZERO).ok())
-            .unwrap_or(true)
-    }
-
-    /// Its identity on the wire.
-    #[must_use]
-    pub fn id(&self) -> EndpointId {
-        endpoint_of(self.writer.guid())
-    }
-
-    /// Whether a reader is there.
-    #[must_use]
-    pub fn is_matched(&self) -> bool {
-        self.contain(|| self.is_matched_now().then_some(())).is_some()
-    }
-
-    fn is_matched_now(&self) -> bool {
-        while let Some(status) = self.writer.try_recv_status() {
-            if let DataWriterStatus::PublicationMatched { current, .. } = status {
-                self.matched.store(current.count() > 0, Ordering::Relaxed);
-            }
-        }
-        self.matched.load(Ordering::Relaxed)
-    }
-
-    fn contain<T>(&self, call: impl FnOnce() -> Option<T>) -> Option<T> {
-        catch_unwind(AssertUnwindSafe(call)).unwrap_or_else(|_| {
-            self.failed.store(true, Ordering::Relaxed);
-            None
-        })
-    }
 }

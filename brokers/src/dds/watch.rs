@@ -1,5 +1,6 @@
 //! Which readers and writers other participants have.
 
+use std::collections::HashSet;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
 use std::sync::Arc;
@@ -11,8 +12,9 @@ use std::time::{Duration, Instant};
 use futures::Stream;
 use rustdds::{DomainParticipant, DomainParticipantStatusEvent as Event, StatusEvented};
 
-use super::participant::{EndpointId, endpoint_of, prefix_of};
+use super::participant::prefix_of;
 use super::reader::{StoppableThread, unpark_waker};
+use super::writer::{EndpointId, endpoint_of};
 use super::{DdsError, GuidPrefix};
 
 /// RustDDS drops events when its queue of 2048 is full, so all readers are looked at once in this time.
@@ -64,9 +66,13 @@ pub struct Endpoints {
     pub writers: Vec<FoundWriter>,
 }
 
+/// Participants that were lost and are remembered, to know them again.
+const MAX_LOST: usize = 1024;
+
 /// Watches all endpoints until it is dropped.
 pub struct EndpointWatch {
     _thread: StoppableThread,
+    returned: Arc<AtomicBool>,
 }
 
 impl EndpointWatch {
@@ -76,10 +82,35 @@ impl EndpointWatch {
         sink: Box<dyn Fn(Endpoints) + Send>,
         failed: Arc<AtomicBool>,
     ) -> Result<Self, DdsError> {
+        let returned = Arc::<AtomicBool>::default();
+        let tell = Arc::clone(&returned);
         let thread = StoppableThread::start("dds-watch", failed, move |stop| {
-            watch(&participant, stop, || sink(endpoints(&participant, own)));
+            let mut lost = HashSet::new();
+            let note = |event: &Event| match event {
+                Event::ParticipantLost { id, .. } => {
+                    if lost.len() >= MAX_LOST {
+                        lost.clear();
+                    }
+                    lost.insert(*id);
+                }
+                Event::ParticipantDiscovered { dpd } if lost.remove(&dpd.guid.prefix) => {
+                    tell.store(true, Ordering::Relaxed);
+                }
+                _ => {}
+            };
+            watch(&participant, stop, note, || sink(endpoints(&participant, own)));
         })?;
-        Ok(Self { _thread: thread })
+        Ok(Self {
+            _thread: thread,
+            returned,
+        })
+    }
+
+    /// Whether a participant came back that was lost before. RustDDS does not ask it for its readers and writers again, so
+    /// that this one must begin anew to meet it.
+    #[must_use]
+    pub fn has_returned(&self) -> bool {
+        self.returned.load(Ordering::Relaxed)
     }
 }
 
@@ -97,15 +128,20 @@ impl ReaderWatch {
         failed: Arc<AtomicBool>,
     ) -> Result<Self, DdsError> {
         let thread = StoppableThread::start("dds-watch", failed, move |stop| {
-            watch(&participant, stop, || {
-                sink(remote_readers(&participant, own, &topics));
-            });
+            watch(
+                &participant,
+                stop,
+                |_| {},
+                || {
+                    sink(remote_readers(&participant, own, &topics));
+                },
+            );
         })?;
         Ok(Self { _thread: thread })
     }
 }
 
-fn watch(participant: &DomainParticipant, stop: &AtomicBool, look: impl Fn()) {
+fn watch(participant: &DomainParticipant, stop: &AtomicBool, mut note: impl FnMut(&Event), look: impl Fn()) {
     let listener = participant.status_listener();
     let mut events = listener.as_async_status_stream();
     let waker = unpark_waker();
@@ -114,6 +150,7 @@ fn watch(participant: &DomainParticipant, stop: &AtomicBool, look: impl Fn()) {
     while !stop.load(Ordering::Relaxed) {
         let mut changed = false;
         while let Poll::Ready(event) = Pin::new(&mut events).poll_next(&mut context) {
+            event.iter().for_each(&mut note);
             match event {
                 Some(
                     Event::ReaderDetected { .. }

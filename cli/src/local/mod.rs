@@ -87,9 +87,7 @@ fn open(file: &NodeFile) -> Result<(Arc<dyn Broker>, Scope), CliError> {
     let role = Role::Service;
     let memory = || {
         Err(OpenError::InProcess).map_err(|error: OpenError| {
-            CliError::Usage(format!(
-                "brokers: {error}. Name a redis or kafka server in the node file."
-            ))
+            CliError::Usage(format!("brokers: {error}. Name redis, kafka or dds in the node file."))
         })
     };
     match (&file.brokers.node, &file.brokers.layer) {

@@ -216,3 +216,35 @@ fn what_a_robot_kills_comes_back_over_the_layer() -> anyhow::Result<()> {
     }
     Ok(())
 }
+
+#[test]
+fn the_command_line_publishes_and_echoes_on_the_layer() -> anyhow::Result<()> {
+    const COUNT: usize = 5;
+    let _turn = turn();
+    let domain = free_domain()?;
+    let flow = FlowProcess::start(FlowSpec::new("edge", "robot-1").on_dds(domain))?;
+    let folder = tempfile::tempdir()?;
+    let file = folder.path().join("blaze.yaml");
+    let spec = FlowSpec::new("edge", "robot-1").on_dds(domain);
+    std::fs::write(&file, spec.to_yaml(folder.path()))?;
+    let file = file.to_string_lossy();
+    let echo = Process::start(
+        "blaze",
+        &["echo", TOPIC, "--config", &file, "--count", &COUNT.to_string()],
+        None,
+    )?;
+    let mut publisher = Process::start(
+        "blaze",
+        &["pub", TOPIC, "{\"x\":1}", "--config", &file, "--rate", "10"],
+        None,
+    )?;
+    wait::until(
+        "the echo prints what is published",
+        SOON,
+        || echo.stdout().iter().filter(|line| line.contains("\"x\"")).count() >= COUNT,
+        || format!("{}\n{}\n{}", echo.tail(), publisher.tail(), flow.tail()),
+    )?;
+    let code = publisher.terminate(SOON)?;
+    assert_eq!(code, Some(0), "{}", publisher.tail());
+    Ok(())
+}

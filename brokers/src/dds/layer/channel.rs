@@ -29,9 +29,9 @@ const TURN: usize = 256;
 /// A safety net only: RustDDS wakes the thread.
 const LONGEST_SLEEP: Duration = Duration::from_millis(250);
 /// Samples that wait for the reading thread. RustDDS keeps that many whether they wait or not.
-const SMALL_DEPTH: u16 = 2048;
+const SMALL_DEPTH: u16 = 1024;
 /// The same where they may be large.
-const LARGE_DEPTH: u16 = 16;
+const LARGE_DEPTH: u16 = 32;
 
 pub(super) type RawReader = SimpleDataReader<Octets, OctetsAdapter>;
 

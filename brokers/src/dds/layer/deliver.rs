@@ -10,8 +10,9 @@ use super::channel::Channel;
 use super::kept::History;
 use super::shared::{Shared, WriterFacts};
 use crate::dds::EndpointId;
-use crate::dds::participant::{endpoint_of, prefix_of};
+use crate::dds::participant::prefix_of;
 use crate::dds::sample::Octets;
+use crate::dds::writer::endpoint_of;
 use crate::port::{Content, Received};
 
 /// Writers of one channel whose progress is remembered; those that are gone are forgotten first.

@@ -22,6 +22,10 @@ const RETRY: Duration = Duration::from_secs(1);
 const GOOD_BYE: Duration = Duration::from_secs(1);
 /// How often it is looked whether the interface still has its address.
 const INTERFACE: Duration = Duration::from_secs(1);
+/// Between two lives that end because of others.
+const LIFE: Duration = Duration::from_secs(10);
+/// After standing still for so long this participant may have been forgotten.
+const FORGOTTEN: Duration = Duration::from_secs(20);
 /// A window that is full for a moment is the network's pace.
 const PRESSURE: Duration = Duration::from_millis(50);
 
@@ -93,8 +97,19 @@ impl Lifecycle {
         if paused > SILENT / 2 {
             generation.presence.lock().excuse(now);
         }
-        if generation.exchange_signs(&self.shared, now) && now.saturating_duration_since(self.built) > SILENT {
-            self.bury("others had given this participant up");
+        let age = now.saturating_duration_since(self.built);
+        let given_up = generation.exchange_signs(&self.shared, now) && age > SILENT;
+        let reason = if given_up {
+            Some("others had given this participant up")
+        } else if paused > FORGOTTEN {
+            Some("this process stood still for long")
+        } else if generation.has_missed_one() && age > LIFE {
+            Some("a participant came back after it was lost")
+        } else {
+            None
+        };
+        if let Some(reason) = reason {
+            self.bury(reason);
             return;
         }
         if let Err(error) = make_missing(&self.shared, generation, now) {

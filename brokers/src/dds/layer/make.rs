@@ -37,7 +37,7 @@ const SIGNS: u16 = 256;
 
 /// Fields drop in this order: users first, the participant last.
 pub(super) struct Generation {
-    _watch: EndpointWatch,
+    watch: EndpointWatch,
     pulse: Pulse,
     signs: RawReader,
     sign: Writer,
@@ -67,7 +67,7 @@ impl Generation {
         let presence = Arc::<parking_lot::Mutex<Presence>>::default();
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
         Ok(Self {
-            _watch: participant.watch_endpoints(Box::new(move |endpoints| {
+            watch: participant.watch_endpoints(Box::new(move |endpoints| {
                 note_endpoints(&told, &found, &endpoints);
             }))?,
             pulse,
@@ -85,6 +85,11 @@ impl Generation {
     /// Why it must be replaced, if so.
     pub(super) fn illness(&mut self) -> Option<Illness> {
         self.pulse.feel(&self.participant).err()
+    }
+
+    /// Whether a participant came back that RustDDS cannot meet again in this life.
+    pub(super) fn has_missed_one(&self) -> bool {
+        self.watch.has_returned()
     }
 
     /// Makes a writer.

@@ -56,6 +56,10 @@ const DRAIN: Duration = Duration::from_secs(1);
 /// How long readers have to take what they have acknowledged, before its writer goes: RustDDS forgets what was not read of
 /// a writer that has gone.
 const LINGER: Duration = Duration::from_millis(150);
+/// How long a message may wait for RustDDS.
+const LONGEST_WAIT: Duration = Duration::from_secs(5);
+/// The same of one that must not be lost.
+const RELIABLE_WAIT: Duration = Duration::from_secs(120);
 /// How long a subscription may take to be made.
 const SUBSCRIBE: Duration = Duration::from_secs(5);
 const LOOK: Duration = Duration::from_millis(5);
@@ -160,8 +164,13 @@ impl Broker for DdsBroker {
             return Err(BrokerError::Closed);
         }
         let target = Target::new(&self.shared, names::topic(channel), options);
+        let longest_wait = if options.reliable || options.depth > 0 {
+            RELIABLE_WAIT
+        } else {
+            LONGEST_WAIT
+        };
         Ok(Arc::new(DdsPublisher {
-            lane: self.shared.outbox.lane(target, None),
+            lane: self.shared.outbox.lane(target, Some(longest_wait)),
             shared: Arc::clone(&self.shared),
         }))
     }

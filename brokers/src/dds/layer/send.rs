@@ -33,6 +33,8 @@ const AGAIN: Duration = Duration::from_millis(2);
 /// The same where an attempt copies much.
 const LARGE_AGAIN: Duration = Duration::from_millis(20);
 const LARGE_BYTES: usize = 64 * 1024;
+/// What a message of a large topic counts at least, as its readers have room for few.
+const LARGE_COST: usize = 64 * 1024;
 /// How often what is over its time is looked for while nothing else happens.
 const IDLE: Duration = Duration::from_millis(100);
 /// Origins of one transient_local publisher that have a writer each; the one that wrote longest ago gives way.
@@ -144,6 +146,8 @@ impl Sender {
         // Until they are written they are nowhere else.
         self.shared.held.fetch_add(self.taken.len(), Ordering::AcqRel);
         let count = self.taken.len();
+        let of_large = self.taken.iter().filter(|waiting| waiting.to.key.large).count();
+        let bytes = bytes.max(of_large * LARGE_COST);
         for waiting in std::mem::take(&mut self.taken) {
             self.write(waiting, begin);
         }

@@ -62,6 +62,16 @@ impl Peer {
 
     /// Everything arrived, in order, once, and without a long gap.
     async fn has_all(&self, last: u64) {
+        let report = self.has_all_sooner_or_later(last).await;
+        assert!(
+            report["gap_ms"].as_f64().unwrap() < LONGEST_GAP_MS,
+            "{}: {report}",
+            self.name
+        );
+    }
+
+    /// Everything arrived, in order, once.
+    async fn has_all_sooner_or_later(&self, last: u64) -> Value {
         eventually(&format!("{} has message {last}: {}", self.name, self.report()), || {
             (self.number("last") == last).then_some(())
         })
@@ -75,11 +85,7 @@ impl Peer {
             "{report}"
         );
         assert_eq!(count("received"), last + 1 - count("first"), "{report}");
-        assert!(
-            report["gap_ms"].as_f64().unwrap() < LONGEST_GAP_MS,
-            "{} : {report}",
-            self.name
-        );
+        report
     }
 }
 
@@ -157,8 +163,9 @@ async fn a_killed_reader_holds_nobody_up() {
         let [victim, one, other] =
             [victim, "adapter witness", "plain witness"].map(|name| Peer::start(&domain, name, &topic, flags));
         let options = PublisherOptions { large, ..RELIABLE };
-        // A writer for large messages has a small window: it would be full in an eighth of a second.
-        let mut source = Source::new(&broker, &topic, 500.0, 200, options);
+        // A writer for large messages has a window of 64.
+        let bytes = if large { 4_000 } else { 200 };
+        let mut source = Source::new(&broker, &topic, 500.0, bytes, options);
         source.meet(&[&victim, &one, &other]).await;
         source.run(Duration::from_secs(1)).await;
         let expelled = broker.counts().expelled;
@@ -214,6 +221,29 @@ async fn a_reader_that_starts_anew_receives_at_once() {
         println!("received after {:?}", start.elapsed());
         assert!(start.elapsed() < Duration::from_secs(5), "{:?}", start.elapsed());
         peer.signal(Signal::KILL);
+    }
+    assert_eq!(source.publisher.later().dropped(), 0);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn large_messages_reach_other_processes() {
+    let domain = Domain::start().await;
+    let broker = domain.open().await;
+    let topic = topic("large");
+    let readers =
+        ["adapter reader", "plain reader"].map(|name| Peer::start(&domain, name, &topic, &["--reliable", "--large"]));
+    let options = PublisherOptions {
+        large: true,
+        ..RELIABLE
+    };
+    let mut source = Source::new(&broker, &topic, 5.0, 1_000, options);
+    source.meet(&[&readers[0], &readers[1]]).await;
+    for (bytes, time) in [(1_000_000, Duration::from_secs(4)), (8_000_000, Duration::from_secs(1))] {
+        source.bytes = bytes;
+        source.run(time).await;
+    }
+    for reader in &readers {
+        reader.has_all_sooner_or_later(source.sequence).await;
     }
     assert_eq!(source.publisher.later().dropped(), 0);
 }

@@ -1,5 +1,6 @@
 //! DDS as a broker: the rules for all adapters, and what is special to a network without a server.
 
+mod alone;
 mod gone;
 mod support;
 
