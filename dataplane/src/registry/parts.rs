@@ -16,7 +16,7 @@ use blaze_proto::link::link_control::RouteState;
 use super::Registry;
 use super::announce::MAX_ENTRIES;
 use super::wire::MAX_ROUTES;
-use crate::world::{Carrying, Part};
+use crate::world::{Carrying, Part, Reach};
 
 /// A route state with this step says that the flow carries the topic out of its layer.
 const CARRY: &str = "carry";
@@ -101,12 +101,12 @@ impl Registry {
         }
     }
 
-    /// Another flow of the group says that it carries the topic.
+    /// Another flow of the group that lives says that it carries the topic.
     #[must_use]
     pub fn is_carried_elsewhere(&self, topic: &TopicName) -> bool {
-        let others = self.world.flows.keys().filter(|flow| **flow != self.config.me);
-        let mut of_group = others.filter(|flow| self.shares_layer(flow));
-        of_group.any(|flow| self.carrying(flow, topic) == Some(&Carrying::Carries))
+        let others = self.world.flows.iter().filter(|(flow, _)| **flow != self.config.me);
+        let mut living = others.filter(|(flow, view)| view.reach != Reach::Down && self.shares_layer(flow));
+        living.any(|(flow, _)| self.carrying(flow, topic) == Some(&Carrying::Carries))
     }
 
     /// Topics that cannot wait for quiet: who carries them has changed.

@@ -4,6 +4,7 @@
 
 mod identities;
 mod outages;
+mod places;
 mod plain;
 mod rules;
 mod topics;

@@ -2,6 +2,7 @@
 
 pub(crate) mod generate;
 mod property;
+mod replicas;
 mod simulate;
 mod table;
 pub(crate) mod worlds;

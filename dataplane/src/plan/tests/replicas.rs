@@ -1,0 +1,306 @@
+//! Who of the flows that share a layer broker carries a topic out of the layer, and who takes in what others send: when one
+//! joins, leaves, dies, or two think that it is theirs.
+
+use super::worlds::{id, topic, world};
+use crate::plan::{PlanRules, Target, TopicPlan, owner, plan_topic};
+use crate::world::{Carrying, FlowState, FlowView, Reach, World};
+use blaze_domain::FlowId;
+
+const FLOWS: [&str; 3] = ["f/a", "f/b", "f/c"];
+
+/// Three flows of the fog on one broker where services publish, and a robot that asks for it.
+fn fog() -> World {
+    world(&["f/a@1 layer+", "f/b@1 layer+", "f/c@1 layer+", "e/r node-"])
+}
+
+/// The same with a robot that publishes what services of the fog ask for.
+fn fog_that_listens() -> World {
+    world(&["e/r node+", "f/a@1 layer-", "f/b@1 layer-", "f/c@1 layer-"])
+}
+
+/// The flows in the order in which hashing prefers them.
+fn preferred() -> [FlowId; 3] {
+    let mut left = fog();
+    [(); 3].map(|()| {
+        let found = owner(&left, &topic()).unwrap();
+        left.flows.remove(&found);
+        let next = left.flows.keys().find(|flow| flow.layer == found.layer);
+        left.me = next.unwrap_or(&found).clone();
+        found
+    })
+}
+
+fn view<'a>(world: &'a mut World, flow: &FlowId) -> &'a mut FlowView {
+    world.flows.get_mut(flow).unwrap()
+}
+
+fn set(world: &mut World, flow: &FlowId, carrying: Carrying) {
+    view(world, flow).parts.entry(topic()).or_default().carrying = carrying;
+}
+
+fn plan_of(world: &World, flow: &FlowId, previous: Option<&TopicPlan>) -> TopicPlan {
+    let seen = World {
+        me: flow.clone(),
+        ..world.clone()
+    };
+    plan_topic(&seen, &topic(), &PlanRules::default(), previous)
+}
+
+/// Who carries the topic to the robot, as each plans for itself.
+fn carriers(world: &World) -> Vec<FlowId> {
+    let all = FLOWS.map(id).into_iter();
+    all.filter(|flow| world.flows.contains_key(flow) && plan_of(world, flow, None).carries_out())
+        .collect()
+}
+
+#[test]
+fn a_topic_that_nobody_carries_is_taken_at_once_by_one() {
+    let [best, second, _] = preferred();
+    let mut world = fog();
+    assert_eq!(carriers(&world), [best.clone()]);
+    assert_eq!(plan_of(&world, &second, None).carrier, Some(best.clone()));
+    assert_eq!(plan_of(&world, &best, None).carrier, None);
+    view(&mut world, &best).reach = Reach::Down;
+    set(&mut world, &best, Carrying::Carries);
+    // Its own view knows that it lives.
+    assert_eq!(plan_of(&world, &second, None).carrier, None);
+    assert!(
+        plan_of(&world, &second, None).carries_out(),
+        "what a flow carried that is gone counts no more"
+    );
+}
+
+#[test]
+fn whoever_carries_a_topic_keeps_it_until_a_better_one_has_settled() {
+    let [best, second, third] = preferred();
+    let mut world = fog();
+    set(&mut world, &second, Carrying::Carries);
+    assert_eq!(carriers(&world), [second.clone()], "the better one has only just come");
+    view(&mut world, &third).settled = true;
+    assert_eq!(
+        carriers(&world),
+        [second.clone()],
+        "one that is not better changes nothing"
+    );
+    view(&mut world, &best).settled = true;
+    assert_eq!(carriers(&world), [], "it gives up, and the other waits for that");
+    assert_eq!(plan_of(&world, &second, None).carrier, Some(best.clone()));
+    set(&mut world, &second, Carrying::HandedOver([7].into()));
+    assert_eq!(carriers(&world), [best]);
+}
+
+#[test]
+fn of_two_that_carry_it_the_better_one_stays() {
+    let [best, second, third] = preferred();
+    let mut world = fog();
+    set(&mut world, &second, Carrying::Carries);
+    set(&mut world, &third, Carrying::Carries);
+    assert_eq!(carriers(&world), [second.clone()]);
+    set(&mut world, &best, Carrying::Carries);
+    assert_eq!(carriers(&world), [best]);
+}
+
+#[test]
+fn a_flow_that_goes_is_waited_for_until_it_has_said_where_it_stopped() {
+    let [best, second, _] = preferred();
+    let mut world = fog();
+    set(&mut world, &best, Carrying::Carries);
+    view(&mut world, &best).state = FlowState::Draining;
+    assert_eq!(carriers(&world), []);
+    assert_eq!(
+        plan_of(&world, &best, None).carrier,
+        Some(second.clone()),
+        "so it knows that somebody is to be told"
+    );
+    let mut gone = world.clone();
+    view(&mut gone, &best).reach = Reach::Down;
+    assert_eq!(carriers(&gone), [second.clone()], "it died before it said so");
+    gone.flows.remove(&best);
+    assert_eq!(carriers(&gone), [second.clone()], "it said good-bye");
+    set(&mut world, &best, Carrying::HandedOver([7].into()));
+    assert_eq!(carriers(&world), [second]);
+}
+
+#[test]
+fn what_nobody_asks_for_is_handed_to_nobody() {
+    let [best, second, _] = preferred();
+    let mut world = fog();
+    set(&mut world, &best, Carrying::Carries);
+    view(&mut world, &id("e/r")).topics.clear();
+    view(&mut world, &best).state = FlowState::Draining;
+    assert_eq!(carriers(&world), []);
+    assert_eq!(
+        [&best, &second].map(|flow| plan_of(&world, flow, None).carrier),
+        [None, None]
+    );
+}
+
+/// The receiver in a plan of the robot.
+fn receiver(plan: &TopicPlan) -> FlowId {
+    match &plan.bridges[..] {
+        [bridge] => bridge.to.receiver().unwrap().clone(),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_sender_goes_back_to_a_better_receiver_that_has_settled() {
+    let mut world = fog_that_listens();
+    let robot = id("e/r");
+    let best = receiver(&plan_of(&world, &robot, None));
+    view(&mut world, &best).reach = Reach::Down;
+    let second = plan_of(&world, &robot, None);
+    let other = receiver(&second);
+    view(&mut world, &best).reach = Reach::Up;
+    assert_eq!(
+        receiver(&plan_of(&world, &robot, Some(&second))),
+        other,
+        "it has only just come back"
+    );
+    view(&mut world, &best).settled = true;
+    assert_eq!(receiver(&plan_of(&world, &robot, Some(&second))), best);
+}
+
+#[test]
+fn whoever_a_sender_has_chosen_takes_it_in_and_so_does_the_one_that_it_will_choose() {
+    let mut world = fog_that_listens();
+    let robot = id("e/r");
+    let best = receiver(&plan_of(&world, &robot, None));
+    let other = FLOWS.map(id).into_iter().find(|flow| *flow != best).unwrap();
+    let takes = |world: &World, flow: &FlowId| plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer);
+    assert!(takes(&world, &best) && !takes(&world, &other));
+    view(&mut world, &robot).parts.entry(topic()).or_default().receivers = vec![other.clone()];
+    assert!(takes(&world, &best) && takes(&world, &other));
+    view(&mut world, &other).state = FlowState::Draining;
+    assert!(takes(&world, &best) && !takes(&world, &other));
+}
+
+/// Missing layers, and two layers of one kind: who sends what to whom.
+#[test]
+fn incomplete_systems_and_doubled_layers() {
+    let rows: &[(&str, &[&str], &str, usize)] = &[
+        (
+            "no fog: the robot sends to the cloud",
+            &["e/r node+", "c/a@1 layer-"],
+            "e/r",
+            1,
+        ),
+        (
+            "no fog, two in the cloud: one copy",
+            &["e/r node+", "c/a@1 layer-", "c/b@1 layer-"],
+            "e/r",
+            1,
+        ),
+        (
+            "edge alone, one layer broker: no way out",
+            &["e/r@1 node+", "e/s@1 node-"],
+            "e/r",
+            0,
+        ),
+        (
+            "edge alone, no layer broker: to each that asks",
+            &["e/r node+", "e/s node-", "e/t node-"],
+            "e/r",
+            2,
+        ),
+        (
+            "fog alone: nothing leaves it",
+            &["f/a@1 layer+", "f/b@1 layer-"],
+            "f/a",
+            0,
+        ),
+        (
+            "fog and edge: the fog to each robot",
+            &["f/a@1 layer+", "e/r node-", "e/s node-"],
+            "f/a",
+            2,
+        ),
+        (
+            "two fogs of their own: a copy each",
+            &["e/r node+", "fog-1/a@1 layer-", "fog-2/a@1 layer-"],
+            "e/r",
+            2,
+        ),
+        (
+            "two fogs with two flows each: a copy each",
+            &[
+                "e/r node+",
+                "fog-1/a@1 layer-",
+                "fog-1/b@1 layer-",
+                "fog-2/a@1 layer-",
+                "fog-2/b@1 layer-",
+            ],
+            "e/r",
+            2,
+        ),
+        (
+            "from one fog to another, over the inter scope",
+            &["fog-1/a@1 layer+", "fog-2/a@1 layer-", "fog-2/b@1 layer-"],
+            "fog-1/a",
+            1,
+        ),
+        (
+            "one Kafka and one prefix do not make one layer of two",
+            &["fog-1/a@1 layer+ layer-", "fog-2/a@1 layer+ layer-"],
+            "fog-1/a",
+            1,
+        ),
+    ];
+    for (rule, lines, sender, copies) in rows {
+        let plan = plan_of(&world(lines), &id(sender), None);
+        let found: Vec<_> = plan.bridges.iter().filter_map(|bridge| bridge.to.receiver()).collect();
+        assert_eq!(found.len(), *copies, "{rule}: {found:?}");
+        let mut layers: Vec<_> = found.iter().map(|flow| flow.layer.clone()).collect();
+        layers.dedup();
+        if !rule.contains("edge") && !rule.contains("each robot") {
+            assert_eq!(layers.len(), *copies, "{rule}: {found:?}");
+        }
+    }
+}
+
+/// However the claims lie: at most one of the living ends up with it, and after each has done what it plans exactly one.
+#[test]
+fn any_claims_end_with_one_carrier() {
+    for seed in 0..3_u32.pow(3) * 2_u32.pow(3) {
+        let mut world = fog();
+        let mut rest = seed;
+        for flow in FLOWS.map(id) {
+            let claim = match rest % 3 {
+                0 => Carrying::No,
+                1 => Carrying::Carries,
+                _ => Carrying::HandedOver([7].into()),
+            };
+            set(&mut world, &flow, claim);
+            rest /= 3;
+            view(&mut world, &flow).settled = rest % 2 == 1;
+            rest /= 2;
+        }
+        for _ in 0..4 {
+            // Each in turn does what it plans, and tells.
+            for flow in FLOWS.map(id) {
+                let carries = plan_of(&world, &flow, None).carries_out();
+                let held = view(&mut world, &flow).parts[&topic()].carrying.clone();
+                let next = match (held, carries) {
+                    (_, true) => Carrying::Carries,
+                    (Carrying::Carries, false) => Carrying::HandedOver([9].into()),
+                    (held, false) => held,
+                };
+                set(&mut world, &flow, next);
+            }
+        }
+        assert_eq!(carriers(&world).len(), 1, "seed {seed}: {:?}", carriers(&world));
+        let claims = FLOWS
+            .map(id)
+            .iter()
+            .filter(|flow| world.flows[*flow].parts[&topic()].carrying == Carrying::Carries)
+            .count();
+        assert_eq!(claims, 1, "seed {seed}");
+    }
+}
+
+#[test]
+fn owner_is_what_the_planner_says() {
+    let world = fog();
+    let [best, ..] = preferred();
+    assert_eq!(owner(&world, &topic()), Some(best));
+}

@@ -1,0 +1,274 @@
+//! Flows that hear each other on the channel of their layer broker.
+
+use blaze_brokers::Begin;
+use blaze_proto::link::link_control::Goodbye;
+
+use super::*;
+use crate::world::{Carrying, SETTLED_AFTER};
+
+const MS: Duration = Duration::from_millis(1);
+
+fn id(text: &str) -> FlowId {
+    text.parse().unwrap()
+}
+
+/// Two flows of a layer without an inter scope between them, and a channel that loses.
+struct Pair {
+    now: Instant,
+    start: Instant,
+    flows: [Registry; 2],
+    steps: u64,
+    messages: u64,
+    /// Of ten messages so many are lost.
+    loss: u64,
+}
+
+impl Pair {
+    fn new(loss: u64) -> Self {
+        let now = Instant::now();
+        let flows = ["cloud/a", "cloud/b"].map(|flow| Registry::new(config(flow, 1, now)));
+        let mut pair = Self {
+            now,
+            start: now,
+            flows,
+            steps: 0,
+            messages: 0,
+            loss,
+        };
+        for flow in &mut pair.flows {
+            flow.set_state(FlowState::Ready);
+        }
+        pair
+    }
+
+    fn names(&self) -> [FlowId; 2] {
+        [0, 1].map(|at| self.flows[at].world().me.clone())
+    }
+
+    /// Milliseconds since 1970 on the server, which began with the test.
+    fn server_ms(&self) -> i64 {
+        i64::try_from((self.now - self.start).as_millis()).unwrap()
+    }
+
+    fn hello(&mut self, from: usize) {
+        let said = Hello {
+            state: match self.flows[from].world().own().unwrap().state {
+                FlowState::Starting => State::Starting,
+                FlowState::Ready => State::Ready,
+                FlowState::Draining => State::Draining,
+            }
+            .into(),
+            ..hello(&self.flows[from])
+        };
+        let (name, ms) = (self.names()[from].clone(), self.server_ms());
+        self.flows[1 - from].on_layer_hello(self.now, &name, &said, Some(ms));
+    }
+
+    fn run(&mut self, time: Duration) {
+        let end = self.now + time;
+        while self.now < end {
+            self.now += 10 * MS;
+            self.steps += 1;
+            for from in 0..2 {
+                if self.steps.is_multiple_of(50) {
+                    self.hello(from);
+                }
+                let over_link = self.flows[from].poll(self.now);
+                assert!(over_link.is_empty(), "there is no link: {over_link:?}");
+                for (to, body) in self.flows[from].poll_layer() {
+                    let names = self.names();
+                    assert!(to.is_none_or(|to| to == names[1 - from]));
+                    self.messages += 1;
+                    if self.messages * 7 % 10 >= self.loss {
+                        self.flows[1 - from].on_layer_control(self.now, &names[from], 1, body);
+                    }
+                }
+                let now = self.now;
+                self.flows[from].watch_flows(now);
+            }
+        }
+    }
+
+    fn say(&mut self, at: usize, scope: Scope, message: &Value) {
+        self.flows[at].control(self.now, scope, message.to_string().as_bytes());
+    }
+
+    fn carries(&mut self, at: usize, carrying: &Carrying) {
+        let me = self.names()[at].clone();
+        self.flows[at].set_route_state(self.now, &topic("t"), carrying_states(&me, carrying));
+    }
+
+    fn sees(&self, at: usize) -> &FlowView {
+        &self.flows[at].world().flows[&self.names()[1 - at]]
+    }
+}
+
+fn lease(op: &str, topic: &str, service: &str) -> Value {
+    json!({"op": op, "topic": topic, "service": service, "ttl_s": 0})
+}
+
+#[test]
+fn without_a_link_they_know_each_other_over_a_channel_that_loses() {
+    for loss in [0, 3, 6] {
+        let mut pair = Pair::new(loss);
+        pair.run(1000 * MS);
+        for number in 0..120 {
+            pair.say(number % 2, Scope::Node, &lease("request", &format!("t{number}"), "s"));
+            pair.run(20 * MS);
+        }
+        pair.run(8000 * MS);
+        for at in 0..2 {
+            let own = &pair.flows[1 - at].world().own().unwrap().topics;
+            let told: BTreeSet<&TopicName> = pair.sees(at).topics.keys().collect();
+            assert_eq!(told, own.keys().collect(), "loss {loss}");
+            assert!(pair.flows[at].knows_replicas() && pair.sees(at).reach == Reach::Up);
+        }
+    }
+}
+
+#[test]
+fn one_that_is_silent_is_gone_and_what_it_carried_begins_a_second_before_its_last_sign() {
+    let mut pair = Pair::new(0);
+    pair.carries(0, &Carrying::Carries);
+    pair.run(1000 * MS);
+    assert!(pair.flows[1].is_carried_elsewhere(&topic("t")));
+    let last = pair.now;
+    pair.hello(0);
+    let last_ms = pair.server_ms();
+    let mut watch = |after: Duration| pair.flows[1].watch_flows(last + after);
+    assert!(!watch(2499 * MS).contains(&topic("t")));
+    assert!(
+        watch(2500 * MS).contains(&topic("t")),
+        "what it carried is planned anew"
+    );
+    let (flow, now) = (&mut pair.flows[1], last + 2500 * MS);
+    assert!(flow.take_urgent().contains(&topic("t")));
+    assert_eq!(flow.world().flows[&id("cloud/a")].reach, Reach::Down);
+    let since = Begin::Since {
+        appended_ms: last_ms - 1000,
+        latest: [].into(),
+    };
+    assert_eq!(flow.begin_carrying(now, &topic("t"), true), since);
+    assert_eq!(
+        flow.begin_carrying(now, &topic("t"), true),
+        Begin::Now,
+        "it is taken up once"
+    );
+}
+
+#[test]
+fn after_a_crash_best_effort_topics_begin_at_the_end_and_old_places_are_forgotten() {
+    for (reliable, wait) in [(false, 0 * MS), (true, LEGACY)] {
+        let mut pair = Pair::new(0);
+        pair.carries(0, &Carrying::Carries);
+        pair.run(1000 * MS);
+        let gone = pair.now + SILENT;
+        pair.flows[1].watch_flows(gone);
+        let begin = pair.flows[1].begin_carrying(gone + wait, &topic("t"), reliable);
+        assert_eq!(begin, Begin::Now, "reliable {reliable}, {wait:?} later");
+    }
+}
+
+#[test]
+fn what_is_handed_over_outlives_the_good_bye() {
+    let mut pair = Pair::new(0);
+    pair.carries(0, &Carrying::Carries);
+    pair.run(1000 * MS);
+    pair.carries(0, &Carrying::HandedOver([42].into()));
+    pair.flows[0].set_state(FlowState::Draining);
+    pair.hello(0);
+    pair.run(100 * MS);
+    assert_eq!(pair.sees(1).state, FlowState::Draining);
+    let now = pair.now;
+    let goodbye = Body::Goodbye(Goodbye { epoch: 1 });
+    pair.flows[1].on_layer_control(now, &id("cloud/a"), 1, goodbye);
+    assert_eq!(pair.sees(1).reach, Reach::Down);
+    assert_eq!(
+        pair.flows[1].begin_carrying(now, &topic("t"), false),
+        Begin::At([42].into())
+    );
+}
+
+#[test]
+fn a_new_life_ends_the_one_before_and_late_words_of_that_count_no_more() {
+    let mut pair = Pair::new(0);
+    pair.carries(0, &Carrying::Carries);
+    pair.run(1000 * MS);
+    let (now, ms) = (pair.now, pair.server_ms());
+    let mut again = Registry::new(config("cloud/a", 2, now));
+    let said = Hello {
+        state: State::Starting.into(),
+        ..hello(&again)
+    };
+    pair.flows[1].on_layer_hello(now, &id("cloud/a"), &said, Some(ms));
+    assert!(!pair.flows[1].is_carried_elsewhere(&topic("t")));
+    assert!(matches!(
+        pair.flows[1].begin_carrying(now, &topic("t"), true),
+        Begin::Since { .. }
+    ));
+    let before = pair.flows[1].faults().unknown_flows;
+    let goodbye = Body::Goodbye(Goodbye { epoch: 1 });
+    pair.flows[1].on_layer_control(now, &id("cloud/a"), 1, goodbye);
+    pair.hello(0);
+    assert_eq!(pair.flows[1].faults().unknown_flows, before + 1);
+    assert_eq!((pair.sees(1).reach, pair.sees(1).epoch), (Reach::Up, 2));
+    again.set_state(FlowState::Ready);
+}
+
+#[test]
+fn a_flow_does_not_go_back_to_what_it_was_and_settles_after_five_seconds() {
+    let mut pair = Pair::new(0);
+    pair.run(1000 * MS);
+    pair.run(SETTLED_AFTER - 1000 * MS);
+    assert!(!pair.sees(1).settled);
+    pair.run(1000 * MS);
+    assert!(pair.sees(1).settled);
+    let late = hello(&pair.flows[0]);
+    pair.flows[0].set_state(FlowState::Draining);
+    pair.hello(0);
+    let (now, ms) = (pair.now, pair.server_ms());
+    pair.flows[1].on_layer_hello(now, &id("cloud/a"), &late, Some(ms));
+    pair.flows[1].watch_flows(now);
+    assert_eq!((pair.sees(1).state, pair.sees(1).settled), (FlowState::Draining, false));
+}
+
+#[test]
+fn the_link_does_not_decide_about_flows_that_share_the_layer_broker() {
+    let mut pair = Pair::new(0);
+    pair.run(1000 * MS);
+    let (a, now) = (id("cloud/a"), pair.now);
+    let said = hello(&pair.flows[0]);
+    pair.flows[1].on_hello(now, &a, &said);
+    for reach in [Reach::Suspect, Reach::Down] {
+        pair.flows[1].set_reach(now, &a, reach);
+        assert_eq!(pair.sees(1).reach, Reach::Up, "it lives on the layer broker");
+    }
+    pair.flows[1].forget_link(now, &a);
+    assert_eq!(pair.sees(1).reach, Reach::Up);
+    pair.flows[1].set_reach(now, &a, Reach::Up);
+    pair.flows[1].watch_flows(now + SILENT);
+    assert_eq!(
+        pair.sees(1).reach,
+        Reach::Down,
+        "it has lost the broker, though it is there"
+    );
+    pair.flows[1].forget_link(now, &a);
+    assert!(!pair.flows[1].world().flows.contains_key(&a));
+}
+
+#[test]
+fn who_shares_nothing_is_not_heard_there() {
+    let mut pair = Pair::new(0);
+    let (now, said) = (pair.now, hello(&pair.flows[0]));
+    let other_broker = Hello {
+        layer_scope_id: 77,
+        ..said.clone()
+    };
+    assert!(
+        pair.flows[1]
+            .on_layer_hello(now, &id("cloud/a"), &other_broker, None)
+            .is_empty()
+    );
+    pair.flows[1].on_layer_hello(now, &id("fog/a"), &said, None);
+    assert_eq!(pair.flows[1].world().flows.len(), 1);
+}

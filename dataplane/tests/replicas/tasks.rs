@@ -1,0 +1,259 @@
+//! What the tasks of one flow do in production: read, decide, carry out, send, and leave.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use blaze_brokers::{Begin, Content, Place, PublisherOptions, Received};
+use blaze_domain::{Scope, TopicName};
+use blaze_flow::control::{Duty, Output};
+use blaze_flow::lane::path::TopicInfo;
+use blaze_flow::lane::writer::NewWriter;
+use blaze_flow::plan::{Target, TopicPlan};
+use blaze_flow::world::FlowState;
+use blaze_proto::link::link_control::State;
+use rand::RngExt;
+
+use crate::parts::{Life, LogWriter, Packet, Record, channel};
+use crate::world::World;
+
+impl World {
+    /// What the source tasks and the task of the channel of flows do.
+    pub(crate) fn read(&mut self, index: usize) {
+        let (now, wall, visible) = (self.now, self.wall(), self.now - self.kafka_delay);
+        let topics: Vec<(TopicName, Scope)> = self.flows[index].reads.keys().cloned().collect();
+        for (topic, scope) in topics {
+            let log = Arc::clone(if scope == Scope::Layer {
+                &self.kafka
+            } else {
+                &self.redis
+            });
+            let flow = &mut self.flows[index];
+            let (Some(next), Some(id)) = (
+                flow.reads.get_mut(&(topic.clone(), scope)),
+                flow.plane.core.find(topic.as_str()),
+            ) else {
+                continue;
+            };
+            let log = log.lock();
+            let records = log.get(&channel(index, scope, topic.as_str()));
+            let records = records.map_or(&[][..], Vec::as_slice);
+            let mut batch = Vec::new();
+            while let Some(record) = records.get(*next).filter(|record| record.at <= visible) {
+                batch.push(Received {
+                    content: record.content.clone(),
+                    at: now,
+                    broker_age_us: 0,
+                    place: (scope == Scope::Layer).then(|| Place {
+                        partition: 0,
+                        offset: *next as i64,
+                        appended_ms: None,
+                    }),
+                });
+                *next += 1;
+            }
+            drop(log);
+            flow.plane.ingest(now, wall, id, scope, &mut batch);
+        }
+        if index == 0 {
+            return;
+        }
+        let said: Vec<Record> = {
+            let log = self.kafka.lock();
+            let all = log.get("peers").map_or(&[][..], Vec::as_slice);
+            let new = all.iter().skip(self.flows[index].peers);
+            new.take_while(|record| record.at <= visible).cloned().collect()
+        };
+        let start = self.start;
+        let flow = &mut self.flows[index];
+        flow.peers += said.len();
+        for record in said {
+            if let Content::Bare { payload, .. } = &record.content
+                && (!self.split || record.by == index)
+            {
+                let appended_ms = (record.at - start).as_millis() as i64;
+                flow.control.replica_message(now, payload, Some(appended_ms));
+            }
+        }
+    }
+
+    pub(crate) fn run_control(&mut self, index: usize) {
+        let (now, wall_ms) = (self.now, self.wall() / 1_000_000);
+        let flow = &mut self.flows[index];
+        flow.plane.run_timers(now);
+        let mut news = Vec::new();
+        flow.plane.pump(now, |event| news.push(event));
+        for event in news {
+            flow.control.link_event(now, event);
+        }
+        flow.control.tick(now, wall_ms);
+        while let Some(output) = self.flows[index].control.poll() {
+            self.carry_out(index, output);
+        }
+    }
+
+    fn carry_out(&mut self, index: usize, output: Output) {
+        let (now, wall_ms) = (self.now, self.wall() / 1_000_000);
+        if let Output::Plan {
+            topic,
+            plan,
+            info,
+            duty,
+        } = output
+        {
+            let places = self.apply(index, &topic, &plan, *info, &duty);
+            if duty == Duty::GivesUp {
+                self.flows[index].control.given_up(now, wall_ms, &topic, places);
+            }
+            return;
+        }
+        if let Output::Replicas { body, .. } = output {
+            let content = Content::Bare {
+                payload: body,
+                identity: None,
+            };
+            let record = Record {
+                content,
+                at: now,
+                by: index,
+            };
+            return self.kafka.lock().entry("peers".to_owned()).or_default().push(record);
+        }
+        let Some(engine) = &mut self.flows[index].plane.engine else {
+            return;
+        };
+        match output {
+            Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
+            Output::Announce { version, digest } => engine.set_registry(now, version, digest),
+            Output::State(state) => {
+                let said = match state {
+                    FlowState::Starting => State::Starting,
+                    FlowState::Ready => State::Ready,
+                    FlowState::Draining => State::Draining,
+                };
+                engine.set_state(now, said);
+            }
+            _ => {}
+        }
+    }
+
+    /// What the executor does: bridges, and where they are read from.
+    fn apply(
+        &mut self,
+        index: usize,
+        topic: &TopicName,
+        plan: &TopicPlan,
+        info: TopicInfo,
+        duty: &Duty,
+    ) -> Option<Vec<i64>> {
+        let (now, kafka, redis, clock) = (self.now, &self.kafka, &self.redis, &self.clock);
+        let flow = &mut self.flows[index];
+        let id = flow.plane.core.intern(topic, now)?;
+        flow.plane.core.apply(now, id, info, plan, |bridge| {
+            let (log, scope) = match bridge.to {
+                Target::Layer => (kafka, Scope::Layer),
+                _ => (redis, Scope::Node),
+            };
+            let writer = LogWriter {
+                log: Arc::clone(log),
+                channel: channel(index, scope, topic.as_str()),
+                clock: Arc::clone(clock),
+            };
+            Ok(NewWriter {
+                publisher: Arc::new(writer),
+                options: PublisherOptions::default(),
+            })
+        });
+        flow.plane.deliver_early(now, id);
+        let stopped_at = flow.plane.core.stopped_at(id);
+        for scope in [Scope::Node, Scope::Layer] {
+            let key = (topic.clone(), scope);
+            if !flow.plane.core.path(id).reads(scope) {
+                if flow.reads.remove(&key).is_some() {
+                    flow.plane.core.reads_no_more(id);
+                }
+                continue;
+            }
+            let log = if scope == Scope::Layer { kafka } else { redis }.lock();
+            let records = log.get(&channel(index, scope, topic.as_str()));
+            let records = records.map_or(&[][..], Vec::as_slice);
+            let begin = match duty {
+                Duty::Takes(begin) if scope == Scope::Layer => begin.clone(),
+                _ => Begin::Now,
+            };
+            let again = flow.reads.contains_key(&key);
+            if again && begin == Begin::Now {
+                continue;
+            }
+            let start = match flow.plane.core.begin_reading(id, &begin, again) {
+                Begin::Now => records.len(),
+                Begin::At(offsets) => offsets[0] as usize,
+                Begin::Since { appended_ms, latest } => {
+                    let at = self.start + Duration::from_millis(appended_ms.max(0) as u64);
+                    let first = records
+                        .iter()
+                        .position(|record| record.at >= at)
+                        .unwrap_or(records.len());
+                    latest.first().map_or(first, |latest| first.min(*latest as usize))
+                }
+            };
+            if scope == Scope::Layer {
+                flow.plane.core.reads_from(id, &[start as i64]);
+            }
+            flow.reads.insert(key, start);
+        }
+        (*duty == Duty::GivesUp && !stopped_at.is_empty()).then_some(stopped_at)
+    }
+
+    /// What a flow does that is stopped.
+    pub(crate) fn leave(&mut self, index: usize) {
+        let now = self.now;
+        let flow = &mut self.flows[index];
+        match flow.life {
+            Life::Draining(since) => {
+                let over = now - since >= Duration::from_millis(600);
+                if over || (flow.control.has_handed_over() && !flow.plane.core.is_draining()) {
+                    flow.control.say_goodbye();
+                    if let Some(engine) = &mut flow.plane.engine {
+                        engine.goodbye(now);
+                    }
+                    flow.life = Life::Gone(now);
+                }
+            }
+            Life::Gone(since) if now - since >= Duration::from_millis(100) => {
+                self.handed_over += flow.control.handovers().0;
+                flow.life = Life::Dead;
+            }
+            _ => {}
+        }
+    }
+
+    pub(crate) fn transmit(&mut self, index: usize) {
+        let now = self.now;
+        while let Some(transmit) = self.flows[index]
+            .plane
+            .engine
+            .as_mut()
+            .and_then(|engine| engine.poll_transmit(now))
+        {
+            let between = index > 0 && transmit.to.flow.layer.as_str() == "cloud";
+            if self.split && between {
+                continue;
+            }
+            let jitter = Duration::from_micros(self.random.random_range(0..2_000));
+            self.packets += 1;
+            self.network.push(Packet {
+                due: now + self.one_way + jitter,
+                order: self.packets,
+                to: transmit.to,
+                class: transmit.class,
+                datagram: transmit.datagram,
+            });
+        }
+        let flow = &mut self.flows[index];
+        let mut news = Vec::new();
+        flow.plane.pump(now, |event| news.push(event));
+        for event in news {
+            flow.control.link_event(now, event);
+        }
+    }
+}

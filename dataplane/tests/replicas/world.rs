@@ -1,0 +1,352 @@
+//! The simulated system: brokers, wire and clock around the cores of production.
+
+use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashMap};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use blaze_brokers::Content;
+use blaze_domain::{FlowId, LayerKind, Origin, Scope, TopicName, WriterId};
+use blaze_flow::control::{ControlConfig, ControlCore};
+use blaze_flow::flow::plane::PlaneState;
+use blaze_flow::lane::core::{DataConfig, DataCore};
+use blaze_flow::link::transport::Endpoint;
+use blaze_flow::link::{Engine, EngineConfig, Limits};
+use blaze_flow::plan::{PlanRules, TopicPlan};
+use blaze_flow::registry::LayerNames;
+use blaze_flow::world::LayerScopeId;
+use blaze_proto::link::link_control::LayerScope;
+use blaze_proto::{Frame, Header};
+use bytes::Bytes;
+use parking_lot::Mutex;
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use serde_json::json;
+
+use crate::parts::{End, Flow, Found, Life, Log, Packet, Record, channel};
+
+const STEP: Duration = Duration::from_millis(5);
+const WALL_NS: u64 = 1_700_000_000_000_000_000;
+/// From the robot to the cloud, and back.
+const UP: &str = "imu/data";
+const DOWN: &str = "cmd/vel";
+/// Between two messages of a publisher.
+const PERIOD: Duration = Duration::from_millis(20);
+
+pub(crate) struct World {
+    pub(crate) random: StdRng,
+    pub(crate) start: Instant,
+    pub(crate) now: Instant,
+    pub(crate) clock: Arc<Mutex<Instant>>,
+    /// 0 is the robot.
+    pub(crate) flows: Vec<Flow>,
+    pub(crate) kafka: Log,
+    pub(crate) redis: Log,
+    pub(crate) network: BinaryHeap<Packet>,
+    pub(crate) packets: u64,
+    pub(crate) known: HashMap<(usize, usize), (u64, u64)>,
+    pub(crate) one_way: Duration,
+    pub(crate) kafka_delay: Duration,
+    pub(crate) publishing: bool,
+    pub(crate) next_publish: Instant,
+    pub(crate) sent: u64,
+    pub(crate) split: bool,
+    pub(crate) handed_over: u64,
+    /// How many messages the services of a node had when its flow was started again, each time.
+    pub(crate) lives: BTreeMap<usize, Vec<usize>>,
+}
+
+impl World {
+    pub(crate) fn new(seed: u64) -> Self {
+        let mut random = StdRng::seed_from_u64(seed);
+        let now = Instant::now();
+        let mut world = Self {
+            one_way: Duration::from_millis(random.random_range(1..=20)),
+            kafka_delay: Duration::from_millis(random.random_range(5..=20)),
+            random,
+            start: now,
+            now,
+            clock: Arc::new(Mutex::new(now)),
+            flows: Vec::new(),
+            kafka: Log::default(),
+            redis: Log::default(),
+            network: BinaryHeap::new(),
+            packets: 0,
+            known: HashMap::new(),
+            publishing: false,
+            next_publish: now,
+            sent: 0,
+            split: false,
+            handed_over: 0,
+            lives: BTreeMap::new(),
+        };
+        for index in 0..3 {
+            let flow = world.make_flow(index, 1);
+            world.flows.push(flow);
+        }
+        for index in 0..3 {
+            world.lease(index);
+        }
+        world.run_for(Duration::from_secs(4));
+        world.publishing = true;
+        world.next_publish = world.now;
+        world
+    }
+
+    pub(crate) fn wall(&self) -> u64 {
+        WALL_NS + (self.now - self.start).as_nanos() as u64
+    }
+
+    fn make_flow(&self, index: usize, epoch: u64) -> Flow {
+        let robot = index == 0;
+        let id: FlowId = ["edge/robot-1", "cloud/cloud-1", "cloud/cloud-2"][index]
+            .parse()
+            .unwrap();
+        let kind = if robot { LayerKind::Edge } else { LayerKind::Cloud };
+        let layer_scope = (!robot).then(|| LayerScopeId::kafka(""));
+        let control = ControlConfig {
+            me: id.clone(),
+            kind,
+            epoch,
+            node_scope: true,
+            layer_scope,
+            replicas: !robot,
+            inter_scope: true,
+            layer_answers_need_id: true,
+            layer_names: LayerNames::Any,
+            lease_stores: BTreeSet::new(),
+            rules: PlanRules::default(),
+        };
+        let core = DataCore::new(DataConfig {
+            me: id.clone(),
+            epoch,
+            large_bytes: 65_536,
+            salt: index as u32,
+        });
+        let said = layer_scope.map_or((LayerScope::None, 0), |scope| (LayerScope::Kafka, scope.0));
+        let engine = EngineConfig {
+            me: id.clone(),
+            kind,
+            epoch,
+            layer_scope: said,
+            max_datagram: 1300,
+            limits: Limits::default(),
+        };
+        Flow {
+            control: ControlCore::new(control, self.now),
+            plane: PlaneState {
+                core,
+                engine: Some(Engine::new(engine, self.now, self.wall())),
+            },
+            id,
+            epoch,
+            life: Life::Alive,
+            reads: BTreeMap::new(),
+            peers: self.kafka.lock().get("peers").map_or(0, Vec::len),
+        }
+    }
+
+    /// The services of a flow's broker send their leases; on Kafka each replica hears them.
+    fn lease(&mut self, index: usize) {
+        let message = |op: &str, topic: &str| {
+            json!({"op": op, "topic": topic, "service": "s", "ttl_s": 0, "reliability": "reliable"}).to_string()
+        };
+        let (scope, messages) = if index == 0 {
+            (Scope::Node, [message("advertise", UP), message("request", DOWN)])
+        } else {
+            (Scope::Layer, [message("request", UP), message("advertise", DOWN)])
+        };
+        let (now, wall_ms) = (self.now, self.wall() / 1_000_000);
+        let control = &mut self.flows[index].control;
+        for message in messages {
+            control.control(now, wall_ms, scope, message.as_bytes());
+        }
+        if index > 0 {
+            // A service on the replica's own node wants what the layer publishes, too.
+            control.control(now, wall_ms, Scope::Node, message("request", DOWN).as_bytes());
+        }
+    }
+
+    pub(crate) fn random_cloud(&mut self) -> usize {
+        self.random.random_range(1..=2)
+    }
+
+    pub(crate) fn end(&mut self, index: usize, end: End) {
+        // Not always at the same moment between two Hellos and two messages.
+        let pause = self.random.random_range(0..120);
+        self.run_for(STEP * pause);
+        let (now, wall_ms) = (self.now, self.wall() / 1_000_000);
+        let flow = &mut self.flows[index];
+        self.handed_over += flow.control.handovers().0;
+        match end {
+            End::Killed => flow.life = Life::Dead,
+            End::Stopped => {
+                flow.life = Life::Draining(now);
+                flow.control.start_draining(now, wall_ms);
+            }
+        }
+    }
+
+    pub(crate) fn restart(&mut self, index: usize) {
+        assert_eq!(self.flows[index].life, Life::Dead, "it has not ended in time");
+        let heard = self
+            .redis
+            .lock()
+            .get(&channel(index, Scope::Node, DOWN))
+            .map_or(0, Vec::len);
+        self.lives.entry(index).or_default().push(heard);
+        self.flows[index] = self.make_flow(index, self.flows[index].epoch + 1);
+        self.lease(index);
+    }
+
+    pub(crate) fn stop_publishing(&mut self) {
+        self.publishing = false;
+    }
+
+    /// Whether the replicas hear each other, on Kafka and over the link.
+    pub(crate) fn split(&mut self, split: bool) {
+        self.split = split;
+    }
+
+    pub(crate) fn run_for(&mut self, time: Duration) {
+        let end = self.now + time;
+        while self.now < end {
+            self.step();
+        }
+    }
+
+    fn step(&mut self) {
+        self.now += STEP;
+        *self.clock.lock() = self.now;
+        self.publish();
+        self.discover();
+        while self.network.peek().is_some_and(|packet| packet.due <= self.now) {
+            let Some(packet) = self.network.pop() else { break };
+            let reads = |flow: &&mut Flow| {
+                flow.life != Life::Dead && flow.id == packet.to.flow && flow.epoch == packet.to.epoch
+            };
+            if let Some(engine) = self
+                .flows
+                .iter_mut()
+                .find(reads)
+                .and_then(|flow| flow.plane.engine.as_mut())
+            {
+                engine.receive(self.now, packet.datagram, packet.class);
+            }
+        }
+        for index in 0..self.flows.len() {
+            if self.flows[index].life != Life::Dead {
+                self.read(index);
+                self.run_control(index);
+                self.leave(index);
+                self.transmit(index);
+            }
+        }
+    }
+
+    fn publish(&mut self) {
+        if !self.publishing || self.now < self.next_publish {
+            return;
+        }
+        self.next_publish += PERIOD;
+        self.sent += 1;
+        let ways = [
+            (&self.redis, Scope::Node, UP, "edge", "robot-1"),
+            (&self.kafka, Scope::Layer, DOWN, "cloud", ""),
+        ];
+        for (log, scope, topic, layer, node) in ways {
+            let origin = Origin {
+                layer: layer.into(),
+                node: node.into(),
+                service: "s".into(),
+                ..Origin::default()
+            };
+            let header = Header {
+                reliable: true,
+                ..Header::new(topic, origin, WriterId([topic.len() as u8; 16]), self.sent, self.wall())
+            };
+            let record = Record {
+                content: Content::Frame(Frame::new(&header, Bytes::from_static(b"payload")).unwrap()),
+                at: self.now,
+                by: usize::MAX,
+            };
+            log.lock().entry(channel(0, scope, topic)).or_default().push(record);
+        }
+    }
+
+    fn discover(&mut self) {
+        for a in 0..self.flows.len() {
+            for b in 0..self.flows.len() {
+                let lives = (self.flows[a].epoch, self.flows[b].epoch);
+                let both = a != b && [a, b].iter().all(|at| self.flows[*at].life == Life::Alive);
+                if both && self.known.get(&(a, b)) != Some(&lives) && self.random.random_bool(0.05) {
+                    self.known.insert((a, b), lives);
+                    let endpoint = Endpoint {
+                        flow: self.flows[b].id.clone(),
+                        epoch: lives.1,
+                    };
+                    let now = self.now;
+                    if let Some(engine) = &mut self.flows[a].plane.engine {
+                        engine.peer_discovered(now, endpoint);
+                    }
+                }
+            }
+        }
+    }
+
+    /// What flows wrote to a channel: how often each sequence.
+    fn written(log: &Log, topic: &str) -> BTreeMap<u64, usize> {
+        let mut counts = BTreeMap::new();
+        for record in log.lock().get(topic).into_iter().flatten() {
+            if let Content::Frame(frame) = &record.content
+                && frame.hops() > 0
+            {
+                *counts.entry(frame.sequence()).or_default() += 1;
+            }
+        }
+        counts
+    }
+
+    /// Messages that services of the replicas' nodes missed or got out of turn within a life of their flow.
+    fn holes(&self) -> usize {
+        let log = self.redis.lock();
+        let mut holes = 0;
+        for index in 1..=2 {
+            let all = log
+                .get(&channel(index, Scope::Node, DOWN))
+                .map_or(&[][..], Vec::as_slice);
+            let begins = self.lives.get(&index).map_or(&[][..], Vec::as_slice);
+            let sequence = |record: &Record| match &record.content {
+                Content::Frame(frame) => frame.sequence(),
+                _ => 0,
+            };
+            let pairs = all.windows(2).enumerate().filter(|(at, _)| !begins.contains(&(at + 1)));
+            holes += pairs
+                .filter(|(_, pair)| sequence(&pair[1]) != sequence(&pair[0]) + 1)
+                .count();
+        }
+        holes
+    }
+
+    pub(crate) fn judge(&mut self) -> Found {
+        let up = Self::written(&self.kafka, UP);
+        let down = Self::written(&self.redis, &channel(0, Scope::Node, DOWN));
+        let lost = |counts: &BTreeMap<u64, usize>| (1..=self.sent).filter(|n| !counts.contains_key(n)).count();
+        let twice = |counts: &BTreeMap<u64, usize>| counts.values().filter(|count| **count > 1).count();
+        let topic: TopicName = DOWN.parse().unwrap();
+        let carries = |flow: &&Flow| flow.control.plans().get(&topic).is_some_and(TopicPlan::carries_out);
+        let core = &self.flows[0].plane.core;
+        let dropped = core.find(DOWN).map_or(0, |id| core.path(id).ingress_drops.total());
+        Found {
+            sent_up: self.sent as usize,
+            sent_down: self.sent as usize,
+            lost_up: lost(&up),
+            lost_down: lost(&down),
+            twice_up: twice(&up),
+            twice_down: twice(&down),
+            repeats_down: dropped,
+            carriers: self.flows.iter().filter(carries).count(),
+            handed_over: self.handed_over,
+            holes: self.holes(),
+        }
+    }
+}
