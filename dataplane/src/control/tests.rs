@@ -287,7 +287,7 @@ fn other_flows_are_told_of_brokers_that_are_away() {
 }
 
 /// The rules of a node file.
-fn access(rules: Value) -> AccessRules {
+fn access(rules: &Value) -> AccessRules {
     let file = json!({
         "layer": {"name": "fog", "kind": "fog"}, "node": {"name": "fog-1"}, "brokers": {"node": {"memory": {}}},
         "flow": {"access": rules},
@@ -299,7 +299,7 @@ fn access(rules: Value) -> AccessRules {
 #[test]
 fn who_may_not_advertise_is_told_and_leaves_no_lease() {
     let mut bench = Bench::ready();
-    let rules = access(json!([{"match": "cmd/**", "advertise": {"allow": ["*/*/joystick"]}}]));
+    let rules = access(&json!([{"match": "cmd/**", "advertise": {"allow": ["*/*/joystick"]}}]));
     bench.core.set_access(bench.now, 0, rules);
     let mut denied = lease("advertise", "cmd/vel");
     denied["service"] = "planner".into();
@@ -342,7 +342,7 @@ fn leases_that_new_rules_do_not_allow_end() {
     bench.core.set_access(
         bench.now,
         0,
-        access(json!([{"match": "cmd/*", "request": {"allow": []}}])),
+        access(&json!([{"match": "cmd/*", "request": {"allow": []}}])),
     );
     bench.step(300);
     assert_eq!(bench.bridges("cmd/vel"), [""; 0]);

@@ -279,7 +279,7 @@ mod tests {
         assert!(kept.bytes <= MAX_BYTES, "{}", kept.bytes);
         assert!(kept.evicted >= 33 && kept.writers.len() >= 60);
         let mut alone = KeptMessages::default();
-        let mut last = message(1, "a", 1, 1, 40_000_000_usize.min(16_000_000));
+        let mut last = message(1, "a", 1, 1, 16_000_000);
         alone.keep(now, TOPIC, Scope::Node, &last);
         last = message(1, "a", 1, 2, 16_000_000);
         alone.keep(now, TOPIC, Scope::Node, &last);

@@ -15,6 +15,7 @@ use blaze_proto::link::link_control::RouteState;
 
 use super::Registry;
 use super::announce::MAX_ENTRIES;
+use super::remote::Remote;
 use super::wire::MAX_ROUTES;
 use crate::world::{Carrying, Part, Reach};
 
@@ -180,7 +181,7 @@ impl Registry {
         };
         let carried = view.parts.iter().filter(|(_, part)| part.carrying == Carrying::Carries);
         let topics: Vec<TopicName> = carried.map(|(topic, _)| topic.clone()).collect();
-        let sign = self.remotes.get(flow).and_then(|remote| remote.last_sign_ms());
+        let sign = self.remotes.get(flow).and_then(Remote::last_sign_ms);
         for topic in topics {
             if let Some(last_ms) = sign {
                 let since = Begin::Since {

@@ -289,7 +289,11 @@ fn a_replica_names_the_one_that_carries_the_topic() {
     );
     setup.route(&owner.to_string(), Some("c/x"), StepKind::Deliver, WhyCode::Ok);
     let why = setup.why();
-    assert_eq!((why.verdict, why.code), (Verdict::Flowing, WhyCode::Ok), "it says that it flows");
+    assert_eq!(
+        (why.verdict, why.code),
+        (Verdict::Flowing, WhyCode::Ok),
+        "it says that it flows"
+    );
     let named = why.steps.iter().find(|step| step.code == WhyCode::NotOwner).unwrap();
     assert!(named.ok && named.detail.contains(&owner.to_string()), "{named:?}");
 }

@@ -158,7 +158,7 @@ fn one_that_is_silent_is_gone_and_what_it_carried_begins_a_second_before_its_las
 
 #[test]
 fn after_a_crash_best_effort_topics_begin_at_the_end_and_old_places_are_forgotten() {
-    for (reliable, wait) in [(false, 0 * MS), (true, LEGACY)] {
+    for (reliable, wait) in [(false, Duration::ZERO), (true, LEGACY)] {
         let mut pair = Pair::new(0);
         pair.carries(0, &Carrying::Carries);
         pair.run(1000 * MS);
