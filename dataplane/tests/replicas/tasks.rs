@@ -43,7 +43,8 @@ impl World {
                     content: record.content.clone(),
                     at: now,
                     broker_age_us: 0,
-                    place: (scope == Scope::Layer).then(|| Place {
+                    kept: false,
+                    place: (scope == Scope::Layer).then_some(Place {
                         partition: 0,
                         offset: *next as i64,
                         appended_ms: None,
@@ -163,7 +164,7 @@ impl World {
                 options: PublisherOptions::default(),
             })
         });
-        flow.plane.deliver_early(now, id);
+        flow.plane.deliver_waiting(now, id);
         let stopped_at = flow.plane.core.stopped_at(id);
         for scope in [Scope::Node, Scope::Layer] {
             let key = (topic.clone(), scope);

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::Content;
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, LayerKind, Origin, Scope, TopicName, WriterId};
 use blaze_flow::control::{ControlConfig, ControlCore};
 use blaze_flow::flow::plane::PlaneState;
@@ -115,6 +116,7 @@ impl World {
             layer_names: LayerNames::Any,
             lease_stores: BTreeSet::new(),
             rules: PlanRules::default(),
+            access: AccessRules::default(),
         };
         let core = DataCore::new(DataConfig {
             me: id.clone(),
