@@ -120,7 +120,8 @@ fn blast(rate: u64) -> anyhow::Result<[f64; 2]> {
     const PAYLOAD: usize = 1_372;
     let shape = Shape {
         rate: Some(rate),
-        queue: 250_000,
+        // 0.3 s: longer than the sender waits for the processor on a busy machine, so that the link is never idle.
+        queue: rate * 3 / 80,
         delay: 25 * MS,
         ..Shape::default()
     };
