@@ -38,7 +38,7 @@ pub enum OpenError {
 pub fn check_layer(section: &LayerBroker) -> Result<(), OpenError> {
     match section {
         LayerBroker::Memory => Ok(()),
-        LayerBroker::Dds(dds) => DdsBroker::check(dds).map_err(dds_error),
+        LayerBroker::Dds(dds) => DdsBroker::check(dds).map_err(|error| dds_error(&error)),
         #[cfg(feature = "kafka")]
         LayerBroker::Kafka(kafka) => crate::kafka::KafkaBroker::check(kafka),
         #[cfg(not(feature = "kafka"))]
@@ -64,7 +64,7 @@ pub fn open_node(section: &NodeBroker, role: &Role) -> Result<Arc<dyn Broker>, O
 pub fn open_layer(section: &LayerBroker, role: &Role) -> Result<Arc<dyn Broker>, OpenError> {
     match section {
         LayerBroker::Memory => Err(OpenError::InProcess),
-        LayerBroker::Dds(dds) => Ok(Arc::new(DdsBroker::open(dds).map_err(dds_error)?)),
+        LayerBroker::Dds(dds) => Ok(Arc::new(DdsBroker::open(dds).map_err(|error| dds_error(&error))?)),
         #[cfg(feature = "kafka")]
         LayerBroker::Kafka(kafka) => Ok(Arc::new(crate::kafka::KafkaBroker::open(kafka, role)?)),
         #[cfg(not(feature = "kafka"))]
@@ -75,8 +75,8 @@ pub fn open_layer(section: &LayerBroker, role: &Role) -> Result<Arc<dyn Broker>,
     }
 }
 
-fn dds_error(error: DdsError) -> OpenError {
-    let key = match &error {
+fn dds_error(error: &DdsError) -> OpenError {
+    let key = match error {
         DdsError::Domain(_) => "dds.domain",
         DdsError::Address(_) | DdsError::AddressMissing { .. } => "dds.interface",
         DdsError::Create { .. } | DdsError::Panicked(_) => "dds",
