@@ -2,16 +2,21 @@
 
 use std::net::Ipv4Addr;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
 
 use anyhow::Context as _;
 
 use super::link::{Link, LinkProcess};
-use super::namespace::{Namespace, batch, check_rights};
+use super::namespace::{Namespace, batch, check_rights, run};
 use super::plan::Plan;
 use super::routes::{Network, networks, routes};
+use crate::wait;
 
 /// Packets that a device holds for `blaze-wan` while it waits for the processor: 10,000 are 90 ms at 160 Mbit/s.
 const DEVICE_QUEUE: u32 = 10_000;
+
+/// Measured: at most 1 s. The rest is for a machine that does much else.
+const PORTS: Duration = Duration::from_secs(10);
 
 /// A host: its namespace, and the address under which everybody reaches it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -42,11 +47,11 @@ impl Topology {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         check_rights()?;
         let networks = networks(plan)?;
-        let run = format!("blaze-{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
+        let prefix = format!("blaze-{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed));
         let mut namespaces = Vec::new();
         let mut hosts = Vec::new();
         for (index, name) in plan.hosts.iter().enumerate() {
-            let namespace = Namespace::new(format!("{run}t{index}"))?;
+            let namespace = Namespace::new(format!("{prefix}t{index}"))?;
             let first = |network: &Network| network.members.iter().find(|member| member.host == index).cloned();
             let first = networks.iter().find_map(first).context("a host without an interface")?;
             hosts.push(Host {
@@ -57,7 +62,7 @@ impl Topology {
             namespaces.push(namespace);
         }
         if !plan.segments.is_empty() {
-            let switch = Namespace::new(format!("{run}ts"))?;
+            let switch = Namespace::new(format!("{prefix}ts"))?;
             build_segments(plan, &networks, &hosts, &switch)?;
             namespaces.push(switch);
         }
@@ -124,7 +129,22 @@ fn build_segments(plan: &Plan, networks: &[Network], hosts: &[Host], switch: &Na
             ports.push(format!("link set {port} up"));
         }
     }
-    batch(switch.name(), &ports)
+    batch(switch.name(), &ports)?;
+    let members: usize = plan.segments.iter().map(|segment| segment.members.len()).sum();
+    forwarding(switch, members)
+}
+
+/// Waits until every port of the switches forwards: the kernel opens them up to a second after they were set up, and until
+/// then multicast is lost without a word.
+fn forwarding(switch: &Namespace, ports: usize) -> anyhow::Result<()> {
+    let list = || run(&format!("ip -n {} -d link show type bridge_slave", switch.name())).unwrap_or_default();
+    wait::until(
+        "every port of the switches forwards",
+        PORTS,
+        || list().matches("bridge_slave state forwarding").count() == ports,
+        list,
+    )?;
+    Ok(())
 }
 
 fn build_link(link: &super::WanLink, network: &Network, hosts: &[Host]) -> anyhow::Result<LinkProcess> {

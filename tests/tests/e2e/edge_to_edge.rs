@@ -135,7 +135,7 @@ fn a_topic_goes_from_node_to_node_over_the_layer() -> anyhow::Result<()> {
 
     let ids = |robot: &FlowProcess| robot.bridges_up();
     assert_eq!(ids(&robots.robots[0]), [format!("{TOPIC}|node>layer|edge")]);
-    assert_eq!(ids(&robots.robots[1]), [format!("{TOPIC}|layer>node|edge")]);
+    assert_eq!(ids(&robots.robots[1]), [format!("{TOPIC}|layer>node|edge|bare")]);
     let bridge = &robots.robots[1].bridges()[0];
     assert_eq!(
         (text(&bridge["from"]["broker"]), text(&bridge["to"]["broker"])),

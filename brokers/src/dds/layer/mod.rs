@@ -8,8 +8,8 @@
 //! ```
 //!
 //! There is no server: the broker is up while a participant stands on the interface. A participant that dies without a
-//! good-bye would hold the windows of all reliable writers for as long as its lease; [`presence`] finds it, and
-//! [`farewell`] says good-bye in its name, to the own participant only.
+//! good-bye would hold the windows of all reliable writers for as long as its lease; `presence` finds it, and
+//! `farewell` says good-bye in its name, to the own participant only.
 
 mod channel;
 mod deliver;

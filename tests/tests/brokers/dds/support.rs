@@ -23,6 +23,8 @@ pub(super) const DEADLINE: Duration = Duration::from_secs(20);
 /// want their time.
 pub(super) struct Domain {
     pub(super) id: u16,
+    /// Threads of participants that other tests made hang.
+    before: Vec<String>,
     _turn: MutexGuard<'static, ()>,
 }
 
@@ -32,6 +34,7 @@ impl Domain {
         let turn = TURN.lock().await;
         Self {
             id: free_domain().unwrap(),
+            before: own_threads(),
             _turn: turn,
         }
     }
@@ -82,7 +85,8 @@ impl Fixture for Domain {
     async fn leftovers(&self) -> Vec<String> {
         let until = Instant::now() + DEADLINE;
         loop {
-            let threads = own_threads();
+            let mut threads = own_threads();
+            threads.retain(|thread| !self.before.contains(thread));
             if threads.is_empty() || Instant::now() > until {
                 return threads;
             }
@@ -91,13 +95,15 @@ impl Fixture for Domain {
     }
 }
 
-/// Threads of participants in this process, by name.
+/// Threads of participants in this process: number and name.
 fn own_threads() -> Vec<String> {
     let names = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
     names
-        .filter_map(|task| std::fs::read_to_string(task.path().join("comm")).ok())
-        .map(|name| name.trim().to_owned())
-        .filter(|name| name.starts_with("dds-") || name.starts_with("RustDDS"))
+        .filter_map(|task| {
+            let name = std::fs::read_to_string(task.path().join("comm")).ok()?;
+            let is_ours = name.starts_with("dds-") || name.starts_with("RustDDS");
+            is_ours.then(|| format!("{} {}", task.file_name().display(), name.trim()))
+        })
         .collect()
 }
 
