@@ -76,7 +76,7 @@ pub fn open_layer(section: &LayerBroker, role: &Role) -> Result<Arc<dyn Broker>,
 }
 
 fn dds_error(error: &DdsError) -> OpenError {
-    let key = match &error {
+    let key = match error {
         DdsError::Domain(_) => "dds.domain",
         DdsError::Address(_) | DdsError::AddressMissing { .. } => "dds.interface",
         DdsError::Create { .. } | DdsError::Panicked(_) => "dds",
