@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use crate::admin::Admin;
 use crate::network::Host;
-use crate::process::{Process, Signal};
+use crate::process::{Process, Signal, Usage};
 use crate::wait;
 
 /// Where a flow must say `ready`, on a busy machine.
@@ -29,7 +29,7 @@ pub struct FlowSpec {
     pub redis: Option<(String, String)>,
     /// Address and prefix of the layer scope's Kafka.
     pub kafka: Option<(String, String)>,
-    /// DDS domain of the layer scope, on loopback.
+    /// DDS domain of the layer scope, on loopback or its host's address.
     pub layer_domain: Option<u16>,
     /// DDS domain of the inter scope, on loopback or its host's address.
     pub domain: Option<u16>,
@@ -79,7 +79,7 @@ impl FlowSpec {
         self
     }
 
-    /// With a DDS domain on loopback as layer scope.
+    /// With a DDS domain as layer scope.
     #[must_use]
     pub fn on_dds(mut self, domain: u16) -> Self {
         self.layer_domain = Some(domain);
@@ -118,14 +118,14 @@ impl FlowSpec {
                 "  layer: {{ kafka: {{ bootstrap: [\"{bootstrap}\"], prefix: \"{prefix}\" }} }}"
             );
         }
+        let listen = self.host.as_ref().map_or(Ipv4Addr::LOCALHOST, |host| host.address);
         if let Some(domain) = self.layer_domain {
             let _ = writeln!(
                 text,
-                "  layer: {{ dds: {{ domain: {domain}, interface: \"127.0.0.1\" }} }}"
+                "  layer: {{ dds: {{ domain: {domain}, interface: \"{listen}\" }} }}"
             );
         }
         if let Some(domain) = self.domain {
-            let listen = self.host.as_ref().map_or(Ipv4Addr::LOCALHOST, |host| host.address);
             let peers = match (&self.host, &self.peers[..]) {
                 (None, []) => &[Ipv4Addr::LOCALHOST],
                 (_, peers) => peers,
@@ -335,6 +335,14 @@ impl FlowProcess {
     pub fn rss_kib(&self) -> anyhow::Result<u64> {
         let bytes = self.process.resident_bytes().context("the process has gone")?;
         Ok(bytes / 1024)
+    }
+
+    /// What it holds of the machine now.
+    ///
+    /// # Errors
+    /// When the process has gone.
+    pub fn usage(&self) -> anyhow::Result<Usage> {
+        self.process.usage().context("the process has gone")
     }
 
     /// CPU time that it has used.

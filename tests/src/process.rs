@@ -46,6 +46,29 @@ pub fn hurry() {
 
 type Lines = Arc<Mutex<Vec<String>>>;
 
+/// What a process holds of its machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Usage {
+    /// Resident memory in KiB.
+    pub resident_kib: u64,
+    /// Threads.
+    pub threads: u64,
+    /// Open file descriptors.
+    pub descriptors: u64,
+}
+
+impl std::fmt::Display for Usage {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "{:.1} MiB, {} threads, {} descriptors",
+            self.resident_kib as f64 / 1024.0,
+            self.threads,
+            self.descriptors
+        )
+    }
+}
+
 /// A running process; it is killed when dropped.
 pub struct Process {
     child: Child,
@@ -172,10 +195,23 @@ impl Process {
     /// Resident memory in bytes; `None` when it does not run.
     #[must_use]
     pub fn resident_bytes(&self) -> Option<u64> {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).ok()?;
-        let line = status.lines().find(|line| line.starts_with("VmRSS:"))?;
-        let kilobytes: u64 = line.split_whitespace().nth(1)?.parse().ok()?;
-        Some(kilobytes * 1024)
+        Some(self.usage()?.resident_kib * 1024)
+    }
+
+    /// What it holds of the machine now; `None` when it does not run.
+    #[must_use]
+    pub fn usage(&self) -> Option<Usage> {
+        let id = self.child.id();
+        let status = std::fs::read_to_string(format!("/proc/{id}/status")).ok()?;
+        let number = |name: &str| {
+            let line = status.lines().find(|line| line.starts_with(name))?;
+            line.split_whitespace().nth(1)?.parse::<u64>().ok()
+        };
+        Some(Usage {
+            resident_kib: number("VmRSS:")?,
+            threads: number("Threads:")?,
+            descriptors: std::fs::read_dir(format!("/proc/{id}/fd")).ok()?.count() as u64,
+        })
     }
 
     /// Whether it still runs.

@@ -9,6 +9,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use blaze_domain::control::LeaseKind;
 use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
 use blaze_runtime::config::{Loaded, LocatedFault, Place, Schema, Sources, load_typed};
 
@@ -77,16 +78,24 @@ fn the_documented_example_has_no_fault_and_a_warning_for_each_section_without_ef
 
 #[test]
 fn the_documentation_shows_that_example_and_one_without_a_warning() {
-    let [today, complete] = documented()[..] else {
+    let [today, complete, access] = documented()[..] else {
         panic!("{} blocks of YAML", documented().len());
     };
     assert_eq!(complete, FIXTURE);
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("blaze.yaml");
     std::fs::write(&file, today).unwrap();
-    let loaded = load(file).unwrap_or_else(|faults| panic!("{faults:?}"));
+    let loaded = load(file.clone()).unwrap_or_else(|faults| panic!("{faults:?}"));
     assert!(loaded.warnings.is_empty(), "{:?}", loaded.warnings);
     assert_eq!(loaded.value.flow.bandwidth.limit_mbps, 40.0);
+    // The part about access is one of a file that has the rest.
+    std::fs::write(&file, today.replace("flow:\n", access)).unwrap();
+    let loaded = load(file).unwrap_or_else(|faults| panic!("{faults:?}"));
+    let allows = |topic: &str, service: &str| {
+        let rules = loaded.value.flow.access.of(&topic.parse().unwrap());
+        rules.allows(LeaseKind::Advertise, "edge", "robot-1", service)
+    };
+    assert!(allows("cmd_vel", "joystick") && !allows("cmd_vel", "planner") && allows("imu/data", "planner"));
 }
 
 #[test]

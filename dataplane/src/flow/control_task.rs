@@ -74,6 +74,9 @@ impl ControlTask {
             }
             self.take_control(Scope::Node, &mut of_node);
             self.take_control(Scope::Layer, &mut of_layer);
+            for (hears, channel) in self.shared.hears.iter().zip([&node, &layer]) {
+                hears.store(channel.is_settled(), Ordering::Relaxed);
+            }
             let overrun = node.take_dropped() + layer.take_dropped();
             if overrun > 0 {
                 tracing::warn!(overrun, "control messages came faster than they could be read");

@@ -56,6 +56,11 @@ pub(super) async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: 
                 Health::Up if shared.control.lock().is_reading_leases(scope) => {
                     (CheckStatus::Failed, format!("{}: reading leases", status.detail))
                 }
+                // A control message that is sent to a flow that is ready is heard.
+                Health::Up if !shared.hears(scope) => (
+                    CheckStatus::Failed,
+                    format!("{}: control channel not read yet", status.detail),
+                ),
                 Health::Up => (CheckStatus::Ok, status.detail),
                 _ => (CheckStatus::Failed, status.detail),
             };

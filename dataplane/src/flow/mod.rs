@@ -27,7 +27,7 @@ use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicU64;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
@@ -136,11 +136,18 @@ pub(crate) struct Shared {
     pub(crate) egress: Arc<Egress>,
     pub(crate) live: Mutex<LiveSettings>,
     pub(crate) readiness: Readiness,
+    /// Whether the control channels of node and layer are read.
+    pub(crate) hears: [AtomicBool; 2],
     /// When the flow started, in seconds since 1970.
     pub(crate) started_s: f64,
 }
 
 impl Shared {
+    /// Whether control messages of a scope are heard.
+    pub(crate) fn hears(&self, scope: Scope) -> bool {
+        self.hears[usize::from(scope == Scope::Layer)].load(Ordering::Relaxed)
+    }
+
     /// Tells the link what its Hellos say of this flow's traffic, and the wall clock, which may have been set.
     fn tell_link(&self) {
         let now = Instant::now();
@@ -289,6 +296,7 @@ pub async fn start_with(
         egress,
         live: Mutex::new(settings.live),
         readiness: readiness.clone(),
+        hears: Default::default(),
         started_s: wall_ns() as f64 / 1e9,
     });
 

@@ -12,10 +12,11 @@ mod run;
 use std::time::Duration;
 
 use crate::network::Plan;
+use crate::process::Usage;
 use crate::wan::{Change, Ways};
 
-pub use report::{Report, Route};
-pub use run::run;
+pub use report::{FlowReport, Report, Route};
+pub use run::{Running, Since, run};
 
 /// A run of processes on a network.
 #[derive(Debug, Clone, PartialEq)]
@@ -77,6 +78,8 @@ pub struct Flow {
     pub host: &'static str,
     /// Names of servers: Redis or Valkey is its node scope, Kafka its layer scope.
     pub brokers: Vec<&'static str>,
+    /// DDS domain of its layer scope, on its host's network.
+    pub layer_domain: Option<u16>,
     /// Hosts of flows that it is told of.
     pub peers: Vec<&'static str>,
     /// `flow.bandwidth.limit_mbps`
@@ -145,4 +148,8 @@ pub enum Expect {
     Received(&'static str, &'static str, u64),
     /// 99 of 100 take at most this long.
     P99(&'static str, &'static str, Duration),
+    /// In every flow every bridge has, in the end, `in = out + dropped + queued`.
+    Balanced,
+    /// No flow holds more in the end than a fifth of the time after the begin, but for this.
+    Growth(Usage),
 }

@@ -1,8 +1,10 @@
 //! What a scenario measured.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use super::Expect;
+use crate::process::Usage;
 
 /// One topic at one consumer.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -45,6 +47,8 @@ impl Route {
             Expect::P99(_, _, most) => self
                 .latency_ms(0.99)
                 .is_some_and(|p99| Duration::from_secs_f64(p99 / 1e3) <= *most),
+            // Of flows, not of routes.
+            Expect::Balanced | Expect::Growth(_) => true,
         };
         (!holds).then(|| format!("{expect:?} does not hold: {self}"))
     }
@@ -73,6 +77,48 @@ impl std::fmt::Display for Route {
     }
 }
 
+/// One flow.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct FlowReport {
+    /// Its node.
+    pub node: String,
+    /// What it held once it was warm.
+    pub warm: Usage,
+    /// What it holds in the end.
+    pub last: Usage,
+    /// Bridges that do not say where every message went.
+    pub unbalanced: Vec<String>,
+    /// What its bridges dropped, by reason, since its last start.
+    pub dropped: BTreeMap<String, u64>,
+}
+
+impl FlowReport {
+    fn faults(&self, expect: &Expect) -> Option<String> {
+        match expect {
+            Expect::Balanced if !self.unbalanced.is_empty() => {
+                Some(format!("{}: {}", self.node, self.unbalanced.join("; ")))
+            }
+            Expect::Growth(most) => {
+                let held = self.last.resident_kib <= self.warm.resident_kib + most.resident_kib
+                    && self.last.threads <= self.warm.threads + most.threads
+                    && self.last.descriptors <= self.warm.descriptors + most.descriptors;
+                (!held).then(|| format!("{} grew from {} to {}", self.node, self.warm, self.last))
+            }
+            _ => None,
+        }
+    }
+}
+
+impl std::fmt::Display for FlowReport {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "{:<16} {}, before {}; dropped {:?}",
+            self.node, self.last, self.warm, self.dropped
+        )
+    }
+}
+
 /// All topics at all consumers.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Report {
@@ -80,6 +126,8 @@ pub struct Report {
     pub name: String,
     /// In the order of the scenario.
     pub routes: Vec<Route>,
+    /// By node.
+    pub flows: Vec<FlowReport>,
 }
 
 impl Report {
@@ -95,14 +143,17 @@ impl Report {
     /// # Errors
     /// Names all that does not, with the table.
     pub fn check(&self, expect: &[Expect]) -> anyhow::Result<()> {
-        let faults = expect.iter().filter_map(|expect| {
-            let (Expect::Whole(consumer, topic)
+        let faults = expect.iter().filter_map(|expect| match expect {
+            Expect::Whole(consumer, topic)
             | Expect::LostAtMost(consumer, topic, _)
             | Expect::Received(consumer, topic, _)
-            | Expect::P99(consumer, topic, _)) = expect;
-            match self.route(consumer, topic) {
+            | Expect::P99(consumer, topic, _) => match self.route(consumer, topic) {
                 Some(route) => route.faults(expect),
                 None => Some(format!("there is no {topic} at {consumer}")),
+            },
+            Expect::Balanced | Expect::Growth(_) => {
+                let faults: Vec<String> = self.flows.iter().filter_map(|flow| flow.faults(expect)).collect();
+                (!faults.is_empty()).then(|| faults.join("\n"))
             }
         });
         let faults: Vec<String> = faults.collect();
@@ -128,7 +179,8 @@ impl std::fmt::Display for Report {
             "p99/ms",
             "MAX/ms"
         )?;
-        self.routes.iter().try_for_each(|route| writeln!(f, "{route}"))
+        self.routes.iter().try_for_each(|route| writeln!(f, "{route}"))?;
+        self.flows.iter().try_for_each(|flow| writeln!(f, "{flow}"))
     }
 }
 
@@ -149,6 +201,7 @@ mod tests {
         Report {
             name: "a scenario".to_owned(),
             routes: vec![route],
+            flows: Vec::new(),
         }
     }
 
@@ -177,6 +230,31 @@ mod tests {
         ] {
             assert!(report.check(std::slice::from_ref(&wrong)).is_err(), "{wrong:?}");
         }
+    }
+
+    #[test]
+    fn flows_that_grow_or_lose_count_are_found() {
+        let usage = |resident_kib, threads, descriptors| Usage {
+            resident_kib,
+            threads,
+            descriptors,
+        };
+        let mut report = report();
+        report.flows.push(FlowReport {
+            node: "cloud-1".to_owned(),
+            warm: usage(1_000, 10, 20),
+            last: usage(1_100, 11, 20),
+            ..FlowReport::default()
+        });
+        report
+            .check(&[Expect::Balanced, Expect::Growth(usage(100, 1, 0))])
+            .unwrap();
+        for most in [usage(99, 1, 0), usage(100, 0, 0)] {
+            assert!(report.check(&[Expect::Growth(most)]).is_err(), "{most}");
+        }
+        report.flows[0].unbalanced.push("imu: in 3, out 2".to_owned());
+        let error = report.check(&[Expect::Balanced]).unwrap_err();
+        assert!(error.to_string().contains("cloud-1: imu: in 3, out 2"), "{error}");
     }
 
     #[test]

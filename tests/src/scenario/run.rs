@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use serde_json::Value;
 
-use super::{Broker, BrokerKind, Fault, Flow, Report, Route, Scenario, Service, Stream};
+use super::{Broker, BrokerKind, Fault, Flow, FlowReport, Report, Route, Scenario, Service, Stream};
 use crate::flow::{FlowProcess, FlowSpec};
-use crate::network::{Host, Topology};
-use crate::process::{Process, Signal};
+use crate::network::{Host, Link, Topology};
+use crate::process::{Process, Signal, Usage};
 use crate::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer};
 use crate::wait;
 
@@ -19,6 +19,8 @@ const DOMAIN: u16 = 20;
 const START: Duration = Duration::from_secs(40);
 /// A row comes each second.
 const ROW: Duration = Duration::from_secs(10);
+/// The share of the time after which flows are warm: what they hold from then on is compared.
+const WARM: u32 = 5;
 /// Beyond the time that it is published for, so that services end after the runner has asked them.
 const SPARE: Duration = Duration::from_secs(600);
 
@@ -38,8 +40,9 @@ enum Server {
     Kafka(KafkaServer),
 }
 
-/// Everything that runs; fields end in this order.
-struct Running {
+/// The processes of a scenario, for tests that break and measure things themselves. They end when it is dropped.
+pub struct Running {
+    // Fields are dropped in this order.
     publishers: Vec<Probe>,
     consumers: Vec<Probe>,
     flows: BTreeMap<&'static str, FlowProcess>,
@@ -47,13 +50,21 @@ struct Running {
     topology: Topology,
 }
 
+/// A moment in the lives of the consumers.
+#[derive(Debug, Clone, Default)]
+pub struct Since(BTreeMap<&'static str, usize>);
+
 struct Probe {
     service: Service,
     process: Process,
 }
 
 impl Running {
-    fn start(scenario: &Scenario) -> anyhow::Result<Self> {
+    /// Starts everything and waits until it is ready; faults are not played.
+    ///
+    /// # Errors
+    /// As [`run`].
+    pub fn start(scenario: &Scenario) -> anyhow::Result<Self> {
         check(scenario)?;
         let topology = Topology::build(&scenario.network)?;
         let mut running = Self {
@@ -95,6 +106,7 @@ impl Running {
         spec.kind = flow.kind.to_owned();
         spec.limit_mbps = flow.limit_mbps;
         spec.extra = flow.extra.to_owned();
+        spec.layer_domain = flow.layer_domain;
         for name in &flow.brokers {
             spec = match self.broker(name)? {
                 Server::Redis(redis) => spec.on_redis(&redis.url(), ""),
@@ -135,30 +147,86 @@ impl Running {
         })
     }
 
-    fn play(&mut self, scenario: &Scenario) -> anyhow::Result<Report> {
+    /// Waits until every topic has reached every consumer that wants it.
+    ///
+    /// # Errors
+    /// When one has not in time.
+    pub fn wait_flowing(&self) -> anyhow::Result<()> {
         let arrives = |probe: &Probe| {
             let mut streams = probe.service.streams.iter();
             streams.all(|stream| probe.last(stream.topic, "received") > 0)
+        };
+        let missing = || {
+            let silent = self.consumers.iter().filter(|probe| !arrives(probe));
+            silent.map(|probe| probe.service.name).collect::<Vec<_>>().join(", ")
         };
         wait::until(
             "every topic reaches every consumer",
             START,
             || self.consumers.iter().all(arrives),
-            String::new,
+            || format!("not so for {}", missing()),
         )?;
+        Ok(())
+    }
+
+    /// A link, as [`Topology::link`].
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn link(&self, a: &str, b: &str) -> anyhow::Result<Link<'_>> {
+        self.topology.link(a, b)
+    }
+
+    /// A server with Redis' or Valkey's protocol.
+    ///
+    /// # Errors
+    /// When there is none of that name.
+    pub fn redis(&self, name: &str) -> anyhow::Result<&RedisServer> {
+        match self.broker(name)? {
+            Server::Redis(redis) => Ok(redis),
+            Server::Kafka(_) => anyhow::bail!("{name} is a Kafka"),
+        }
+    }
+
+    /// What a consumer measured of a topic from a moment on.
+    ///
+    /// # Errors
+    /// When there is no such consumer.
+    pub fn route(&self, consumer: &str, topic: &str, since: &Since) -> anyhow::Result<Route> {
+        let mut consumers = self.consumers.iter();
+        let probe = consumers.find(|probe| probe.service.name == consumer);
+        let probe = probe.with_context(|| format!("{consumer} is no consumer"))?;
+        let row = since.0.get(consumer).copied().unwrap_or(0);
+        let sent = self.publishers.iter().map(|probe| probe.last(topic, "sent")).max();
+        Ok(probe.route(topic, sent.unwrap_or(0), row))
+    }
+
+    /// The present, for [`Running::route`].
+    #[must_use]
+    pub fn now(&self) -> Since {
+        let row = |probe: &Probe| (probe.service.name, probe.process.stdout().len());
+        Since(self.consumers.iter().map(row).collect())
+    }
+
+    fn play(&mut self, scenario: &Scenario) -> anyhow::Result<Report> {
+        self.wait_flowing()?;
         let begin = Instant::now();
-        let rows: Vec<usize> = self
-            .consumers
-            .iter()
-            .map(|probe| probe.process.stdout().len())
-            .collect();
+        let rows = self.now();
+        let mut usage = None;
         let mut faults = scenario.faults.clone();
         faults.sort_by_key(|(at, _)| *at);
         for (at, fault) in &faults {
+            if usage.is_none() && *at > scenario.duration / WARM {
+                usage = Some(self.warm_usage(begin + scenario.duration / WARM)?);
+            }
             sleep_until(begin + *at);
             self.break_or_mend(fault)
                 .with_context(|| format!("{fault:?} at {at:?}"))?;
         }
+        let usage = match usage {
+            Some(usage) => usage,
+            None => self.warm_usage(begin + scenario.duration / WARM)?,
+        };
         sleep_until(begin + scenario.duration);
         let sent = self.stop_publishing()?;
         let all = |probe: &Probe| {
@@ -172,19 +240,51 @@ impl Running {
             || self.consumers.iter().all(all),
             String::new,
         );
-        let routes = self.consumers.iter().zip(rows).flat_map(|(probe, from)| {
+        let routes = self.consumers.iter().flat_map(|probe| {
             let sent = &sent;
+            let from = rows.0.get(probe.service.name).copied().unwrap_or(0);
             let streams = probe.service.streams.iter();
             streams.map(move |stream| probe.route(stream.topic, sent.get(stream.topic).copied().unwrap_or(0), from))
         });
         Ok(Report {
             name: scenario.name.to_owned(),
             routes: routes.collect(),
+            flows: self.flow_reports(&usage)?,
         })
     }
 
-    /// Messages published of each topic.
-    fn stop_publishing(&self) -> anyhow::Result<BTreeMap<&'static str, u64>> {
+    /// What the flows hold once they are warm; one that was killed just then is compared with what it begins with.
+    fn warm_usage(&self, at: Instant) -> anyhow::Result<BTreeMap<&'static str, Usage>> {
+        sleep_until(at);
+        let usage = self
+            .flows
+            .iter()
+            .map(|(node, flow)| Ok((*node, flow.usage().unwrap_or_default())));
+        usage.collect()
+    }
+
+    fn flow_reports(&mut self, warm: &BTreeMap<&'static str, Usage>) -> anyhow::Result<Vec<FlowReport>> {
+        let mut reports = Vec::new();
+        for (node, flow) in &mut self.flows {
+            flow.wait_ready()?;
+            // Messages may be on their way from one bridge to the next until the last has settled.
+            let _ = wait::until("bridges have settled", ROW, || unbalanced(flow).is_empty(), String::new);
+            reports.push(FlowReport {
+                node: (*node).to_owned(),
+                warm: warm.get(node).copied().unwrap_or_default(),
+                last: flow.usage()?,
+                unbalanced: unbalanced(flow),
+                dropped: dropped(flow),
+            });
+        }
+        Ok(reports)
+    }
+
+    /// Ends publishing and gives the number of messages published of each topic.
+    ///
+    /// # Errors
+    /// When a publisher does not end.
+    pub fn stop_publishing(&self) -> anyhow::Result<BTreeMap<&'static str, u64>> {
         let mut sent = BTreeMap::new();
         for probe in &self.publishers {
             probe.process.signal(Signal::USR1)?;
@@ -229,7 +329,11 @@ impl Running {
         self.brokers.get(name).with_context(|| format!("{name} is no broker"))
     }
 
-    fn flow(&self, node: &str) -> anyhow::Result<&FlowProcess> {
+    /// A flow, by its node.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn flow(&self, node: &str) -> anyhow::Result<&FlowProcess> {
         self.flows.get(node).with_context(|| format!("{node} is no flow"))
     }
 
@@ -237,7 +341,9 @@ impl Running {
         self.flows.get_mut(node).with_context(|| format!("{node} is no flow"))
     }
 
-    fn tails(&self) -> String {
+    /// The last lines of all processes.
+    #[must_use]
+    pub fn tails(&self) -> String {
         let flows = self
             .flows
             .iter()
@@ -282,6 +388,39 @@ impl Probe {
             latencies_ms,
         }
     }
+}
+
+/// Bridges that do not say where every message went.
+fn unbalanced(flow: &FlowProcess) -> Vec<String> {
+    let of = |bridge: &Value| {
+        let dropped: u64 = bridge["dropped"]
+            .as_object()
+            .map_or(0, |reasons| reasons.values().filter_map(Value::as_u64).sum());
+        let number = |value: &Value| value.as_u64().unwrap_or(0);
+        let (came, went, waits) = (
+            number(&bridge["in"]["messages"]),
+            number(&bridge["out"]["messages"]),
+            number(&bridge["queued"]),
+        );
+        (came != went + dropped + waits).then(|| {
+            format!(
+                "{}: in {came}, out {went}, dropped {dropped}, queued {waits}",
+                bridge["id"]
+            )
+        })
+    };
+    flow.bridges().iter().filter_map(of).collect()
+}
+
+/// What all bridges of a flow dropped, by reason.
+fn dropped(flow: &FlowProcess) -> BTreeMap<String, u64> {
+    let mut all = BTreeMap::new();
+    for bridge in flow.bridges() {
+        for (reason, count) in bridge["dropped"].as_object().into_iter().flatten() {
+            *all.entry(reason.clone()).or_default() += count.as_u64().unwrap_or(0);
+        }
+    }
+    all
 }
 
 /// Mistakes in the rows, before anything is started.

@@ -1,5 +1,6 @@
 //! A service with nothing but a Redis or Kafka client is part of the system.
 
+use anyhow::Context as _;
 use std::time::{Duration, Instant};
 
 use blaze_tests::flow::{FlowProcess, FlowSpec};
@@ -312,8 +313,13 @@ fn commands_come_only_from_whom_the_rules_allow() -> anyhow::Result<()> {
                "id": service, "reply_to": "blaze/reply/test"})
         .to_string()
     };
-    tell("blaze/flow/control", &op("request", "motor"))?;
-    assert_eq!(answers.next_json(SOON)?["ok"], true);
+    assert_eq!(
+        tell("blaze/flow/control", &op("request", "motor"))?,
+        1,
+        "the flow alone hears it"
+    );
+    let answer = answers.next_json(SOON).with_context(|| flow.tail())?;
+    assert_eq!(answer["ok"], true, "{answer}");
     tell("blaze/flow/control", &op("advertise", "planner"))?;
     let refused = answers.next_json(SOON)?;
     assert_eq!(refused["error"]["code"], "access_denied", "{refused}");

@@ -3,7 +3,9 @@
 //! Needs root, iproute2 and `/dev/net/tun`; scenarios need `scripts/services install` as well. Most measure time, so they run
 //! one after another. `BLAZE_LONG` selects the full durations.
 
+mod cuts;
 mod emulator;
+mod layers;
 mod proxy;
 mod scenario;
 mod support;

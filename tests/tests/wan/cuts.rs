@@ -1,0 +1,241 @@
+//! A link that is cut for longer than the time after which a flow counts as down: one way, the other way, and both.
+
+use std::time::{Duration, Instant};
+
+use blaze_tests::network::Plan;
+use blaze_tests::scenario::{Broker, BrokerKind, Flow, Running, Scenario, Stream};
+use blaze_tests::wait;
+use blaze_tests::wan::{Shape, Ways};
+use serde_json::Value;
+
+use super::layers::{IMU, service, stream};
+use super::support::turn;
+
+const EVENTS: &str = "robot/events";
+const SCANS: &str = "robot/scans";
+const LIMIT_MBPS: f64 = 20.0;
+/// As `limit_mbps` is meant: 1024² bit.
+const LIMIT_BYTES_PER_S: f64 = LIMIT_MBPS * 1_048_576.0 / 8.0;
+/// Beyond the limit in one second: what the test needs to ask twice.
+const METER_SLACK: f64 = 1.03;
+const CUT: Duration = Duration::from_secs(10);
+/// From the first Hello that gets through.
+const FLOWING: Duration = Duration::from_secs(1);
+/// How long the link is watched after it is healed.
+const WATCHED: Duration = Duration::from_secs(6);
+const IMU_LIFESPAN: Duration = Duration::from_secs(2);
+const SCAN_LIFESPAN: Duration = Duration::from_millis(500);
+/// From the link to the consumer's callback, on a busy machine; lifespans are the flows' business, not the consumer's.
+const DELIVERY: Duration = Duration::from_millis(300);
+
+/// Reliable ones with and without a lifespan, and more bulk than the limit allows.
+fn streams() -> Vec<Stream> {
+    vec![
+        Stream {
+            lifespan: IMU_LIFESPAN,
+            ..stream(IMU, 50.0, 320)
+        },
+        stream(EVENTS, 5.0, 200),
+        Stream {
+            reliable: false,
+            lifespan: SCAN_LIFESPAN,
+            ..stream(SCANS, 50.0, 100_000)
+        },
+    ]
+}
+
+fn scenario() -> Scenario {
+    let flow = |layer, node, broker, peers: &[&'static str]| Flow {
+        layer,
+        kind: "",
+        node,
+        host: node,
+        brokers: vec![broker],
+        layer_domain: None,
+        peers: peers.to_vec(),
+        limit_mbps: LIMIT_MBPS,
+        extra: "",
+    };
+    Scenario {
+        name: "a link that is cut",
+        network: Plan::new()
+            .with_hosts(&["robot-1", "cloud-1"])
+            .with_link("robot-1", "cloud-1", Shape::to_cloud()),
+        brokers: vec![
+            Broker {
+                name: "redis",
+                host: "robot-1",
+                kind: BrokerKind::Redis,
+            },
+            Broker {
+                name: "kafka",
+                host: "cloud-1",
+                kind: BrokerKind::Kafka,
+            },
+        ],
+        flows: vec![
+            flow("edge", "robot-1", "redis", &["cloud-1"]),
+            flow("cloud", "cloud-1", "kafka", &[]),
+        ],
+        publishers: vec![service("driver", "robot-1", "redis", streams())],
+        consumers: vec![service("recorder", "cloud-1", "kafka", streams())],
+        faults: vec![],
+        duration: Duration::ZERO,
+        settle: Duration::ZERO,
+        expect: vec![],
+    }
+}
+
+/// When one flow last heard of another.
+fn heard(running: &Running, of: &str, other: &str) -> Option<Instant> {
+    let now = Instant::now();
+    let peers = running.flow(of).ok()?.admin().json("/v1/peers").ok()?;
+    let peer = peers["peers"]
+        .as_array()?
+        .iter()
+        .find(|peer| peer["flow"].as_str().is_some_and(|flow| flow.ends_with(other)))?;
+    now.checked_sub(Duration::from_secs_f64(peer["last_heard_ms"].as_f64()? / 1e3))
+}
+
+/// Messages of a topic that the cloud has written to its Kafka.
+fn delivered(running: &Running, topic: &str) -> u64 {
+    let bridges = running.flow("cloud-1").map(|flow| flow.bridges()).unwrap_or_default();
+    let of_topic = bridges.iter().filter(|bridge| bridge["topic"] == topic);
+    of_topic.filter_map(|bridge| bridge["out"]["messages"].as_u64()).sum()
+}
+
+fn dropped(running: &Running, topic: &str) -> anyhow::Result<Value> {
+    let bridges = running.flow("robot-1")?.bridges();
+    let bridge = bridges.iter().find(|bridge| bridge["topic"] == topic);
+    Ok(bridge.map(|bridge| bridge["dropped"].clone()).unwrap_or_default())
+}
+
+fn total(dropped: &Value) -> u64 {
+    let reasons = dropped.as_object();
+    reasons.map_or(0, |reasons| reasons.values().filter_map(Value::as_u64).sum())
+}
+
+/// The largest share of the limit that went into the link within a second, of samples of its byte counter.
+fn busiest(samples: &[(Instant, u64)]) -> f64 {
+    let mut busiest: f64 = 0.0;
+    for (index, (from, before)) in samples.iter().enumerate() {
+        let later = samples[index..]
+            .iter()
+            .find(|(to, _)| *to >= *from + Duration::from_secs(1));
+        if let Some((to, after)) = later {
+            let rate = (after - before) as f64 / (*to - *from).as_secs_f64();
+            busiest = busiest.max(rate / LIMIT_BYTES_PER_S);
+        }
+    }
+    busiest
+}
+
+/// What is seen of the link and the flows after it is healed.
+struct Healed {
+    hello: Duration,
+    flowing: Duration,
+    busiest: f64,
+}
+
+fn watch(running: &Running, ways: Ways) -> anyhow::Result<Healed> {
+    let before = delivered(running, IMU);
+    let link = running.link("robot-1", "cloud-1")?;
+    let healed = Instant::now();
+    link.heal(ways)?;
+    let (mut hello, mut flowing, mut samples) = (None, None, Vec::new());
+    // Whoever heard nothing while the link was cut.
+    let deaf: &[(&str, &str)] = match ways {
+        Ways::Forward => &[("cloud-1", "robot-1")],
+        Ways::Back => &[("robot-1", "cloud-1")],
+        Ways::Both => &[("cloud-1", "robot-1"), ("robot-1", "cloud-1")],
+    };
+    wait::until(
+        "the link was watched long enough",
+        WATCHED * 2,
+        || {
+            samples.extend(link.stats().map(|stats| (Instant::now(), stats.forward.taken.bytes)));
+            if hello.is_none() {
+                let heard = deaf.iter().filter_map(|(of, other)| heard(running, of, other));
+                hello = heard.filter(|at| *at > healed).min();
+            }
+            if flowing.is_none() && delivered(running, IMU) > before {
+                flowing = Some(Instant::now());
+            }
+            healed.elapsed() > WATCHED && hello.is_some() && flowing.is_some()
+        },
+        || format!("{}\n{:?}", running.tails(), dropped(running, IMU)),
+    )?;
+    let since = |at: Option<Instant>| at.map_or(Duration::MAX, |at| at.saturating_duration_since(healed));
+    Ok(Healed {
+        hello: since(hello),
+        flowing: since(flowing),
+        busiest: busiest(&samples),
+    })
+}
+
+fn cut(running: &Running, ways: Ways) -> anyhow::Result<()> {
+    running.wait_flowing()?;
+    let since = running.now();
+    let before: Vec<u64> = [IMU, EVENTS, SCANS]
+        .iter()
+        .map(|topic| Ok(total(&dropped(running, topic)?)))
+        .collect::<anyhow::Result<_>>()?;
+    let began = Instant::now();
+    running.link("robot-1", "cloud-1")?.cut(ways)?;
+    // The length of the cut is what is tested.
+    std::thread::sleep(CUT.saturating_sub(began.elapsed()));
+    let healed = watch(running, ways)?;
+    println!(
+        "cut {ways:?} for {CUT:?}: first Hello {:.0?} after it was healed, flowing {:.0?} after; busiest second {:.1} % of the limit",
+        healed.hello,
+        healed.flowing,
+        healed.busiest * 100.0
+    );
+    anyhow::ensure!(healed.flowing <= healed.hello + FLOWING, "{ways:?}: too late");
+    anyhow::ensure!(healed.busiest <= METER_SLACK, "{ways:?}: more than the limit");
+    for ((stream, before), lifespan) in
+        streams()
+            .iter()
+            .zip(before)
+            .zip([Some(IMU_LIFESPAN), None, Some(SCAN_LIFESPAN)])
+    {
+        let topic = stream.topic;
+        let (route, dropped) = (running.route("recorder", topic, &since)?, dropped(running, topic)?);
+        println!("  {route}\n    dropped since the start {dropped}");
+        anyhow::ensure!(
+            route.duplicated == 0 && route.reordered == 0,
+            "{ways:?}: twice or out of order: {route}"
+        );
+        // What is lost by the cut is counted where it was lost, with its reason.
+        anyhow::ensure!(
+            lifespan.is_none() || total(&dropped) > before,
+            "{ways:?}: nothing of {topic} was dropped: {dropped}"
+        );
+        if let Some(lifespan) = lifespan {
+            let oldest = route.latency_ms(1.0).unwrap_or_default();
+            anyhow::ensure!(
+                oldest <= (lifespan + DELIVERY).as_secs_f64() * 1e3,
+                "{ways:?}: {topic} of {oldest} ms arrived"
+            );
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn a_link_that_is_cut_and_healed() -> anyhow::Result<()> {
+    let _turn = turn();
+    let running = Running::start(&scenario())?;
+    for ways in [Ways::Forward, Ways::Back, Ways::Both] {
+        cut(&running, ways)?;
+    }
+    let robot = running.flow("robot-1")?;
+    let metric = |name, label| robot.admin().metric(name, &[label]).unwrap_or_default();
+    println!(
+        "counted by the robot: lifespan {}, link_down {}, queue_full {}",
+        metric("blaze_flow_dropped_total", "reason=\"lifespan\""),
+        metric("blaze_flow_dropped_total", "reason=\"link_down\""),
+        metric("blaze_flow_dropped_total", "reason=\"queue_full\"")
+    );
+    Ok(())
+}
