@@ -10,6 +10,8 @@ pub mod process;
 pub mod proxy;
 pub mod scenario;
 pub mod servers;
+#[cfg(feature = "kafka")]
+pub mod stream;
 pub mod wait;
 pub mod wan;
 

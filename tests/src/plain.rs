@@ -105,6 +105,23 @@ impl KafkaReader {
     }
 }
 
+/// A plain connection to Redis.
+///
+/// # Errors
+/// When the server does not answer within two seconds.
+pub fn connect(url: &str) -> anyhow::Result<redis::Connection> {
+    Ok(redis::Client::open(url)?.get_connection_with_timeout(Duration::from_secs(2))?)
+}
+
+/// Publishes on a Redis channel, as `redis-cli publish` does. Gives how many heard it.
+///
+/// # Errors
+/// When the server does not answer within two seconds.
+pub fn publish(url: &str, channel: &str, payload: &[u8]) -> anyhow::Result<i64> {
+    let mut command = redis::cmd("PUBLISH");
+    Ok(command.arg(channel).arg(payload).query(&mut connect(url)?)?)
+}
+
 /// A subscriber of one Redis channel that knows nothing of frames.
 pub struct RedisReader {
     connection: redis::Connection,

@@ -11,8 +11,8 @@ use blaze_tests::servers::{
 use blaze_tests::wait;
 use serde_json::json;
 
-use crate::stream::Stream;
 use crate::support::{RedisReader, RobotAndCloud, SOON, connect, turn};
+use blaze_tests::stream::Stream;
 
 const TOPIC: &str = "imu/data";
 

@@ -10,8 +10,8 @@ use blaze_tests::servers::{
 use blaze_tests::wait;
 use serde_json::{Value, json};
 
-use crate::stream::{Arrival, Stream};
 use crate::support::{SOON, connect, turn};
+use blaze_tests::stream::{Arrival, Stream};
 
 const TOPIC: &str = "imu/data";
 /// Payload: large enough that what piles up would be seen.

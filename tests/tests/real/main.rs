@@ -3,6 +3,8 @@
 #![cfg(feature = "kafka")]
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
+mod again;
+mod churn;
 mod contract;
 mod demo;
 mod frozen;
@@ -10,5 +12,5 @@ mod garbage;
 mod plain_clients;
 mod replicas;
 mod restarts;
-mod stream;
+mod scale;
 mod support;

@@ -8,8 +8,8 @@ use blaze_tests::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, R
 use blaze_tests::wait;
 use serde_json::{Value, json};
 
-use crate::stream::Stream;
 use crate::support::{RobotAndCloud, SOON, turn};
+use blaze_tests::stream::Stream;
 
 const TOPIC: &str = "imu/data";
 /// After whatever was killed answers again, messages must flow within this time.

@@ -4,8 +4,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
-use blaze_tests::plain::KafkaWriter;
-pub(crate) use blaze_tests::plain::RedisReader;
+use blaze_tests::plain::{self, KafkaWriter};
+pub(crate) use blaze_tests::plain::{RedisReader, connect};
 use blaze_tests::servers::unique_name;
 
 /// Where something must happen, on a busy machine.
@@ -65,11 +65,7 @@ impl RobotAndCloud {
 
     /// PUBLISH on the robot's Redis, as `redis-cli publish` does. Gives how many heard it.
     pub(crate) fn publish(&self, channel: &str, payload: &[u8]) -> anyhow::Result<i64> {
-        let mut connection = connect(&self.redis)?;
-        Ok(redis::cmd("PUBLISH")
-            .arg(self.channel(channel))
-            .arg(payload)
-            .query(&mut connection)?)
+        plain::publish(&self.redis, &self.channel(channel), payload)
     }
 
     /// A control message on the robot's Redis.
@@ -83,9 +79,4 @@ impl RobotAndCloud {
     pub(crate) fn tell_cloud(&self, message: &serde_json::Value) -> anyhow::Result<()> {
         KafkaWriter::new(&self.kafka)?.produce(&self.topic("blaze/flow/control"), message.to_string().as_bytes())
     }
-}
-
-/// A plain connection to Redis.
-pub(crate) fn connect(url: &str) -> anyhow::Result<redis::Connection> {
-    Ok(redis::Client::open(url)?.get_connection_with_timeout(Duration::from_secs(2))?)
 }

@@ -5,6 +5,7 @@
 
 mod cuts;
 mod emulator;
+mod joins;
 mod layers;
 mod proxy;
 mod scenario;

@@ -42,7 +42,11 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
         .map(|row| replica_row(&control, row))
         .collect();
     drop(control);
-    answer(&shared, json!({"peers": rows, "replicas": replicas}))
+    let link = shared.transport.as_ref().map(|transport| {
+        let status = transport.status();
+        json!({"endpoints": status.endpoints, "addresses": status.addresses, "participants_rebuilt": status.rebuilds})
+    });
+    answer(&shared, json!({"peers": rows, "replicas": replicas, "link": link}))
 }
 
 /// A flow that shares the layer broker, as it is heard there.

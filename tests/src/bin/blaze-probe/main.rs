@@ -46,6 +46,9 @@ pub(crate) struct Options {
     /// On the Kafka of a layer scope instead: HOST:PORT
     #[arg(long, conflicts_with = "listen", requires = "layer", requires = "node")]
     pub(crate) kafka: Option<String>,
+    /// Before all names on that server
+    #[arg(long, default_value = "", conflicts_with = "listen")]
+    pub(crate) prefix: String,
     /// Layer of the flow
     #[arg(long)]
     pub(crate) layer: Option<LayerName>,

@@ -62,7 +62,7 @@ impl Site {
             (Some(url), _) => {
                 let section = RedisBroker {
                     url: url.clone().into(),
-                    prefix: String::new(),
+                    prefix: options.prefix.clone(),
                     user: None,
                     password_file: None,
                     tls: None,
@@ -72,7 +72,7 @@ impl Site {
             (None, Some(bootstrap)) => {
                 let section = KafkaBroker {
                     bootstrap: vec![bootstrap.clone()],
-                    prefix: String::new(),
+                    prefix: options.prefix.clone(),
                     properties: BTreeMap::new(),
                 };
                 let section = blaze_domain::node_file::LayerBroker::Kafka(section);

@@ -6,25 +6,25 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use blaze_tests::plain::KafkaReader;
 use parking_lot::Mutex;
 
-use crate::support::connect;
+use crate::network::{Host, inside};
+use crate::plain::{self, KafkaReader};
 
 /// Messages per second.
-pub(crate) const RATE_HZ: u64 = 50;
+pub const RATE_HZ: u64 = 50;
 
 /// One arrival.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Arrival {
+pub struct Arrival {
     /// Number of the message.
-    pub(crate) number: u64,
+    pub number: u64,
     /// When it came.
-    pub(crate) at: Instant,
+    pub at: Instant,
     /// How long it took.
-    pub(crate) took: Duration,
+    pub took: Duration,
     /// Size of its payload.
-    pub(crate) bytes: usize,
+    pub bytes: usize,
 }
 
 #[derive(Default)]
@@ -35,7 +35,7 @@ struct Shared {
 }
 
 /// The stream; it ends when dropped.
-pub(crate) struct Stream {
+pub struct Stream {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
 }
@@ -43,13 +43,42 @@ pub(crate) struct Stream {
 impl Stream {
     /// Publishes payloads of that size on a Redis channel at [`RATE_HZ`] and reads a Kafka topic. Both ends wait out a server
     /// that is away.
-    pub(crate) fn start(redis: &str, channel: &str, kafka: &str, topic: &str, bytes: usize) -> anyhow::Result<Self> {
+    ///
+    /// # Errors
+    /// When the topic is not there within ten seconds.
+    pub fn start(redis: &str, channel: &str, kafka: &str, topic: &str, bytes: usize) -> anyhow::Result<Self> {
+        let reader = KafkaReader::from_end(kafka, topic)?;
+        let (redis, channel) = (redis.to_owned(), channel.to_owned());
+        Ok(Self::with(reader, move |shared, base| {
+            publish(shared, base, &redis, &channel, bytes);
+        }))
+    }
+
+    /// The same between two hosts of a network, each beside its server.
+    ///
+    /// # Errors
+    /// As [`Stream::start`], and when a host has gone.
+    pub fn between(
+        (from, redis, channel): (&Host, &str, &str),
+        (to, kafka, topic): (&Host, &str, &str),
+        bytes: usize,
+    ) -> anyhow::Result<Self> {
+        let reader = inside(&to.namespace, || KafkaReader::from_end(kafka, topic))?;
+        let (namespace, redis, channel) = (from.namespace.clone(), redis.to_owned(), channel.to_owned());
+        Ok(Self::with(reader, move |shared, base| {
+            // Without the namespace nothing is published, which whoever waits for it will tell.
+            let _ = inside(&namespace, || {
+                publish(shared, base, &redis, &channel, bytes);
+                Ok(())
+            });
+        }))
+    }
+
+    fn with(reader: KafkaReader, publish: impl FnOnce(&Shared, Instant) + Send + 'static) -> Self {
         let shared = Arc::<Shared>::default();
         let base = Instant::now();
-        let reader = KafkaReader::from_end(kafka, topic)?;
         let (of_source, of_sink) = (Arc::clone(&shared), Arc::clone(&shared));
-        let (redis, channel) = (redis.to_owned(), channel.to_owned());
-        let source = std::thread::spawn(move || publish(&of_source, base, &redis, &channel, bytes));
+        let source = std::thread::spawn(move || publish(&of_source, base));
         let sink = std::thread::spawn(move || {
             while !of_sink.stop.load(Ordering::Relaxed) {
                 let Some(record) = reader.next(Duration::from_millis(50)) else {
@@ -66,29 +95,35 @@ impl Stream {
                 }
             }
         });
-        Ok(Self {
+        Self {
             shared,
             threads: vec![source, sink],
-        })
+        }
     }
 
     /// Messages that a server took from the publisher.
-    pub(crate) fn published(&self) -> u64 {
+    #[must_use]
+    pub fn published(&self) -> u64 {
         self.shared.published.load(Ordering::Relaxed)
     }
 
     /// What arrived so far.
-    pub(crate) fn arrivals(&self) -> Vec<Arrival> {
+    #[must_use]
+    pub fn arrivals(&self) -> Vec<Arrival> {
         self.shared.arrivals.lock().clone()
     }
 
     /// The last arrival.
-    pub(crate) fn last(&self) -> Option<Arrival> {
+    #[must_use]
+    pub fn last(&self) -> Option<Arrival> {
         self.shared.arrivals.lock().last().copied()
     }
 
     /// Waits until something that was sent after now arrives. Returns how long it took.
-    pub(crate) fn wait_fresh(&self, deadline: Duration) -> anyhow::Result<Duration> {
+    ///
+    /// # Errors
+    /// When nothing does in time.
+    pub fn wait_fresh(&self, deadline: Duration) -> anyhow::Result<Duration> {
         let begin = Instant::now();
         loop {
             if self
@@ -103,7 +138,8 @@ impl Stream {
     }
 
     /// Numbers that came more than once, and how often a smaller one came after a larger.
-    pub(crate) fn faults(&self) -> (Vec<u64>, u64) {
+    #[must_use]
+    pub fn faults(&self) -> (Vec<u64>, u64) {
         let arrivals = self.arrivals();
         let mut seen: BTreeMap<u64, u32> = BTreeMap::new();
         for arrival in &arrivals {
@@ -121,8 +157,18 @@ impl Stream {
         (twice, reordered)
     }
 
+    /// The longest time without an arrival that has a part between two moments.
+    #[must_use]
+    pub fn gap(&self, from: Instant, to: Instant) -> Duration {
+        let arrivals = self.arrivals();
+        let pairs = arrivals.windows(2).filter(|pair| pair[1].at > from && pair[0].at < to);
+        let gaps = pairs.map(|pair| pair[1].at.saturating_duration_since(pair[0].at));
+        gaps.max().unwrap_or(Duration::MAX)
+    }
+
     /// Of the messages that were sent between two moments: how long the slowest hundredth took at least.
-    pub(crate) fn p99(&self, from: Instant, to: Instant) -> Option<Duration> {
+    #[must_use]
+    pub fn p99(&self, from: Instant, to: Instant) -> Option<Duration> {
         let mut took: Vec<Duration> = self
             .arrivals()
             .into_iter()
@@ -153,7 +199,7 @@ fn publish(shared: &Shared, base: Instant, redis: &str, channel: &str, bytes: us
         let mut payload = format!("{number} {} ", base.elapsed().as_nanos()).into_bytes();
         payload.resize(bytes.max(payload.len()), b'.');
         if connection.is_none() {
-            connection = connect(redis).ok();
+            connection = plain::connect(redis).ok();
             if let Some(connection) = &connection {
                 let _ = connection.set_read_timeout(Some(Duration::from_millis(200)));
                 let _ = connection.set_write_timeout(Some(Duration::from_millis(200)));
