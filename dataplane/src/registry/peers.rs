@@ -12,7 +12,7 @@ use super::{Registry, wire};
 use crate::world::{FlowState, FlowView, LayerScopeId, Reach};
 
 /// Most other flows that are followed.
-pub const MAX_FLOWS: usize = 256;
+pub const MAX_FLOWS: usize = 1024;
 /// Snapshots that are pulled at a time, so that their unfinished parts stay few.
 const MAX_PULLS: usize = 8;
 /// Messages to other flows that wait for [`Registry::poll`]; snapshot parts beyond it are asked for again.

@@ -1,9 +1,12 @@
 //! A server stops answering: nobody else notices, nothing piles up, nothing stale arrives afterwards.
 
+use std::io::Write as _;
+use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::plain::KafkaWriter;
+use blaze_tests::process::Signal;
 use blaze_tests::servers::{
     KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis, unique_name,
 };
@@ -14,6 +17,7 @@ use crate::support::{SOON, connect, turn};
 use blaze_tests::stream::{Arrival, Stream};
 
 const TOPIC: &str = "imu/data";
+const SIBLING: &str = "second/data";
 /// Payload: large enough that what piles up would be seen.
 const BYTES: usize = 20_000;
 const LIFESPAN: Duration = Duration::from_millis(500);
@@ -22,13 +26,16 @@ const IN_THE_SOCKET: usize = 1024 * 1024;
 /// A flow may grow by this much while a server is frozen.
 const MAX_GROWTH_KIB: u64 = 96 * 1024;
 
-/// A robot and a cloud with two streams between them: one over the servers that freeze, one over others.
+/// Robots, a fog and a cloud with streams between them: one over what freezes, the others beside it.
 struct Rig {
     redis: RedisServer,
     kafka: KafkaServer,
     flows: [FlowProcess; 4],
     frozen: Stream,
+    /// Nothing in common with the frozen one but the machine.
     other: Stream,
+    /// From the same publisher's Redis and through the same flow as the frozen one, to another destination.
+    sibling: Stream,
 }
 
 impl Rig {
@@ -65,11 +72,15 @@ impl Rig {
         let flows: [FlowProcess; 4] = flows.try_into().map_err(|_| anyhow::anyhow!("four flows"))?;
         // Two topics, so that each stream has one destination.
         connect_stream(&redis.url(), "", "first/data", &kafka.bootstrap(), "")?;
+        connect_stream(&redis.url(), "", SIBLING, &other_kafka, &kafka_prefix)?;
         connect_stream(&other_redis, &redis_prefix, TOPIC, &other_kafka, &kafka_prefix)?;
         flows[0].wait_bridge("first/data", SOON)?;
         flows[1].wait_bridge("first/data", SOON)?;
+        flows[0].wait_bridge(SIBLING, SOON)?;
+        for topic in [TOPIC, SIBLING] {
+            flows[3].wait_bridge(topic, SOON)?;
+        }
         flows[2].wait_bridge(TOPIC, SOON)?;
-        flows[3].wait_bridge(TOPIC, SOON)?;
         let frozen = Stream::start(&redis.url(), "first/data", &kafka.bootstrap(), "first.data", BYTES)?;
         let other = Stream::start(
             &other_redis,
@@ -78,14 +89,18 @@ impl Rig {
             &format!("{kafka_prefix}imu.data"),
             300,
         )?;
-        frozen.wait_fresh(SOON)?;
-        other.wait_fresh(SOON)?;
+        let topic = format!("{kafka_prefix}{}", SIBLING.replace('/', "."));
+        let sibling = Stream::start(&redis.url(), SIBLING, &other_kafka, &topic, 300)?;
+        for stream in [&frozen, &other, &sibling] {
+            stream.wait_fresh(SOON)?;
+        }
         Ok(Self {
             redis,
             kafka,
             flows,
             frozen,
             other,
+            sibling,
         })
     }
 
@@ -120,28 +135,31 @@ const ATTEMPTS: usize = 3;
 fn freeze(
     rig: &Rig,
     what: &str,
+    others: &[&Stream],
     freeze: impl Fn() -> anyhow::Result<()>,
     thaw: impl Fn() -> anyhow::Result<()>,
 ) -> anyhow::Result<()> {
     let mut seen = Vec::new();
     while seen.len() < ATTEMPTS {
-        let (calm, frozen) = freeze_once(rig, what, &freeze, &thaw)?;
+        let times = freeze_once(rig, what, others, &freeze, &thaw)?;
         // The margin beside the factor is what the clock of two busy cores resolves.
-        if frozen <= calm.mul_f64(1.2) + Duration::from_millis(5) {
+        let as_fast = |(calm, frozen): &(Duration, Duration)| *frozen <= calm.mul_f64(1.2) + Duration::from_millis(5);
+        if times.iter().all(as_fast) {
             return Ok(());
         }
-        seen.push((calm, frozen));
+        seen.push(times);
     }
-    anyhow::bail!("{what}: each time the other route was slower while it was frozen: {seen:?}")
+    anyhow::bail!("{what}: each time another route was slower while it was frozen: {seen:?}")
 }
 
-/// Gives the other route's p99 before and while the server was frozen.
+/// Gives the other routes' p99 before and while the server was frozen.
 fn freeze_once(
     rig: &Rig,
     what: &str,
+    others: &[&Stream],
     freeze: impl Fn() -> anyhow::Result<()>,
     thaw: impl Fn() -> anyhow::Result<()>,
-) -> anyhow::Result<(Duration, Duration)> {
+) -> anyhow::Result<Vec<(Duration, Duration)>> {
     let calm_from = Instant::now();
     std::thread::sleep(period());
     let calm_to = Instant::now();
@@ -155,12 +173,16 @@ fn freeze_once(
     let thawed = Instant::now();
     rig.frozen.wait_fresh(SOON)?;
     println!("{what}: flowing again {:?} after it answers", thawed.elapsed());
-    let calm = rig.other.p99(calm_from, calm_to).unwrap_or_default();
-    let frozen = rig.other.p99(frozen_from, frozen_to).unwrap_or_default();
-    println!("{what}: the other route's p99 {calm:?} before, {frozen:?} while it was frozen");
-    let (twice, reordered) = rig.other.faults();
-    assert_eq!((twice.len(), reordered), (0, 0), "the other route");
-    assert!(!frozen.is_zero(), "the other route went on");
+    let mut times = Vec::new();
+    for other in others {
+        let calm = other.p99(calm_from, calm_to).unwrap_or_default();
+        let frozen = other.p99(frozen_from, frozen_to).unwrap_or_default();
+        println!("{what}: another route's p99 {calm:?} before, {frozen:?} while it was frozen");
+        let (twice, reordered) = other.faults();
+        assert_eq!((twice.len(), reordered), (0, 0), "another route");
+        assert!(!frozen.is_zero(), "another route went on");
+        times.push((calm, frozen));
+    }
     for (flow, (before, during)) in rig.flows.iter().zip(before.iter().zip(&during)) {
         println!(
             "{what}: {} {before} KiB before, {during} KiB while it was frozen",
@@ -172,7 +194,7 @@ fn freeze_once(
             flow.spec.node
         );
     }
-    Ok((calm, frozen))
+    Ok(times)
 }
 
 /// What arrived after the thaw although it was older than its lifespan.
@@ -198,6 +220,7 @@ fn a_frozen_kafka_holds_up_nobody_else() -> anyhow::Result<()> {
     freeze(
         &rig,
         "Kafka",
+        &[&rig.other, &rig.sibling],
         || rig.kafka.freeze(),
         || {
             thawed.set(Instant::now());
@@ -229,7 +252,7 @@ fn a_frozen_kafka_holds_up_nobody_else() -> anyhow::Result<()> {
 fn a_frozen_redis_holds_up_nobody_else() -> anyhow::Result<()> {
     let _turn = turn();
     let rig = Rig::start()?;
-    freeze(&rig, "Redis", || rig.redis.freeze(), || rig.redis.thaw())?;
+    freeze(&rig, "Redis", &[&rig.other], || rig.redis.freeze(), || rig.redis.thaw())?;
     let (twice, reordered) = rig.frozen.faults();
     assert_eq!((twice, reordered), (vec![], 0));
     wait::until(
@@ -239,4 +262,52 @@ fn a_frozen_redis_holds_up_nobody_else() -> anyhow::Result<()> {
         || rig.flows[0].tail(),
     )?;
     Ok(())
+}
+
+/// The flow at the other end of the link stands still, until it counts as down and beyond.
+#[test]
+fn a_stalled_destination_holds_up_nobody_else() -> anyhow::Result<()> {
+    let _turn = turn();
+    let rig = Rig::start()?;
+    let cloud = &rig.flows[1];
+    freeze(
+        &rig,
+        "the cloud's flow",
+        &[&rig.other, &rig.sibling],
+        || cloud.signal(Signal::STOP),
+        || cloud.signal(Signal::CONT),
+    )?;
+    let (twice, reordered) = rig.frozen.faults();
+    assert_eq!((twice, reordered), (vec![], 0));
+    let counted = dropped(&rig.flows[0]);
+    println!("robot-1 counts {counted}");
+    let text = counted.to_string();
+    assert!(
+        ["link_down", "lifespan"].iter().any(|reason| text.contains(reason)),
+        "what was dropped has a reason: {counted}"
+    );
+    Ok(())
+}
+
+/// A subscriber on the publisher's Redis that never reads.
+#[test]
+fn a_slow_redis_subscriber_holds_up_nobody_else() -> anyhow::Result<()> {
+    let _turn = turn();
+    let rig = Rig::start()?;
+    let slow = std::cell::RefCell::new(None);
+    freeze(
+        &rig,
+        "a slow subscriber",
+        &[&rig.frozen, &rig.other, &rig.sibling],
+        || {
+            let mut stream = TcpStream::connect(("127.0.0.1", rig.redis.port()))?;
+            stream.write_all(b"SUBSCRIBE first/data\r\n")?;
+            slow.replace(Some(stream));
+            Ok(())
+        },
+        || {
+            slow.replace(None);
+            Ok(())
+        },
+    )
 }

@@ -12,6 +12,7 @@
 mod clients;
 mod flows;
 mod load;
+mod plan;
 
 use std::time::Duration;
 
@@ -34,6 +35,9 @@ struct Arguments {
     /// Kafka broker; else BLAZE_TEST_KAFKA_CLOUD of .services/env
     #[arg(long, value_name = "HOST:PORT")]
     kafka: Option<String>,
+    /// Measure instead what a fleet costs one flow in planning; no server is needed
+    #[arg(long)]
+    plan: bool,
     /// Seconds per measurement
     #[arg(long, default_value_t = 5.0)]
     seconds: f64,
@@ -69,6 +73,9 @@ impl PathKind {
 
 fn main() -> anyhow::Result<()> {
     let arguments = Arguments::parse();
+    if arguments.plan {
+        return plan::run();
+    }
     let redis = match arguments.redis {
         Some(url) => url,
         None => servers::address("BLAZE_TEST_REDIS_URL").context("no --redis")?,
