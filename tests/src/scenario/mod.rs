@@ -146,6 +146,8 @@ pub enum Expect {
     LostAtMost(&'static str, &'static str, f64),
     /// This many at least.
     Received(&'static str, &'static str, u64),
+    /// The last message published came: the route is whole in the end, whatever happened on the way.
+    Alive(&'static str, &'static str),
     /// 99 of 100 take at most this long.
     P99(&'static str, &'static str, Duration),
     /// In every flow every bridge has, in the end, `in = out + dropped + queued`.

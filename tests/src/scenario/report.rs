@@ -17,6 +17,8 @@ pub struct Route {
     pub sent: u64,
     /// Messages received.
     pub received: u64,
+    /// Number of the last message received.
+    pub last: u64,
     /// Missing between the first received and the last published.
     pub lost: u64,
     /// Repeats.
@@ -44,6 +46,7 @@ impl Route {
                 self.received > 0 && self.lost as f64 <= share * all as f64 && once_in_order
             }
             Expect::Received(_, _, least) => self.received >= *least,
+            Expect::Alive(..) => self.sent > 0 && self.last == self.sent,
             Expect::P99(_, _, most) => self
                 .latency_ms(0.99)
                 .is_some_and(|p99| Duration::from_secs_f64(p99 / 1e3) <= *most),
@@ -147,6 +150,7 @@ impl Report {
             Expect::Whole(consumer, topic)
             | Expect::LostAtMost(consumer, topic, _)
             | Expect::Received(consumer, topic, _)
+            | Expect::Alive(consumer, topic)
             | Expect::P99(consumer, topic, _) => match self.route(consumer, topic) {
                 Some(route) => route.faults(expect),
                 None => Some(format!("there is no {topic} at {consumer}")),
@@ -194,6 +198,7 @@ mod tests {
             topic: "imu".to_owned(),
             sent: 1_000,
             received: 990,
+            last: 1_000,
             lost: 10,
             latencies_ms: (1..=100).map(f64::from).collect(),
             ..Route::default()
@@ -217,6 +222,7 @@ mod tests {
             .check(&[
                 Expect::LostAtMost("recorder", "imu", 0.01),
                 Expect::Received("recorder", "imu", 990),
+                Expect::Alive("recorder", "imu"),
                 Expect::P99("recorder", "imu", Duration::from_millis(99)),
             ])
             .unwrap();
@@ -255,6 +261,13 @@ mod tests {
         report.flows[0].unbalanced.push("imu: in 3, out 2".to_owned());
         let error = report.check(&[Expect::Balanced]).unwrap_err();
         assert!(error.to_string().contains("cloud-1: imu: in 3, out 2"), "{error}");
+    }
+
+    #[test]
+    fn a_route_that_has_ended_is_found() {
+        let mut report = report();
+        report.routes[0].last = 999;
+        assert!(report.check(&[Expect::Alive("recorder", "imu")]).is_err());
     }
 
     #[test]

@@ -381,6 +381,7 @@ impl Probe {
             topic: topic.to_owned(),
             sent,
             received: self.last(topic, "received"),
+            last: self.last(topic, "last"),
             // What never came after the last one is missing as well.
             lost: self.last(topic, "lost") + sent.saturating_sub(self.last(topic, "last")),
             duplicated: self.last(topic, "duplicated"),

@@ -9,5 +9,6 @@ mod joins;
 mod layers;
 mod proxy;
 mod scenario;
+mod soak;
 mod support;
 mod topology;
