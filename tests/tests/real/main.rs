@@ -9,6 +9,7 @@ mod contract;
 mod demo;
 mod frozen;
 mod garbage;
+mod late;
 mod plain_clients;
 mod replicas;
 mod restarts;
