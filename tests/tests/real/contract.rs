@@ -284,3 +284,33 @@ fn names_that_collide_on_kafka_are_refused() -> anyhow::Result<()> {
     assert_eq!(refused["error"]["pointer"], "/topic");
     Ok(())
 }
+
+#[test]
+fn types_that_differ_are_told_and_agree_later() -> anyhow::Result<()> {
+    const TOPIC: &str = "robot/pose";
+    let _turn = turn();
+    let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
+    let request =
+        |name: &str| system.tell_cloud(&json!({"op":"request","topic":TOPIC,"service":"sink","type":name,"ttl_s":0}));
+    system.tell_robot(
+        &json!({"op":"advertise","topic":TOPIC,"service":"source","type":"geometry_msgs/msg/Pose","ttl_s":0}),
+    )?;
+    request("nav_msgs/msg/Odometry")?;
+    for flow in [&system.robot, &system.cloud] {
+        let why = || flow.why(TOPIC, Some("cloud")).unwrap_or_default();
+        wait::until(
+            "the mismatch is told",
+            SOON,
+            || why()["code"] == "type_mismatch" && why()["verdict"] == "not_flowing",
+            || format!("{}: {}", flow.spec.node, why()),
+        )?;
+        let told = why().to_string();
+        assert!(
+            told.contains("geometry_msgs/msg/Pose") && told.contains("nav_msgs/msg/Odometry"),
+            "{told}"
+        );
+    }
+    request("geometry_msgs/msg/Pose")?;
+    system.robot.wait_bridge(TOPIC, SOON)?;
+    system.cloud.wait_bridge(TOPIC, SOON)
+}
