@@ -121,7 +121,7 @@ pub(super) fn three_layers(image_hz: f64) -> Scenario {
             service("pilot", "robot-1", "redis-1", vec![commands, map]),
         ],
         faults: vec![],
-        duration: Duration::from_secs(if long() { 600 } else { 20 }),
+        duration: Duration::from_secs(if long() { 120 } else { 10 }),
         settle: Duration::from_secs(10),
         expect: whole(),
     }

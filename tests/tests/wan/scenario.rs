@@ -78,11 +78,11 @@ fn robot_and_cloud() -> Scenario {
             service("driver", "robot-1", "redis", stream(COMMANDS, 10.0, 100)),
         ],
         faults: vec![],
-        duration: Duration::from_secs(if long() { 600 } else { 20 }),
+        duration: Duration::from_secs(if long() { 60 } else { 8 }),
         settle: Duration::from_secs(10),
         expect: vec![
             Expect::Whole("recorder", IMU),
-            Expect::Received("recorder", IMU, if long() { 29_000 } else { 950 }),
+            Expect::Received("recorder", IMU, if long() { 2_900 } else { 380 }),
             Expect::Whole("driver", COMMANDS),
         ],
     }

@@ -87,7 +87,7 @@ fn faults(seed: u64, duration: Duration) -> anyhow::Result<Vec<(Duration, Fault)
 #[test]
 fn a_mixed_load_with_random_faults() -> anyhow::Result<()> {
     let _turn = turn();
-    let seconds = setting("BLAZE_SOAK_SECONDS", if long() { 600 } else { 60 })?;
+    let seconds = setting("BLAZE_SOAK_SECONDS", if long() { 300 } else { 45 })?;
     let seed = setting("BLAZE_SOAK_SEED", 1)?;
     let duration = Duration::from_secs(seconds);
     let mut expect = vec![Expect::Balanced, Expect::Growth(GROWTH)];
