@@ -41,6 +41,8 @@ fn wall_ms() -> u64 {
 pub(super) struct ControlTask {
     pub(super) shared: Arc<Shared>,
     pub(super) ready: Arc<Notify>,
+    /// Whether it has been ready.
+    pub(super) was_ready: bool,
     pub(super) writers: HashMap<(Scope, ChannelName), Arc<dyn Publisher>>,
     pub(super) leave: Leave,
 }
@@ -126,8 +128,8 @@ impl ControlTask {
         {
             let mut control = self.shared.control.lock();
             for news in self.shared.plane.take_news() {
-                if let Some(transport) = &self.shared.transport {
-                    transport.follow(&news);
+                if let Some(inter) = &self.shared.inter {
+                    inter.follow(&news);
                 }
                 match news {
                     News::Link(event) => control.link_event(now, *event),
@@ -135,10 +137,15 @@ impl ControlTask {
                         self.shared.epoch.store(epoch, Ordering::Relaxed);
                         control.set_epoch(epoch);
                     }
+                    News::Joined => control.joined(now),
+                    News::Left => control.left(now),
                     News::Discovered(_) => {}
                 }
             }
             control.tick(now, wall_ms());
+            if control.state() == FlowState::Ready && !std::mem::replace(&mut self.was_ready, true) {
+                self.ready.notify_one();
+            }
         }
         // Not locked meanwhile: what is carried out may have a consequence, which is carried out too.
         loop {
@@ -175,8 +182,10 @@ impl ControlTask {
                     FlowState::Draining => HelloState::Draining,
                 };
                 plane.with(|state| state.engine.as_mut().map(|engine| engine.set_state(now, said)));
-                if flow_state == FlowState::Ready {
-                    self.ready.notify_one();
+            }
+            Output::Inter { join } => {
+                if let Some(inter) = &self.shared.inter {
+                    inter.want(join);
                 }
             }
             Output::Plan {

@@ -70,6 +70,8 @@ pub(super) struct Remote {
     pub(super) ways: Ways,
     /// Since when it has been ready, without a break.
     pub(super) ready_since: Option<Instant>,
+    /// Since when it has been a gateway, if it was none while it carried topics before.
+    pub(super) new_gateway: Option<Instant>,
 }
 
 /// The entries of a flow, as its view in the world has them.
@@ -91,6 +93,7 @@ impl Remote {
             retry: DEFAULT_RETRY,
             ways: Ways::default(),
             ready_since: None,
+            new_gateway: None,
         }
     }
 

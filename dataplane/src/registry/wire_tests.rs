@@ -88,9 +88,12 @@ fn any_entry() -> impl Strategy<Value = (TopicName, TopicEntry, Vec<wire::RouteS
         text(200),
         scope(),
         scope(),
+        scope(),
         proptest::collection::vec(route, 0..=MAX_ROUTES),
     )
-        .prop_map(|(topic, node, layer, routes)| (topic.parse().unwrap(), TopicEntry { node, layer }, routes))
+        .prop_map(|(topic, node, layer, outside, routes)| {
+            (topic.parse().unwrap(), TopicEntry { node, layer, outside }, routes)
+        })
 }
 
 fn encoded(body: Body) -> usize {

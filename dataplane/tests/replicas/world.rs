@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::Content;
-use blaze_domain::node_file::AccessRules;
+use blaze_domain::node_file::{AccessRules, AutoBool};
 use blaze_domain::{FlowId, LayerKind, Origin, Scope, TopicName, WriterId};
 use blaze_flow::control::{ControlConfig, ControlCore};
 use blaze_flow::flow::plane::PlaneState;
@@ -110,7 +110,8 @@ impl World {
             epoch,
             node_scope: true,
             layer_scope,
-            replicas: !robot,
+            replicas: (!robot).then_some(LayerScope::Kafka),
+            gateway: AutoBool::Auto,
             inter_scope: true,
             layer_answers_need_id: true,
             layer_names: LayerNames::Any,
@@ -133,8 +134,11 @@ impl World {
             max_datagram: 1300,
             limits: Limits::default(),
         };
+        let inside = control.begins_inside();
+        let mut control = ControlCore::new(control, self.now);
+        control.hears_replicas(self.now);
         Flow {
-            control: ControlCore::new(control, self.now),
+            control,
             plane: PlaneState {
                 core,
                 engine: Some(Engine::new(engine, self.now, self.wall())),
@@ -144,6 +148,8 @@ impl World {
             life: Life::Alive,
             reads: BTreeMap::new(),
             peers: self.kafka.lock().get("peers").map_or(0, Vec::len),
+            inside,
+            leaves: None,
         }
     }
 
@@ -279,7 +285,10 @@ impl World {
         for a in 0..self.flows.len() {
             for b in 0..self.flows.len() {
                 let lives = (self.flows[a].epoch, self.flows[b].epoch);
-                let both = a != b && [a, b].iter().all(|at| self.flows[*at].life == Life::Alive);
+                let both = a != b
+                    && [a, b]
+                        .iter()
+                        .all(|at| self.flows[*at].life == Life::Alive && self.flows[*at].inside);
                 if both && self.known.get(&(a, b)) != Some(&lives) && self.random.random_bool(0.05) {
                     self.known.insert((a, b), lives);
                     let endpoint = Endpoint {
