@@ -19,14 +19,14 @@ const MAX_FILTERS: usize = 128;
 pub(crate) fn told_outside(world: &World, topic: &TopicName) -> Option<TopicEntry> {
     let own = world.own()?;
     let mut told = own.topics.get(topic).cloned().unwrap_or_default();
-    let members = members_behind(world).filter_map(|(_, view)| view.topics.get(topic));
+    let members = members_behind(world).filter_map(|(_, view)| Some((view, view.topics.get(topic)?)));
     let mut own_layer = std::mem::take(&mut told.layer);
     let mut of_nodes = Vec::new();
-    for entry in members {
+    for (view, entry) in members {
         // Every flow of the group has the same leases there, so one of them is enough.
         own_layer.advertise = own_layer.advertise.or_else(|| entry.layer.advertise.clone());
         own_layer.request = own_layer.request.or_else(|| entry.layer.request.clone());
-        of_nodes.push(&entry.node);
+        of_nodes.extend(view.node_scope.then_some(&entry.node));
     }
     told.layer = merge(std::iter::once(&own_layer).chain(of_nodes));
     (!told.is_empty()).then_some(told)
@@ -50,7 +50,7 @@ pub(crate) fn told_inside(world: &World, topic: &TopicName) -> ScopeEntry {
             continue;
         }
         let Some(entry) = view.topics.get(topic) else { continue };
-        entries.push(&entry.node);
+        entries.extend(view.node_scope.then_some(&entry.node));
         // Flows that share a broker say the same of it.
         let says_something = entry.layer.advertise.is_some() || entry.layer.request.is_some();
         if says_something && groups.insert(group) {

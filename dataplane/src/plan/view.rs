@@ -218,6 +218,16 @@ impl<'w> TopicView<'w> {
             .filter(move |requester| requester.group == self.group && of_layer(requester))
     }
 
+    /// Flows of the own group that are on the inter scope for it and carry topics.
+    pub(crate) fn gateways(&self) -> &[&'w FlowId] {
+        &self.gateways
+    }
+
+    /// Whether this flow is not on the inter scope, and no other flow is for it.
+    pub(crate) fn lacks_gateway(&self) -> bool {
+        self.role == Role::Member && self.gateways.is_empty()
+    }
+
     /// Requesters of other groups, as gateways say, of which this flow is none: what it writes to its layer scope reaches them.
     pub(crate) fn requesters_over_gateways(&self) -> impl Iterator<Item = &Requester<'w>> + Clone {
         self.requesters

@@ -155,7 +155,7 @@ impl Registry {
     #[must_use]
     pub fn faults(&self) -> SyncFaults {
         SyncFaults {
-            left_out_routes: self.announcer.left_out + self.layer_announcer.left_out,
+            left_out_routes: self.announcer.left_out.max(self.layer_announcer.left_out),
             ..self.faults
         }
     }

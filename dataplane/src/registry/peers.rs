@@ -13,7 +13,7 @@ use super::{Outgoing, Registry, Way};
 use crate::world::{FlowState, FlowView, LayerScopeId, Reach, Role};
 
 /// Most other flows that are followed.
-pub const MAX_FLOWS: usize = 2048;
+pub const MAX_FLOWS: usize = 1280;
 /// Snapshots that are pulled at a time, so that their unfinished parts stay few.
 const MAX_PULLS: usize = 8;
 /// Messages to other flows that wait for [`Registry::poll`]; snapshot parts beyond it are asked for again.
@@ -278,7 +278,7 @@ impl Registry {
     }
 
     /// What other flows told of a topic, by flow and scope. The layer scope of a flow that shares the own layer broker
-    /// is left out: those services hold leases here.
+    /// is left out: those services hold leases here. What a gateway tells of flows of other groups is of its inter scope.
     pub fn remote_leases<'a>(&'a self, topic: &'a TopicName) -> impl Iterator<Item = RemoteLease<'a>> {
         let shares = |flow: &FlowId, view: &FlowView| {
             flow.layer == self.config.me.layer
@@ -295,14 +295,18 @@ impl Registry {
                 let layer = entry
                     .filter(|_| !shares(flow, view))
                     .map(|entry| (Scope::Layer, &entry.layer));
-                node.into_iter().chain(layer).filter_map(move |(scope, entry)| {
-                    (entry.advertise.is_some() || entry.request.is_some()).then_some(RemoteLease {
-                        flow,
-                        scope,
-                        advertise: entry.advertise.as_ref(),
-                        request: entry.request.as_ref(),
+                let outside = entry.map(|entry| (Scope::Inter, &entry.outside));
+                node.into_iter()
+                    .chain(layer)
+                    .chain(outside)
+                    .filter_map(move |(scope, entry)| {
+                        (entry.advertise.is_some() || entry.request.is_some()).then_some(RemoteLease {
+                            flow,
+                            scope,
+                            advertise: entry.advertise.as_ref(),
+                            request: entry.request.as_ref(),
+                        })
                     })
-                })
             })
     }
 

@@ -127,7 +127,12 @@ proptest! {
             prop_assert_eq!(&back_topic, topic);
             // Only sources may have been left out.
             let mut expected = entry.clone();
-            for (expected, back) in [(&mut expected.node, &back.node), (&mut expected.layer, &back.layer)] {
+            let scopes = [
+                (&mut expected.node, &back.node),
+                (&mut expected.layer, &back.layer),
+                (&mut expected.outside, &back.outside),
+            ];
+            for (expected, back) in scopes {
                 if let (Some(expected), Some(back)) = (&mut expected.advertise, &back.advertise) {
                     prop_assert_eq!(back.more_sources, back.sources.len() < expected.sources.len());
                     prop_assert!(!back.sources.is_empty());

@@ -83,8 +83,8 @@ impl System {
         system
     }
 
-    /// One with a group of more than 16 flows, where some flows of each group are not on the inter scope. Types are left out:
-    /// a gateway tells of several scopes as of one, and of differing types none.
+    /// One with a group of more than 16 flows, where some flows of each group are not on the inter scope. Types and
+    /// sources that are not named are left out: where a gateway tells of several scopes as of one, they match more than they do.
     pub(crate) fn with_gateways(dice: &mut Dice) -> Self {
         let mut system = Self::random(dice);
         for n in 0..17 + dice.below(6) {
@@ -114,14 +114,17 @@ impl System {
                 Role::Gateway
             };
         }
-        system.forget_types();
+        system.tell_precisely();
         system
     }
 
-    pub(crate) fn forget_types(&mut self) {
+    pub(crate) fn tell_precisely(&mut self) {
         let topics = self.world.flows.values_mut().flat_map(|view| view.topics.values_mut());
         for entry in topics.flat_map(|entry| [&mut entry.node, &mut entry.layer]) {
-            entry.advertise.iter_mut().for_each(|offer| offer.type_name.clear());
+            entry.advertise.iter_mut().for_each(|offer| {
+                offer.type_name.clear();
+                offer.more_sources = false;
+            });
             entry.request.iter_mut().for_each(|ask| ask.type_name.clear());
         }
     }

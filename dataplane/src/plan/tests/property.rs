@@ -88,7 +88,7 @@ fn behind_gateways_each_message_reaches_each_requester_once_over_one_path() {
             }
             past = plans;
             system.change(&mut dice);
-            system.forget_types();
+            system.tell_precisely();
         }
     }
     let worlds = usize::try_from(worlds).unwrap();
