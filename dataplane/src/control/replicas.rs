@@ -67,7 +67,9 @@ impl ControlCore {
             return;
         }
         let changed = match body {
-            Body::Hello(hello) => self.registry.on_layer_hello(now, &from, &hello, appended_ms),
+            Body::Hello(hello) => self
+                .registry
+                .on_layer_hello(now, &from, &hello, channel.began, appended_ms),
             body => self.registry.on_layer_control(now, &from, channel.epoch, body),
         };
         self.touch(now, changed);

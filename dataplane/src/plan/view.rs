@@ -343,7 +343,9 @@ impl<'w> TopicView<'w> {
     }
 
     fn is_settled(&self, flow: &FlowId) -> bool {
-        self.world.flows.get(flow).is_some_and(|view| view.settled)
+        let view = self.world.flows.get(flow);
+        // What a flow wrote to the layer scope before it was a gateway it does not carry out itself.
+        view.is_some_and(|view| view.settled && view.role != Role::NewGateway)
     }
 
     /// The flow of the own group that carries what is published on the layer scope to other groups.

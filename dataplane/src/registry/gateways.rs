@@ -15,10 +15,18 @@ use blaze_domain::node_file::AutoBool;
 use blaze_domain::{FlowId, TopicName};
 use blaze_proto::link::link_control::{Delta, Gateway, Hello};
 
+use super::pieces::text_hash;
 use super::remote::Remote;
 use super::{Registry, wire};
 use crate::plan::told;
 use crate::world::{FlowState, Role, TopicEntry};
+
+/// Of so many milliseconds per flow that is known a flow waits a part before it asks …
+const PATIENCE_MS: u64 = 10;
+/// … and at most this long.
+const MAX_PATIENCE_MS: u64 = 5000;
+/// What was said on the channel of the layer broker is not said again for this long.
+const SAID: Duration = Duration::from_millis(100);
 
 /// What a flow wrote to its layer scope before it became a gateway is carried out for it this long.
 pub(crate) const GRACE: Duration = Duration::from_secs(2);
@@ -116,6 +124,30 @@ impl Registry {
     /// Whether a flow was ever heard on the channel of the layer broker.
     pub(super) fn is_heard_on_layer(&self, flow: &FlowId) -> bool {
         self.remotes.get(flow).is_some_and(|remote| remote.ways.layer.is_some())
+    }
+
+    /// A flow whose process goes on has a new life on the inter scope: what it has announced stays.
+    pub(super) fn follow_life(&mut self, flow: &FlowId, epoch: u64, began: u64) {
+        let goes_on = self.remotes.get(flow).is_some_and(|remote| remote.began == Some(began));
+        if let Some(view) = self.world.flows.get_mut(flow).filter(|_| goes_on) {
+            view.epoch = view.epoch.max(epoch);
+        }
+    }
+
+    /// How long this flow waits before it asks for what another one has announced on the channel of the layer broker: of many
+    /// that miss the same, one asks, and all hear the answer.
+    pub(super) fn patience(&self, with: &FlowId) -> Duration {
+        let others = u64::try_from(self.remotes.len()).unwrap_or(u64::MAX);
+        let longest = others.saturating_mul(PATIENCE_MS).min(MAX_PATIENCE_MS);
+        let hash = text_hash(format!("{}|{with}", self.config.me).as_bytes());
+        Duration::from_millis(hash % (longest + 1))
+    }
+
+    /// Whether a part of a snapshot is to be said on the channel of the layer broker: not again right after it was.
+    pub(super) fn say_part(&mut self, now: Instant, version: u64, part: u32) -> bool {
+        let fresh = |at: &Instant| now.saturating_duration_since(*at) < SAID;
+        self.said_parts.retain(|_, at| fresh(at));
+        self.said_parts.insert((version, part), now).is_none()
     }
 
     /// What a flow says of itself on the channel of the layer broker.

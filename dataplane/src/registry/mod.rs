@@ -57,8 +57,8 @@ use crate::world::{FlowState, FlowView, Reach, Role, ScopeEntry, World};
 
 /// A message to another flow that waits for [`Registry::poll`].
 struct Outgoing {
-    to: FlowId,
-    way: Way,
+    /// `None`: to everybody on the channel of the layer broker.
+    to: Option<FlowId>,
     body: Body,
 }
 
@@ -80,6 +80,8 @@ pub struct Registry {
     announcer: Announcer,
     /// What flows are told that share the layer broker, on its channel.
     layer_announcer: Announcer,
+    /// Parts of snapshots that were said on that channel lately: version and part.
+    said_parts: BTreeMap<(u64, u32), Instant>,
     /// A gateway spoke for flows of its group when it was last looked at.
     spoke_for_others: bool,
     remotes: BTreeMap<FlowId, Remote>,
@@ -124,6 +126,7 @@ impl Registry {
             routes: BTreeMap::new(),
             announcer: Announcer::default(),
             layer_announcer: Announcer::default(),
+            said_parts: BTreeMap::new(),
             spoke_for_others: false,
             remotes: BTreeMap::new(),
             world: World {

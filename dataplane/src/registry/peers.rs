@@ -51,6 +51,11 @@ impl Registry {
         };
         let layer_scope = (hello.layer_scope_id != 0).then_some(LayerScopeId(hello.layer_scope_id));
         let mut changed = BTreeSet::new();
+        // Of a flow that shares the layer broker counts what it says there: on the inter scope it speaks to others, and under
+        // lives of their own.
+        if way == Way::Link && self.is_heard_on_layer(from) {
+            return changed;
+        }
         match self.world.flows.get(from).map(|view| view.epoch) {
             Some(epoch) if hello.epoch < epoch => {
                 self.faults.old_epochs += 1;
@@ -69,13 +74,13 @@ impl Registry {
             self.faults.too_many_flows += 1;
             return changed;
         }
-        // Of a flow that shares the layer broker counts what it says there: on the inter scope it speaks to others.
-        if way == Way::Link && self.is_heard_on_layer(from) {
-            return changed;
-        }
         let (gateway, role) = match way {
             Way::Link => (AutoBool::Yes, Role::Gateway),
             Way::Layer => self.said_role(now, from, hello),
+        };
+        let patience = match way {
+            Way::Link => Duration::ZERO,
+            Way::Layer => self.patience(from),
         };
         let view = self.world.flows.entry(from.clone()).or_insert_with(|| FlowView {
             kind,
@@ -100,7 +105,7 @@ impl Registry {
         let same = !is_new && (view.kind, view.state, view.layer_scope, view.gateway, view.role) == said;
         (view.kind, view.state, view.layer_scope, view.gateway, view.role) = said;
         let remote = self.remotes.entry(from.clone()).or_insert_with(Remote::new);
-        remote.on_hello(now, hello.registry_version, hello.registry_digest);
+        remote.on_hello(now, hello.registry_version, hello.registry_digest, patience);
         if !same {
             // Which flow receives, reads or answers hangs on all live flows, whatever their own topics are.
             changed.extend(self.all_topics());
@@ -142,16 +147,18 @@ impl Registry {
             Body::Delta(delta) => remote.on_delta(now, delta, &mut view.topics, &mut self.faults),
             Body::Snapshot(snapshot) => remote.on_snapshot(now, snapshot, &mut view.topics, &mut self.faults),
             Body::SnapshotRequest(request) => {
-                let announcer = match way {
-                    Way::Link => &mut self.announcer,
-                    Way::Layer => &mut self.layer_announcer,
+                // On the channel of the layer broker all hear the answer.
+                let (to, mut parts) = match way {
+                    Way::Link => (Some(from.clone()), self.announcer.request(now, &request)),
+                    Way::Layer => (None, self.layer_announcer.request(now, &request)),
                 };
-                for part in announcer.request(now, &request) {
+                parts.retain(|part| to.is_some() || self.say_part(now, part.version, part.part));
+                for part in parts {
                     if self.outgoing.len() >= MAX_OUTGOING {
                         self.faults.dropped_replies += 1;
                     } else {
-                        let (to, body) = (from.clone(), Body::Snapshot(part));
-                        self.outgoing.push_back(Outgoing { to, way, body });
+                        let (to, body) = (to.clone(), Body::Snapshot(part));
+                        self.outgoing.push_back(Outgoing { to, body });
                     }
                 }
                 return BTreeSet::new();
@@ -201,7 +208,7 @@ impl Registry {
         let topics = self.all_topics();
         self.remotes.remove(flow);
         self.world.flows.remove(flow);
-        self.outgoing.retain(|message| message.to != *flow);
+        self.outgoing.retain(|message| message.to.as_ref() != Some(flow));
         topics
     }
 
@@ -209,10 +216,10 @@ impl Registry {
     pub fn poll(&mut self, now: Instant) -> Vec<(FlowId, Body)> {
         let mut messages = Vec::new();
         let mut layer = Vec::new();
-        for Outgoing { to, way, body } in self.outgoing.drain(..) {
-            match way {
-                Way::Link => messages.push((to, body)),
-                Way::Layer => layer.push((Some(to), body)),
+        for Outgoing { to, body } in self.outgoing.drain(..) {
+            match to {
+                Some(to) => messages.push((to, body)),
+                None => layer.push((None, body)),
             }
         }
         let (deltas, layer_deltas) = self.announce(now);

@@ -58,25 +58,28 @@ impl Ways {
 }
 
 impl Registry {
-    /// A flow that shares the layer broker said Hello there; the server took that at `appended_ms` of its clock. Returns the
-    /// topics to plan anew.
+    /// A flow that shares the layer broker said Hello there, and the life that its process `began` with; the server took that at
+    /// `appended_ms` of its clock. Returns the topics to plan anew.
     pub fn on_layer_hello(
         &mut self,
         now: Instant,
         from: &FlowId,
         hello: &Hello,
+        began: u64,
         appended_ms: Option<i64>,
     ) -> BTreeSet<TopicName> {
         let own = self.world.own().and_then(|own| own.layer_scope);
         if from.layer != self.config.me.layer || own.is_none_or(|own| own.0 != hello.layer_scope_id) {
             return BTreeSet::new();
         }
+        self.follow_life(from, hello.epoch, began);
         let mut changed = self.hear(now, from, hello, Way::Layer);
         let epoch = self.world.flows.get(from).map(|view| view.epoch);
         if epoch != Some(hello.epoch) {
             return changed;
         }
         if let Some(remote) = self.remotes.get_mut(from) {
+            remote.began = Some(began);
             remote.ways.layer = Some(Sign {
                 at: now,
                 appended_ms,

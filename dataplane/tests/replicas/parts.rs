@@ -96,6 +96,7 @@ pub(crate) struct Flow {
     pub(crate) peers: usize,
     /// On the inter scope.
     pub(crate) inside: bool,
+    pub(crate) was_inside: bool,
     /// When it has said good-bye there.
     pub(crate) leaves: Option<Instant>,
 }

@@ -125,7 +125,13 @@ impl World {
         };
         match output {
             Output::Inter { join: true } => {
-                flow.inside = true;
+                if flow.was_inside {
+                    // As in production: whoever comes back has a new life there.
+                    flow.epoch += 1;
+                    engine.restart(now, flow.epoch);
+                    flow.control.set_epoch(flow.epoch);
+                }
+                (flow.inside, flow.was_inside) = (true, true);
                 flow.control.joined(now);
             }
             Output::Inter { join: false } => {

@@ -180,6 +180,7 @@ impl World {
             reads: BTreeMap::new(),
             peers: self.kafka.lock().get("peers").map_or(0, Vec::len),
             inside,
+            was_inside: inside,
             leaves: None,
         }
     }

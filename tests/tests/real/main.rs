@@ -7,6 +7,7 @@ mod contract;
 mod demo;
 mod frozen;
 mod garbage;
+mod gateways;
 mod plain_clients;
 mod replicas;
 mod restarts;
