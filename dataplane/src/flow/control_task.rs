@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
-    Broker, BrokerError, Content, FlowSide, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
+    Broker, BrokerError, BrokerKind, Content, FlowSide, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName, WriterId};
@@ -282,7 +282,7 @@ impl ControlTask {
         let key = (scope, channel);
         let writer = match self.writers.get(&key) {
             Some(writer) => Arc::clone(writer),
-            None => match broker.publisher(&key.1, PublisherOptions::default()) {
+            None => match broker.publisher(&key.1, options_of(broker.kind(), &key.1)) {
                 Ok(writer) => {
                     self.writers.insert(key, Arc::clone(&writer));
                     writer
@@ -294,6 +294,15 @@ impl ControlTask {
             },
         };
         writer.publish_bare(body, deadline);
+    }
+}
+
+/// How a reserved channel is written. What flows of a layer tell one another goes reliably where the broker is DDS: there a burst of
+/// best-effort samples may be lost, and asking for it again takes longer. On Kafka it is reliable as it is.
+fn options_of(kind: BrokerKind, channel: &ChannelName) -> PublisherOptions {
+    PublisherOptions {
+        reliable: kind == BrokerKind::Dds && peers_channel().as_ref() == Some(channel),
+        ..PublisherOptions::default()
     }
 }
 
