@@ -73,6 +73,7 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
         priority: None,
         from: Vec::new(),
         degraded: None,
+        relays: Vec::new(),
     };
     let plan = TopicPlan {
         bridges: vec![Bridge {

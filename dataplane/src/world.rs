@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use blaze_domain::node_file::AutoBool;
 use blaze_domain::{Durability, FlowId, LayerKind, LayerName, Priority, Reliability, TopicName};
 use sha2::{Digest, Sha256};
 
@@ -39,6 +40,38 @@ pub struct FlowView {
     pub settled: bool,
     /// What it does for topics, as far as plans of other flows hang on it.
     pub parts: BTreeMap<TopicName, Part>,
+    /// What its node file says of it as a gateway.
+    pub gateway: AutoBool,
+    /// Whether it is on the inter scope for its group.
+    pub role: Role,
+}
+
+/// Whether a flow is on the inter scope for the flows that share its layer broker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum Role {
+    /// It is: flows of other groups reach it.
+    #[default]
+    Gateway,
+    /// It has been since a moment: what it wrote to the layer scope before is still carried out for it.
+    NewGateway,
+    /// It is still, for what is on its way, but has said that it will not be. Of the own flow only.
+    Leaving,
+    /// It is not: it reaches flows of other groups over the layer scope and a gateway.
+    Member,
+}
+
+impl Role {
+    /// Whether a flow with this role carries topics between its layer scope and other groups.
+    #[must_use]
+    pub fn is_gateway(self) -> bool {
+        matches!(self, Self::Gateway | Self::NewGateway)
+    }
+
+    /// Whether it sends and receives on the inter scope.
+    #[must_use]
+    pub fn is_inside(self) -> bool {
+        self != Self::Member
+    }
 }
 
 /// A flow that has been ready for this long is given topics that a live one carries.
@@ -129,6 +162,8 @@ pub struct TopicEntry {
     pub node: ScopeEntry,
     /// Services on the layer scope (every flow that shares the layer broker has the same).
     pub layer: ScopeEntry,
+    /// What a gateway says that flows of other groups advertise and request, merged; for flows that are none.
+    pub outside: ScopeEntry,
 }
 
 /// What the services of one scope advertise and request of one topic.

@@ -63,7 +63,7 @@ fn the_documented_example_has_no_fault_and_a_warning_for_each_section_without_ef
             (10, "config", NOT_YET),
             (11, "cache", NOT_YET),
             (12, "database", NOT_YET),
-            (13, "flow", &keys("pool_threads, gateway")),
+            (13, "flow", &keys("pool_threads")),
             (
                 14,
                 "flow.bandwidth",

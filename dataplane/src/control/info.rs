@@ -42,12 +42,15 @@ pub(super) fn durable_sources(world: &World, topic: &TopicName) -> BTreeSet<Orig
         let Some(entry) = view.topics.get(topic) else {
             continue;
         };
-        let offers = [&entry.node, &entry.layer]
+        let layer = || Some(flow.layer.to_string());
+        // What a gateway tells of flows outside names no layers.
+        let scopes = [(layer(), &entry.node), (layer(), &entry.layer), (None, &entry.outside)];
+        let offers = scopes
             .into_iter()
-            .filter_map(|scope| scope.advertise.as_ref());
-        for offer in offers.filter(|offer| offer.durability == Durability::TransientLocal) {
+            .filter_map(|(layer, scope)| Some((layer, scope.advertise.as_ref()?)));
+        for (layer, offer) in offers.filter(|(_, offer)| offer.durability == Durability::TransientLocal) {
             found.extend(offer.sources.iter().map(|source| OriginFilter {
-                layer: Some(flow.layer.to_string()),
+                layer: layer.clone(),
                 node: Some(source.node.clone()),
                 service: Some(source.service.clone()),
             }));

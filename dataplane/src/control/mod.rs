@@ -10,6 +10,7 @@
 //! brokers, the simulated network with plain calls.
 
 mod carrying;
+mod gateways;
 mod info;
 mod replicas;
 mod routes;
@@ -20,9 +21,9 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::control::EventKind;
 use blaze_domain::names::ChannelName;
-use blaze_domain::node_file::AccessRules;
+use blaze_domain::node_file::{AccessRules, AutoBool};
 use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
-use blaze_proto::link::link_control::Body;
+use blaze_proto::link::link_control::{Body, LayerScope};
 use bytes::Bytes;
 
 use crate::lane::path::TopicInfo;
@@ -32,6 +33,8 @@ use crate::registry::{EventDraft, LayerNames, MAX_ROUTES, Registry, RegistryConf
 use crate::world::{FlowState, LayerScopeId, OriginFilter, Reach, World};
 use carrying::Carriers;
 pub use carrying::Duty;
+use gateways::Gateways;
+pub use gateways::Stage;
 use info::{durable_sources, local_info};
 use replicas::Replicas;
 use routes::route_states;
@@ -91,8 +94,14 @@ pub enum Output {
         /// Its digest.
         digest: u64,
     },
-    /// Say this state in Hello.
+    /// Say this state in Hello on the inter scope.
     State(FlowState),
+    /// Join the inter scope, and call [`ControlCore::joined`], or leave it, once what is on its way has left, and call
+    /// [`ControlCore::left`].
+    Inter {
+        /// Join it.
+        join: bool,
+    },
     /// Say in Hello that the layer broker is there for this flow, or is not.
     LayerScope {
         /// It is.
@@ -138,8 +147,10 @@ pub struct ControlConfig {
     pub node_scope: bool,
     /// Its layer broker.
     pub layer_scope: Option<LayerScopeId>,
-    /// Flows that share the layer broker have a channel of their own there (Kafka).
-    pub replicas: bool,
+    /// Flows that share the layer broker have a channel of their own there, on a broker of this kind.
+    pub replicas: Option<LayerScope>,
+    /// What the node file says of this flow as a gateway.
+    pub gateway: AutoBool,
     /// Whether it has an inter scope, so that it must listen for peers before it is ready.
     pub inter_scope: bool,
     /// Answers on the layer scope share one channel (Kafka, DDS).
@@ -176,6 +187,7 @@ pub struct ControlCore {
     /// Who advertises which topic as transient_local, in any flow.
     durable: BTreeMap<TopicName, BTreeSet<OriginFilter>>,
     replicas: Replicas,
+    gateways: Gateways,
     carriers: Carriers,
     /// Where other flows say that they are found.
     addresses: BTreeMap<FlowId, String>,
@@ -191,7 +203,7 @@ impl ControlCore {
     /// A control core in state `starting`.
     #[must_use]
     pub fn new(config: ControlConfig, now: Instant) -> Self {
-        let registry = Registry::new(RegistryConfig {
+        let mut registry = Registry::new(RegistryConfig {
             me: config.me.clone(),
             kind: config.kind,
             epoch: config.epoch,
@@ -204,8 +216,11 @@ impl ControlCore {
             access: config.access.clone(),
             started: now,
         });
+        let gateways = Gateways::new(&config);
+        registry.set_role(config.gateway, gateways.role());
         Self {
             replicas: Replicas::new(config.epoch),
+            gateways,
             carriers: Carriers::default(),
             config,
             registry,
@@ -324,6 +339,13 @@ impl ControlCore {
 
     /// Takes what the link says of other flows.
     pub fn link_event(&mut self, now: Instant, event: LinkEvent) {
+        if self.config.inter_scope
+            && !self.gateways.is_inside()
+            && matches!(event, LinkEvent::Hello { .. } | LinkEvent::Control { .. })
+        {
+            // Said before this flow left the inter scope.
+            return;
+        }
         let changed = match event {
             LinkEvent::Hello { from, hello } => {
                 // The own address comes first.
@@ -350,7 +372,8 @@ impl ControlCore {
 
     /// Does what is due. To be called every few ten milliseconds.
     pub fn tick(&mut self, now: Instant, wall_ms: u64) {
-        let listened = !self.config.inter_scope || now.saturating_duration_since(self.started) >= LISTEN;
+        self.follow_choice(now);
+        let listened = self.has_listened(now);
         let knows_leases = !LOCAL.iter().any(|scope| self.is_reading_leases(*scope));
         if self.state == FlowState::Starting && listened && knows_leases && self.knows_replicas(now) {
             self.set_state(now, FlowState::Ready);
@@ -397,13 +420,14 @@ impl ControlCore {
     fn set_state(&mut self, now: Instant, state: FlowState) {
         self.state = state;
         let changed = self.registry.set_state(state);
-        self.outputs.push_back(Output::State(state));
+        self.show_on_link(now);
         self.hello_now();
         self.touch(now, changed);
         self.touch_all(now);
     }
 
     fn touch(&mut self, now: Instant, topics: BTreeSet<TopicName>) {
+        self.registry.tell_anew(now, &topics);
         for topic in topics {
             self.dirty
                 .entry(topic)

@@ -1,4 +1,4 @@
-//! Flows of one layer that share a layer broker with a channel of their own (`blaze/flow/peers` on Kafka): what they say there,
+//! Flows of one layer that share a layer broker with a channel of their own (`blaze/flow/peers`): what they say there,
 //! and what follows.
 //!
 //! ```text
@@ -9,9 +9,10 @@
 
 use std::time::{Duration, Instant};
 
+use blaze_domain::node_file::AutoBool;
 use blaze_domain::{FlowId, LayerKind};
 use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Body, Channel, Goodbye, Hello, Kind, LayerScope, State};
+use blaze_proto::link::link_control::{Body, Channel, Gateway, Goodbye, Hello, Kind, LayerScope, State};
 use bytes::Bytes;
 use prost::Message as _;
 
@@ -21,7 +22,7 @@ use crate::world::FlowState;
 /// Between two Hellos.
 const HELLO_EVERY: Duration = Duration::from_millis(500);
 /// A flow waits so long for what others have announced before it is ready without it.
-const KNOW_OTHERS: Duration = Duration::from_secs(2);
+pub(super) const KNOW_OTHERS: Duration = Duration::from_secs(2);
 /// Largest message that is looked at, in bytes: those of flows have at most 1,200, and the names of sender and addressee.
 const MAX_MESSAGE: usize = 4096;
 
@@ -66,7 +67,9 @@ impl ControlCore {
             return;
         }
         let changed = match body {
-            Body::Hello(hello) => self.registry.on_layer_hello(now, &from, &hello, appended_ms),
+            Body::Hello(hello) => self
+                .registry
+                .on_layer_hello(now, &from, &hello, channel.began, appended_ms),
             body => self.registry.on_layer_control(now, &from, channel.epoch, body),
         };
         self.touch(now, changed);
@@ -86,7 +89,7 @@ impl ControlCore {
 
     /// Says on the channel of the layer broker that this flow goes.
     pub fn say_goodbye(&mut self) {
-        if self.config.replicas {
+        if self.config.replicas.is_some() {
             let epoch = self.epoch();
             self.say(None, Body::Goodbye(Goodbye { epoch }), None);
         }
@@ -94,7 +97,7 @@ impl ControlCore {
 
     /// Whether what the flows next to this one have announced is known, or was waited for long enough.
     pub(super) fn knows_replicas(&self, now: Instant) -> bool {
-        !self.config.replicas
+        self.config.replicas.is_none()
             || self.registry.knows_replicas()
             || now.saturating_duration_since(self.started) >= LISTEN + KNOW_OTHERS
     }
@@ -107,7 +110,7 @@ impl ControlCore {
     /// Says what is due on the channel. To be called after the registry was polled.
     pub(super) fn tell_replicas(&mut self, now: Instant) {
         let messages = self.registry.poll_layer();
-        if !self.config.replicas {
+        if self.config.replicas.is_none() {
             return;
         }
         for (to, body) in messages {
@@ -144,12 +147,13 @@ impl ControlCore {
             FlowState::Draining => State::Draining,
         };
         let scope = self.registry.world().own().and_then(|own| own.layer_scope);
-        let shown = if scope.is_some() {
-            LayerScope::Kafka
-        } else {
-            LayerScope::None
+        let shown = self.config.replicas.filter(|_| scope.is_some());
+        let (registry_version, registry_digest) = self.registry.announced_on_layer();
+        let gateway = match self.gateways.setting(&self.config) {
+            AutoBool::Auto => Gateway::Auto,
+            AutoBool::Yes => Gateway::Always,
+            AutoBool::No => Gateway::Never,
         };
-        let (registry_version, registry_digest) = self.registry.announced();
         Hello {
             layer: self.config.me.layer.to_string(),
             node: self.config.me.node.to_string(),
@@ -158,7 +162,9 @@ impl ControlCore {
             registry_version,
             registry_digest,
             state: state.into(),
-            layer_scope: shown.into(),
+            layer_scope: shown.unwrap_or(LayerScope::None).into(),
+            gateway: gateway.into(),
+            is_gateway: self.gateways.role().is_gateway(),
             layer_scope_id: scope.map_or(0, |id| id.0),
             ..Hello::default()
         }

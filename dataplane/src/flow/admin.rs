@@ -162,7 +162,7 @@ fn extend(row: &mut Value, more: Value) {
 fn remote_advertise(flow: &blaze_domain::FlowId, scope: Scope, advertise: &Advertise) -> Vec<Value> {
     let row = |source: &crate::world::Source| {
         json!({
-            "layer": flow.layer, "node": source.node, "service": source.service, "instance": "", "scope": scope,
+            "layer": layer_of(flow, scope), "node": source.node, "service": source.service, "instance": "", "scope": scope,
             "broker": null, "rate_hz": advertise.rate_hz, "max_bytes": advertise.max_bytes,
             "priority": advertise.priority, "reliability": advertise.reliability, "durability": advertise.durability,
             "expires_in_s": null, "local": false, "flow": flow,
@@ -171,9 +171,14 @@ fn remote_advertise(flow: &blaze_domain::FlowId, scope: Scope, advertise: &Adver
     advertise.sources.iter().map(row).collect()
 }
 
+/// The layer of what a flow tells of a scope: what a gateway tells of flows outside is of any other, so empty.
+fn layer_of(flow: &blaze_domain::FlowId, scope: Scope) -> &str {
+    if scope == Scope::Inter { "" } else { flow.layer.as_str() }
+}
+
 fn remote_request(flow: &blaze_domain::FlowId, scope: Scope, request: &Request) -> Value {
     json!({
-        "layer": flow.layer, "node": if scope == Scope::Node { flow.node.as_str() } else { "" }, "service": "",
+        "layer": layer_of(flow, scope), "node": if scope == Scope::Node { flow.node.as_str() } else { "" }, "service": "",
         "instance": "", "scope": scope, "broker": null, "max_rate_hz": request.max_rate_hz,
         "lifespan_ms": request.lifespan_ms, "bare": request.bare, "priority": request.priority,
         "reliability": request.reliability, "durability": request.durability, "expires_in_s": null, "local": false,

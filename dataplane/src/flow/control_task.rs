@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
-    Broker, BrokerError, Content, FlowSide, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
+    Broker, BrokerError, BrokerKind, Content, FlowSide, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName, WriterId};
@@ -41,6 +41,8 @@ fn wall_ms() -> u64 {
 pub(super) struct ControlTask {
     pub(super) shared: Arc<Shared>,
     pub(super) ready: Arc<Notify>,
+    /// Whether it has been ready.
+    pub(super) was_ready: bool,
     pub(super) writers: HashMap<(Scope, ChannelName), Arc<dyn Publisher>>,
     pub(super) leave: Leave,
 }
@@ -129,8 +131,8 @@ impl ControlTask {
         {
             let mut control = self.shared.control.lock();
             for news in self.shared.plane.take_news() {
-                if let Some(transport) = &self.shared.transport {
-                    transport.follow(&news);
+                if let Some(inter) = &self.shared.inter {
+                    inter.follow(&news);
                 }
                 match news {
                     News::Link(event) => control.link_event(now, *event),
@@ -138,10 +140,15 @@ impl ControlTask {
                         self.shared.epoch.store(epoch, Ordering::Relaxed);
                         control.set_epoch(epoch);
                     }
+                    News::Joined => control.joined(now),
+                    News::Left => control.left(now),
                     News::Discovered(_) => {}
                 }
             }
             control.tick(now, wall_ms());
+            if control.state() == FlowState::Ready && !std::mem::replace(&mut self.was_ready, true) {
+                self.ready.notify_one();
+            }
         }
         // Not locked meanwhile: what is carried out may have a consequence, which is carried out too.
         loop {
@@ -178,8 +185,10 @@ impl ControlTask {
                     FlowState::Draining => HelloState::Draining,
                 };
                 plane.with(|state| state.engine.as_mut().map(|engine| engine.set_state(now, said)));
-                if flow_state == FlowState::Ready {
-                    self.ready.notify_one();
+            }
+            Output::Inter { join } => {
+                if let Some(inter) = &self.shared.inter {
+                    inter.want(join);
                 }
             }
             Output::Plan {
@@ -276,7 +285,7 @@ impl ControlTask {
         let key = (scope, channel);
         let writer = match self.writers.get(&key) {
             Some(writer) => Arc::clone(writer),
-            None => match broker.publisher(&key.1, PublisherOptions::default()) {
+            None => match broker.publisher(&key.1, options_of(broker.kind(), &key.1)) {
                 Ok(writer) => {
                     self.writers.insert(key, Arc::clone(&writer));
                     writer
@@ -288,6 +297,15 @@ impl ControlTask {
             },
         };
         writer.publish_bare(body, deadline);
+    }
+}
+
+/// How a reserved channel is written. What flows of a layer tell one another goes reliably where the broker is DDS: there a burst of
+/// best-effort samples may be lost, and asking for it again takes longer. On Kafka it is reliable as it is.
+fn options_of(kind: BrokerKind, channel: &ChannelName) -> PublisherOptions {
+    PublisherOptions {
+        reliable: kind == BrokerKind::Dds && peers_channel().as_ref() == Some(channel),
+        ..PublisherOptions::default()
     }
 }
 

@@ -9,7 +9,10 @@ use blaze_runtime::admin::{CheckStatus, Gate, Readiness};
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
+use super::inter::InterScope;
 use super::{LocalBrokers, Shared};
+use crate::control::Stage;
+use crate::world::FlowState;
 
 /// `why` looks at what happened during the last one to two of these.
 const MARK: Duration = Duration::from_secs(2);
@@ -66,13 +69,8 @@ pub(super) async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: 
             };
             shared.readiness.set(check, state, detail);
         }
-        if let Some(transport) = &shared.transport {
-            let status = transport.status();
-            let (state, detail) = match (status.ready, listened) {
-                (true, true) => (CheckStatus::Ok, status.detail),
-                (true, false) => (CheckStatus::Failed, "listening for other flows".to_owned()),
-                (false, _) => (CheckStatus::Failed, status.detail),
-            };
+        if let Some(inter) = &shared.inter {
+            let (state, detail) = inter_check(&shared, inter, listened);
             shared.readiness.set("inter", state, detail);
         }
         tokio::select! {
@@ -80,5 +78,39 @@ pub(super) async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: 
             () = tokio::time::sleep(HEALTH) => {}
             () = ready.notified() => listened = true,
         }
+    }
+}
+
+/// Whether flows of other groups are reached, on the inter scope or over a gateway.
+fn inter_check(shared: &Shared, inter: &InterScope, listened: bool) -> (CheckStatus, String) {
+    let (stage, state, gateways) = {
+        let control = shared.control.lock();
+        let gateways: Vec<String> = control.gateways().map(ToString::to_string).collect();
+        (control.stage(), control.state(), gateways)
+    };
+    let apart = !matches!(stage, Stage::Gateway | Stage::Leaving { .. });
+    match inter.status().filter(|_| !apart) {
+        Some(status) if status.ready && listened => (CheckStatus::Ok, status.detail),
+        Some(status) if status.ready => (CheckStatus::Failed, "listening for other flows".to_owned()),
+        Some(status) => (CheckStatus::Failed, status.detail),
+        None if state == FlowState::Starting && stage == Stage::Listening => (
+            CheckStatus::Failed,
+            "listening for flows on the layer broker".to_owned(),
+        ),
+        None if state == FlowState::Starting => {
+            let trouble = inter.trouble();
+            let waits = if trouble.is_empty() {
+                "listening for other flows".to_owned()
+            } else {
+                trouble
+            };
+            (CheckStatus::Failed, waits)
+        }
+        None if gateways.is_empty() => {
+            let detail =
+                "no gateway of this group lives: of the flows that share the layer broker none is on the inter scope";
+            (CheckStatus::Failed, detail.to_owned())
+        }
+        None => (CheckStatus::Ok, format!("over {}", gateways.join(", "))),
     }
 }

@@ -7,6 +7,7 @@ use blaze_domain::{Priority, Scope};
 use prometheus::core::Collector;
 use prometheus::{CounterVec, Encoder, GaugeVec, Opts, Registry, TextEncoder};
 
+use super::inter::InterScope;
 use super::routes::SourceState;
 use super::{Shared, class_label};
 use crate::lane::path::{BridgeState, Phase, TopicId, TopicPath};
@@ -283,8 +284,7 @@ impl Page {
         ] {
             self.link.with_label_values(&[event]).inc_by(count as f64);
         }
-        if let Some(transport) = &shared.transport {
-            let status = transport.status();
+        if let Some(status) = shared.inter.as_ref().and_then(InterScope::status) {
             self.link
                 .with_label_values(&["participant_rebuilt"])
                 .inc_by(status.rebuilds as f64);

@@ -4,8 +4,9 @@
 //! |---|---|---|
 //! | control task | control channels, link news → control core → answers, plans | 1 |
 //! | scope task | health of a local broker, the leases that it keeps → control core | per local scope |
-//! | peers task | who else uses the layer's Kafka, and what they say | 1 where there is one |
+//! | peers task | who else uses the layer broker, and what they say | 1 where there is one |
 //! | source task | one topic of one local scope → message path | per topic and scope that is read |
+//! | inter thread | joins and leaves the inter scope, as the control core wants | 1 where there is one |
 //! | pacer thread | link engine → transport, within the budget | 1 |
 //! | transport threads | transport → link engine → message path → brokers | 3 readers and DDS's own |
 //! | admin task | `/livez`, `/readyz`, `/metrics`, `/v1/…` | 1 and one per connection |
@@ -14,6 +15,7 @@ mod admin;
 mod control_task;
 mod epochs;
 mod health;
+mod inter;
 mod metrics;
 pub mod pacing;
 mod peers_task;
@@ -41,21 +43,20 @@ use tokio::sync::{Notify, watch};
 
 use crate::control::{ControlConfig, ControlCore};
 use crate::lane::core::{DataConfig, DataCore};
-use crate::link::dds::{DdsConfig, DdsStatus, DdsTransport};
-use crate::link::transport::{Endpoint, Transport};
-use crate::link::{DownReason, Engine, EngineConfig, Limits, LinkEvent};
+use crate::link::{Engine, EngineConfig, Limits};
 use crate::registry::{LayerNames, peers_channel};
 use crate::world::LayerScopeId;
 use control_task::Leave;
 pub use epochs::Epochs;
 use health::{readiness, watch_health};
+use inter::InterScope;
 use pacing::Egress;
 use peers_task::PeersTask;
-use plane::{News, Plane, wall_ns};
+use plane::{Plane, wall_ns};
 pub use routes::LocalBrokers;
 use routes::Routes;
 use scope_task::ScopeTask;
-use settings::{FlowSettings, InterSettings, LiveSettings};
+use settings::{FlowSettings, LiveSettings};
 
 /// The layer broker of a flow, and who shares it.
 #[derive(Clone)]
@@ -78,49 +79,6 @@ pub struct FlowOptions {
     pub state_dir: Option<PathBuf>,
 }
 
-/// The inter scope's transport and what it says of itself.
-pub(crate) struct InterTransport {
-    dds: DdsTransport,
-}
-
-impl InterTransport {
-    /// Makes and drops writers as peers come and go. Of a peer that is down the control writer stays: it carries Hello
-    /// until the peer is forgotten, says Goodbye or begins a new life.
-    fn follow(&self, news: &News) {
-        let endpoint = |flow: &FlowId, epoch: u64| Endpoint {
-            flow: flow.clone(),
-            epoch,
-        };
-        let event = match news {
-            News::Discovered(found) => return self.dds.connect(found),
-            News::Link(event) => event.as_ref(),
-            News::Rebuilt(_) => return,
-        };
-        match event {
-            LinkEvent::PeerUp { flow, epoch } => self.dds.connect(&endpoint(flow, *epoch)),
-            LinkEvent::PeerDown {
-                flow,
-                epoch,
-                reason: DownReason::Silent,
-            } => {
-                self.dds
-                    .disconnect(&endpoint(flow, *epoch), &[Priority::State, Priority::Bulk]);
-            }
-            LinkEvent::PeerDown { flow, epoch, .. }
-            | LinkEvent::PeerForgotten { flow, epoch }
-            | LinkEvent::PeerRemoved { flow, epoch } => {
-                self.dds.disconnect(&endpoint(flow, *epoch), Priority::ALL);
-            }
-            LinkEvent::Addresses(addresses) => self.dds.learn_addresses(addresses),
-            _ => {}
-        }
-    }
-
-    fn status(&self) -> DdsStatus {
-        self.dds.status()
-    }
-}
-
 /// What the parts of one flow share.
 pub(crate) struct Shared {
     pub(crate) me: FlowId,
@@ -132,7 +90,7 @@ pub(crate) struct Shared {
     pub(crate) control: Mutex<ControlCore>,
     pub(crate) routes: Routes,
     pub(crate) brokers: LocalBrokers,
-    pub(crate) transport: Option<InterTransport>,
+    pub(crate) inter: Option<InterScope>,
     pub(crate) egress: Arc<Egress>,
     pub(crate) live: Mutex<LiveSettings>,
     pub(crate) readiness: Readiness,
@@ -245,45 +203,41 @@ pub async fn start_with(
         Engine::new(config, now, wall_ns())
     });
     let plane = Plane::new(core, engine);
-    let transport = settings
-        .inter
-        .as_ref()
-        .map(|inter| connect(inter, &settings.me, epoch, &epochs, &plane))
-        .transpose()?;
-    if let Some(transport) = &transport {
-        let addresses = transport.dds.addresses();
-        plane.with(|state| state.engine.as_mut().map(|engine| engine.set_addresses(addresses)));
-    }
-
     let brokers = LocalBrokers {
         node,
         layer: layer.map(|layer| layer.broker),
     };
-    let control = ControlCore::new(
-        ControlConfig {
-            me: settings.me.clone(),
-            kind: settings.kind,
-            epoch,
-            node_scope: brokers.node.is_some(),
-            layer_scope,
-            replicas: layer_kind == Some(BrokerKind::Kafka),
-            inter_scope: settings.inter.is_some(),
-            // Channels there are set up beforehand, so all answers share one.
-            layer_answers_need_id: matches!(layer_kind, Some(BrokerKind::Kafka | BrokerKind::Dds)),
-            layer_names: match layer_kind {
-                Some(BrokerKind::Kafka) => LayerNames::Kafka {
-                    prefix_bytes: layer_prefix.len(),
-                },
-                _ => LayerNames::Any,
+    let config = ControlConfig {
+        me: settings.me.clone(),
+        kind: settings.kind,
+        epoch,
+        node_scope: brokers.node.is_some(),
+        layer_scope,
+        // Within a process flows hear each other over the link alone.
+        replicas: matches!(layer_kind, Some(BrokerKind::Kafka | BrokerKind::Dds)).then_some(said_layer_scope.0),
+        gateway: settings.gateway,
+        inter_scope: settings.inter.is_some(),
+        // Channels there are set up beforehand, so all answers share one.
+        layer_answers_need_id: matches!(layer_kind, Some(BrokerKind::Kafka | BrokerKind::Dds)),
+        layer_names: match layer_kind {
+            Some(BrokerKind::Kafka) => LayerNames::Kafka {
+                prefix_bytes: layer_prefix.len(),
             },
-            lease_stores: brokers.lease_stores(),
-            rules: settings.live.rules.clone(),
-            access: settings.live.access.clone(),
+            _ => LayerNames::Any,
         },
-        now,
-    );
+        lease_stores: brokers.lease_stores(),
+        rules: settings.live.rules.clone(),
+        access: settings.live.access.clone(),
+    };
+    let inter = settings
+        .inter
+        .map(|inter| InterScope::new(inter, settings.me.clone(), epochs, Arc::clone(&plane)));
+    if let Some(inter) = inter.as_ref().filter(|_| config.begins_inside()) {
+        inter.join()?;
+    }
+    let control = ControlCore::new(config, now);
     let egress = Egress::new(settings.live.budget_bytes_per_s());
-    let readiness = readiness(&brokers, transport.is_some());
+    let readiness = readiness(&brokers, inter.is_some());
     let shared = Arc::new(Shared {
         me: settings.me.clone(),
         layer_scope: said_layer_scope,
@@ -292,7 +246,7 @@ pub async fn start_with(
         plane,
         control: Mutex::new(control),
         brokers,
-        transport,
+        inter,
         egress,
         live: Mutex::new(settings.live),
         readiness: readiness.clone(),
@@ -316,6 +270,7 @@ pub async fn start_with(
     let task = control_task::ControlTask {
         shared: Arc::clone(&shared),
         ready: Arc::clone(&ready),
+        was_ready: false,
         writers: HashMap::new(),
         leave: leave.clone(),
     };
@@ -326,16 +281,9 @@ pub async fn start_with(
         TaskPolicy::Essential,
         watch_health(Arc::clone(&shared), ready, supervisor.shutdown_token()),
     );
-    let pacer = if shared.transport.is_some() {
-        let shared = Arc::clone(&shared);
-        let run = move || {
-            if let Some(transport) = &shared.transport {
-                shared.egress.run(&shared.plane, &transport.dds);
-            }
-        };
-        Some(supervisor.spawn_thread("pacer", TaskPolicy::MayEnd, run)?)
-    } else {
-        None
+    let pacer = match shared.inter.is_some() {
+        true => Some(start_inter(&shared, &supervisor)?),
+        false => None,
     };
     Ok(RunningFlow {
         shared,
@@ -408,8 +356,11 @@ impl RunningFlow {
             .with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
         self.leave.gone.cancel();
         let _ = tokio::time::timeout(DRAIN, self.control.finished()).await;
-        if shared.transport.is_some() {
-            tokio::time::sleep(GOODBYE).await;
+        if let Some(inter) = &shared.inter {
+            inter.stop();
+            if inter.is_joined() {
+                tokio::time::sleep(GOODBYE).await;
+            }
         }
         shared.routes.stop();
         let brokers = [&shared.brokers.node, &shared.brokers.layer];
@@ -432,31 +383,21 @@ impl RunningFlow {
     }
 }
 
-fn connect(
-    inter: &InterSettings,
-    me: &FlowId,
-    epoch: u64,
-    epochs: &Epochs,
-    plane: &Arc<Plane>,
-) -> anyhow::Result<InterTransport> {
-    let sink = Arc::clone(plane);
-    let epochs = epochs.clone();
-    let dds = DdsTransport::start(DdsConfig {
-        domain: inter.domain,
-        listen: inter.listen_address(),
-        peers: inter.peers.iter().map(ToString::to_string).collect(),
-        peer_slots: inter.peer_slots,
-        mtu: inter.mtu.into(),
-        chunking: inter.chunking,
-        local: Endpoint {
-            flow: me.clone(),
-            epoch,
-        },
-        next_epoch: Arc::new(move || epochs.renew()),
-        sink: Arc::new(move |event| sink.transport_event(event)),
-    })
-    .context("brokers.inter.dds")?;
-    Ok(InterTransport { dds })
+/// Starts the threads of the inter scope; gives that of the pacer.
+fn start_inter(shared: &Arc<Shared>, supervisor: &Supervisor) -> anyhow::Result<TaskHandle> {
+    let of_inter = Arc::clone(shared);
+    supervisor.spawn_thread("inter", TaskPolicy::MayEnd, move || {
+        if let Some(inter) = &of_inter.inter {
+            inter.run();
+        }
+    })?;
+    let shared = Arc::clone(shared);
+    let run = move || {
+        if let Some(inter) = &shared.inter {
+            shared.egress.run(&shared.plane, inter);
+        }
+    };
+    Ok(supervisor.spawn_thread("pacer", TaskPolicy::MayEnd, run)?)
 }
 
 /// Starts what follows the local brokers.
@@ -465,10 +406,12 @@ fn watch_brokers(shared: &Arc<Shared>, supervisor: &Supervisor, epoch: u64) {
         let Some(broker) = shared.brokers.of(scope) else {
             continue;
         };
-        let shares = scope == Scope::Layer && broker.kind() == BrokerKind::Kafka;
+        let shares = scope == Scope::Layer && matches!(broker.kind(), BrokerKind::Kafka | BrokerKind::Dds);
         let (tell, listened) = watch::channel(true);
-        if let (true, Some(side), Some(channel)) = (shares, broker.flow_side(), peers_channel()) {
-            tell.send_replace(false);
+        if let (true, Some(channel)) = (shares, peers_channel()) {
+            let side = broker.flow_side();
+            // Leases are read when it is known whose the broker is.
+            tell.send_replace(side.is_none());
             let peers = PeersTask {
                 broker: Arc::clone(broker),
                 side,

@@ -1,4 +1,5 @@
-//! Flows that share a Kafka broker hear one another there: those of one layer share its topics, and two layers never use one.
+//! Flows that share a layer broker hear one another there. Of a Kafka broker those of one layer share its topics, and two
+//! layers never use one; on DDS frames of another layer are told apart.
 //!
 //! ```text
 //! control core: Hello, Delta, … ─► blaze/flow/peers ─┬─► Hellos of other layers ─► Claims ─► stand back, or not
@@ -116,7 +117,8 @@ impl Claims {
 pub(super) struct PeersTask {
     pub(super) shared: Arc<Shared>,
     pub(super) broker: Arc<dyn Broker>,
-    pub(super) side: Arc<dyn FlowSide>,
+    /// Where two layers could meet on one broker by mistake.
+    pub(super) side: Option<Arc<dyn FlowSide>>,
     pub(super) channel: ChannelName,
     /// The epoch that this process began with.
     pub(super) began: u64,
@@ -142,6 +144,9 @@ impl PeersTask {
                     .await
                     .ok();
                 since = Instant::now();
+                if subscription.is_some() {
+                    self.shared.control.lock().hears_replicas(since);
+                }
             }
             let ended = tokio::select! {
                 () = self.stop.cancelled() => return,
@@ -151,14 +156,16 @@ impl PeersTask {
             let now = Instant::now();
             self.hear(now, &mut claims, &mut batch);
             let first = claims.first(now);
-            if first.is_some() != standing_back {
+            if let Some(side) = &self.side
+                && first.is_some() != standing_back
+            {
                 standing_back = first.is_some();
                 if let Some(first) = first {
                     tracing::warn!(%first, "another layer's flow uses this Kafka: give each layer a prefix");
                 } else {
                     tracing::info!("the Kafka of this layer is free again");
                 }
-                self.side.stand_back(first.map(ToString::to_string));
+                side.stand_back(first.map(ToString::to_string));
             }
             if subscription.is_some() && now.saturating_duration_since(since) >= LISTEN {
                 self.listened.send_replace(true);

@@ -29,8 +29,12 @@ pub enum News {
     Link(Box<LinkEvent>),
     /// An endpoint was found: writers to it are to be made.
     Discovered(Endpoint),
-    /// The transport died and was rebuilt: the flow has this new epoch on the link.
+    /// The transport was built anew: the flow has this new epoch on the link.
     Rebuilt(u64),
+    /// The inter scope was joined.
+    Joined,
+    /// The inter scope was left.
+    Left,
 }
 
 /// Nanoseconds since 1970.
@@ -254,6 +258,33 @@ impl Plane {
     /// Waits until there is something for [`Plane::take_news`].
     pub async fn news(&self) {
         self.news_waits.notified().await;
+    }
+
+    /// Puts news behind what the link has told before.
+    pub fn push(&self, news: News) {
+        self.news.lock().push_back(news);
+        self.news_waits.notify_one();
+    }
+
+    /// The flow has a new life on the link, without any peer.
+    pub fn begin_life(&self, epoch: u64) {
+        self.with(|state| {
+            state
+                .engine
+                .as_mut()
+                .map(|engine| engine.restart(Instant::now(), epoch))
+        });
+        self.push(News::Rebuilt(epoch));
+    }
+
+    /// The link knows nobody any more.
+    pub fn drop_peers(&self) {
+        self.with(|state| {
+            let engine = state.engine.as_mut()?;
+            let epoch = engine.endpoint().epoch;
+            engine.restart(Instant::now(), epoch);
+            Some(())
+        });
     }
 
     /// Something else has news for the control task.

@@ -2,7 +2,7 @@
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
-use blaze_domain::node_file::{AccessRules, Chunking, FlowSection, NodeFile};
+use blaze_domain::node_file::{AccessRules, AutoBool, Chunking, FlowSection, NodeFile};
 use blaze_domain::{FlowId, LayerKind};
 
 use crate::limit::budget_bytes_per_s;
@@ -70,6 +70,8 @@ pub struct FlowSettings {
     pub admin: SocketAddr,
     /// The inter scope, if the node has one.
     pub inter: Option<InterSettings>,
+    /// Whether it is on the inter scope for the flows that share its layer broker.
+    pub gateway: AutoBool,
     /// What may change.
     pub live: LiveSettings,
 }
@@ -98,6 +100,7 @@ impl TryFrom<&NodeFile> for FlowSettings {
             kind: layer.kind,
             admin: file.admin.flow,
             inter,
+            gateway: file.flow.gateway,
             live: LiveSettings::from(&file.flow),
         })
     }

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use blaze_brokers::PublishOutcome;
-use blaze_domain::{DropReason, Priority};
+use blaze_domain::{DropReason, Priority, Scope};
 
 use super::admit::Admitted;
 use super::core::LaneLink;
@@ -118,8 +118,9 @@ impl BridgeState {
         if message.kept && !self.lane.durable {
             return false;
         }
-        // What a flow wrote stays in the layer: only what was born here leaves for another one.
-        if matches!(self.target, Target::Inter { .. }) && !message.born_here {
+        // What a flow wrote stays in the layer: only what was born here leaves for another one, and what a flow that is not on the
+        // inter scope wrote from its node.
+        if matches!(self.target, Target::Inter { .. }) && !message.born_here && !self.relays(message) {
             return false;
         }
         if self.lane.from.is_empty() {
@@ -128,6 +129,11 @@ impl BridgeState {
         let frame = &message.frame;
         self.lane
             .carries(frame.origin_layer(), frame.origin_node(), frame.origin_service())
+    }
+
+    fn relays(&self, message: &Admitted) -> bool {
+        let frame = &message.frame;
+        self.from == Scope::Layer && message.hops == 1 && self.lane.relays(frame.origin_layer(), frame.origin_node())
     }
 
     /// Whether it is among those that a message is for.

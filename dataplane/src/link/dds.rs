@@ -43,6 +43,12 @@ pub fn max_datagram_bytes(mtu: usize, chunking: Chunking, listen: IpAddr) -> usi
     Wire::new(mtu, chunking, listen.is_loopback()).max_datagram_bytes()
 }
 
+/// Bytes that a datagram takes on the wire with these settings.
+#[must_use]
+pub fn wire_bytes(mtu: usize, chunking: Chunking, listen: IpAddr, datagram_bytes: usize) -> usize {
+    Wire::new(mtu, chunking, listen.is_loopback()).bytes(datagram_bytes)
+}
+
 /// Called with everything that happens. It runs in the threads of the transport and must not wait for long.
 pub type EventSink = Arc<dyn Fn(TransportEvent) + Send + Sync>;
 

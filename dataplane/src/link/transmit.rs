@@ -119,6 +119,8 @@ impl Engine {
             clock: Some(clock),
             egress: self.egress,
             public_key: Bytes::new(),
+            // Who is on the inter scope is a gateway, if its group has any.
+            ..Hello::default()
         }
     }
 

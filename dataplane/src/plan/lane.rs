@@ -51,6 +51,7 @@ impl LaneBuilder {
                 .iter()
                 .any(|(offer, ask)| asks_too_much(offer, ask))
                 .then_some(WhyCode::QosMismatch),
+            relays: Vec::new(),
         };
         self.cap(&mut lane);
         Some(lane)

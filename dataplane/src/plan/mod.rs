@@ -10,10 +10,15 @@
 //! A *group* is the flows that reach each other over one layer broker; a flow without one is a group of its own. Each
 //! message crosses the inter scope once per other group that wants it, to one receiver, which writes its node scope for
 //! its own requesters and its layer scope for everybody else's. What crossed the inter scope never leaves a layer again.
+//!
+//! In a large group only some flows are on the inter scope, its [gateways](gateway). The others publish to the layer scope what
+//! flows of other groups ask for, and read there what those publish: to them, other groups are what a gateway says of them.
 
+pub mod gateway;
 mod lane;
 pub(crate) mod rendezvous;
 mod rules;
+pub(crate) mod told;
 mod view;
 
 #[cfg(test)]
@@ -153,6 +158,9 @@ pub struct LaneSpec {
     pub from: Vec<OriginFilter>,
     /// More is asked than offered; it flows as offered.
     pub degraded: Option<WhyCode>,
+    /// Out of the layer: flows, sorted, that are not on the inter scope, so that what they wrote to the layer scope from their
+    /// own nodes is carried as if it was born there.
+    pub relays: Vec<FlowId>,
 }
 
 impl LaneSpec {
@@ -160,6 +168,13 @@ impl LaneSpec {
     #[must_use]
     pub fn carries(&self, layer: &str, node: &str, service: &str) -> bool {
         self.from.is_empty() || self.from.iter().any(|filter| filter.matches(layer, node, service))
+    }
+
+    /// Whether what the flow of that node wrote to the layer scope is carried out of it.
+    #[must_use]
+    pub fn relays(&self, layer: &str, node: &str) -> bool {
+        let order = |flow: &FlowId| (flow.layer.as_str(), flow.node.as_str()).cmp(&(layer, node));
+        self.relays.binary_search_by(order).is_ok()
     }
 }
 
@@ -268,24 +283,43 @@ impl Planner<'_, '_> {
         let bare = self.view.own_node_requester().filter(|own| own.request.bare);
         let lane = self.lanes.lane(self.view.pairs([publisher], bare));
         self.put(Scope::Node, Target::Node { bare: true }, lane);
-        let lane = self
-            .lanes
-            .lane(self.view.pairs([publisher], self.view.requesters_over_own_layer()));
+        let over_layer = self
+            .view
+            .requesters_over_own_layer()
+            .chain(self.view.requesters_over_gateways());
+        let lane = self.lanes.lane(self.view.pairs([publisher], over_layer));
         self.put(Scope::Node, Target::Layer, lane);
-        self.send_to_other_groups(publisher, previous);
+        self.send_to_other_groups(publisher, &[], previous);
     }
 
-    /// What is on the own layer scope: to the own node, and what was born there to every other group.
+    /// What is on the own layer scope: to the own node, and what was born there, or on a node that is not on the inter scope, to
+    /// every other group.
     fn read_layer(&mut self, previous: Option<&TopicPlan>) {
         if let Some(own) = self.view.own_node_requester() {
             let sources = self.view.publishers_over_own_layer(own);
             let lane = self.lanes.lane(self.view.pairs(sources, [own]));
             self.put_node(Scope::Layer, own, lane);
         }
-        let publisher = self.view.own_layer_publisher();
-        if let Some(publisher) = publisher.filter(|_| self.view.owner() == Some(self.view.me)) {
-            self.send_to_other_groups(publisher, previous);
+        if self.view.owner() != Some(self.view.me) {
+            return;
         }
+        let relayed: Vec<_> = self.view.relayed_publishers().collect();
+        let carried = self
+            .view
+            .own_layer_publisher()
+            .into_iter()
+            .chain(relayed.iter().copied());
+        let Some(offer) = told::merge_offers(carried.map(|publisher| publisher.advertise)) else {
+            return;
+        };
+        let publisher = Publisher {
+            flow: self.view.me,
+            group: self.view.group,
+            scope: Scope::Layer,
+            advertise: &offer,
+        };
+        let relays: Vec<FlowId> = relayed.iter().map(|publisher| publisher.flow.clone()).collect();
+        self.send_to_other_groups(&publisher, &relays, previous);
     }
 
     /// What other groups publish, where their senders choose this flow.
@@ -310,7 +344,7 @@ impl Planner<'_, '_> {
     }
 
     /// One copy to one flow of each other group that asks for it.
-    fn send_to_other_groups(&mut self, publisher: &Publisher<'_>, previous: Option<&TopicPlan>) {
+    fn send_to_other_groups(&mut self, publisher: &Publisher<'_>, relays: &[FlowId], previous: Option<&TopicPlan>) {
         let kept: Vec<&FlowId> = previous
             .iter()
             .flat_map(|plan| &plan.bridges)
@@ -320,7 +354,11 @@ impl Planner<'_, '_> {
         for (group, requesters) in self.view.requesters_outside() {
             let lane = self
                 .lanes
-                .lane(self.view.pairs([publisher], requesters.iter().copied()));
+                .lane(self.view.pairs([publisher], requesters.iter().copied()))
+                .map(|lane| LaneSpec {
+                    relays: relays.to_vec(),
+                    ..lane
+                });
             let Some(receiver) = self.view.next_receiver(publisher, group, &kept) else {
                 continue;
             };

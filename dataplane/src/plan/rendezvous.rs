@@ -9,6 +9,14 @@ pub(crate) fn choose<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>
     candidates.max_by(|a, b| weight(key, a).cmp(&weight(key, b)).then_with(|| b.cmp(a)))
 }
 
+/// The candidates with the largest weights for a key, at most so many, best first.
+pub(crate) fn best<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>, most: usize) -> Vec<&'a FlowId> {
+    let mut ranked: Vec<&FlowId> = candidates.collect();
+    ranked.sort_by(|a, b| weight(key, b).cmp(&weight(key, a)).then_with(|| a.cmp(b)));
+    ranked.truncate(most);
+    ranked
+}
+
 /// FNV-1a (64 bits) over `topic 0xFF layer 0xFF node`, then the finaliser of SplitMix64, because FNV alone leaves the
 /// high bits of similar names alike. It is part of what flows agree on: a change of it moves topics between versions.
 fn weight(key: &str, flow: &FlowId) -> u64 {

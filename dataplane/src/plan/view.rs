@@ -1,12 +1,13 @@
 //! The world as one topic sees it: publishers, requesters, and who of them matches whom.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::iter;
 
 use blaze_domain::{FlowId, LayerName, Scope, TopicName, WhyCode};
 
-use super::{Blocked, Destination, rendezvous};
+use super::{Blocked, Destination, gateway, rendezvous};
 use crate::world::{
-    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, TopicEntry, World,
+    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, Role, TopicEntry, World,
 };
 
 /// Flows that reach each other over one layer broker.
@@ -79,6 +80,10 @@ impl Publisher<'_> {
     }
 
     fn has_origin(&self, filter: &OriginFilter) -> bool {
+        if self.scope == Scope::Inter {
+            // A gateway does not say which layers it speaks for; what comes is looked at one by one.
+            return true;
+        }
         let part = |wanted: &Option<String>, found: &str| wanted.as_deref().is_none_or(|wanted| wanted == found);
         if !part(&filter.layer, self.flow.layer.as_str()) {
             return false;
@@ -113,6 +118,12 @@ pub(crate) struct TopicView<'w> {
     pub(crate) requesters: Vec<Requester<'w>>,
     /// Of flows that are down.
     lost_requesters: Vec<Requester<'w>>,
+    /// Whether this flow is on the inter scope.
+    role: Role,
+    /// Flows of the own group that are on the inter scope for it and carry topics.
+    gateways: Vec<&'w FlowId>,
+    /// Flows of the own group that are not.
+    members: BTreeSet<&'w FlowId>,
 }
 
 impl<'w> TopicView<'w> {
@@ -127,6 +138,9 @@ impl<'w> TopicView<'w> {
             publishers: Vec::new(),
             requesters: Vec::new(),
             lost_requesters: Vec::new(),
+            role: own.role,
+            gateways: gateway::gateways(world).collect(),
+            members: gateway::members(world).collect(),
         };
         for (id, flow) in &world.flows {
             if let Some(entry) = flow.topics.get(topic) {
@@ -138,12 +152,18 @@ impl<'w> TopicView<'w> {
 
     fn add(&mut self, flow: &'w FlowId, view: &'w FlowView, entry: &'w TopicEntry) {
         let group = Group::of(flow, view);
+        if group != self.group && !self.role.is_inside() {
+            // Only a gateway knows what flows outside want, and says it.
+            return;
+        }
         let node = view.node_scope.then_some((Scope::Node, &entry.node));
         let layer = view.layer_scope.map(|_| (Scope::Layer, &entry.layer));
         // A flow knows that it lives; what it is told of itself does not count.
         let reachable = view.reach != Reach::Down || flow == self.me;
         let carries = reachable && view.state == FlowState::Ready;
-        for (scope, entry) in node.into_iter().chain(layer) {
+        let behind = flow != self.me && group == self.group && view.role.is_gateway() && !self.role.is_gateway();
+        let outside = (behind && carries).then_some((Scope::Inter, &entry.outside));
+        for (scope, entry) in node.into_iter().chain(layer).chain(outside) {
             if let Some(advertise) = entry.advertise.as_ref().filter(|_| carries) {
                 self.publishers.push(Publisher {
                     flow,
@@ -188,10 +208,42 @@ impl<'w> TopicView<'w> {
 
     /// Everybody whom a message reaches that this flow writes to its layer scope: services there, other flows' services.
     pub(crate) fn requesters_over_own_layer(&self) -> impl Iterator<Item = &Requester<'w>> + Clone {
-        let of_layer = |requester: &Requester<'_>| requester.scope == Scope::Layer || requester.flow != self.me;
+        let of_layer = |requester: &Requester<'_>| match requester.scope {
+            Scope::Layer => true,
+            Scope::Node => requester.flow != self.me,
+            Scope::Inter => false,
+        };
         self.requesters
             .iter()
             .filter(move |requester| requester.group == self.group && of_layer(requester))
+    }
+
+    /// Flows of the own group that are on the inter scope for it and carry topics.
+    pub(crate) fn gateways(&self) -> &[&'w FlowId] {
+        &self.gateways
+    }
+
+    /// Whether this flow is not on the inter scope, and no other flow is for it.
+    pub(crate) fn lacks_gateway(&self) -> bool {
+        self.role == Role::Member && self.gateways.is_empty()
+    }
+
+    /// Requesters of other groups, as gateways say, of which this flow is none: what it writes to its layer scope reaches them.
+    pub(crate) fn requesters_over_gateways(&self) -> impl Iterator<Item = &Requester<'w>> + Clone {
+        self.requesters
+            .iter()
+            .filter(|requester| requester.scope == Scope::Inter)
+    }
+
+    /// Publishers on nodes of flows that are not on the inter scope, or were not until a moment ago: what they write to the
+    /// layer scope is carried out of it.
+    pub(crate) fn relayed_publishers(&self) -> impl Iterator<Item = &Publisher<'w>> {
+        let relayed = |publisher: &&Publisher<'w>| {
+            let view = self.world.flows.get(publisher.flow);
+            let apart = view.is_some_and(|view| view.role != Role::Gateway);
+            publisher.group == self.group && publisher.scope == Scope::Node && apart
+        };
+        self.publishers.iter().filter(relayed)
     }
 
     /// Whose messages reach the layer scope without this flow, given that its own node asks for them.
@@ -245,10 +297,18 @@ impl<'w> TopicView<'w> {
         publisher: &'p Publisher<'w>,
         group: Group<'w>,
     ) -> impl Iterator<Item = &'w FlowId> + use<'p, 'w> {
-        let in_group = self.requesters.iter().filter(move |requester| requester.group == group);
+        let in_group = self.requesters.iter().filter(move |requester| {
+            requester.group == group && requester.scope != Scope::Inter && publisher.matches(requester)
+        });
+        let behind = |requester: &&Requester<'w>| self.members.contains(requester.flow);
+        // For those that are not on the inter scope any gateway can: it writes to the layer scope for them.
+        let for_members = group == self.group && in_group.clone().any(|requester| behind(&requester));
+        let leaving = iter::once(self.me).filter(|_| self.role == Role::Leaving);
+        let gateways = self.gateways.iter().copied().chain(leaving);
         in_group
-            .filter(|requester| publisher.matches(requester))
+            .filter(move |requester| !behind(requester))
             .map(|requester| requester.flow)
+            .chain(gateways.filter(move |_| for_members))
     }
 
     /// The flow of a group that gets what the publisher sends: one of `kept` if it still could, else by rendezvous.
@@ -283,7 +343,9 @@ impl<'w> TopicView<'w> {
     }
 
     fn is_settled(&self, flow: &FlowId) -> bool {
-        self.world.flows.get(flow).is_some_and(|view| view.settled)
+        let view = self.world.flows.get(flow);
+        // What a flow wrote to the layer scope before it was a gateway it does not carry out itself.
+        view.is_some_and(|view| view.settled && view.role != Role::NewGateway)
     }
 
     /// The flow of the own group that carries what is published on the layer scope to other groups.
@@ -298,7 +360,14 @@ impl<'w> TopicView<'w> {
     /// the next one begins.
     pub(crate) fn owner_in(&self, group: Group<'w>) -> Option<&'w FlowId> {
         let of_group = |publisher: &&Publisher<'_>| publisher.group == group && publisher.scope == Scope::Layer;
-        let able = || self.publishers.iter().filter(of_group).map(|publisher| publisher.flow);
+        let own = group == self.group;
+        let relays = own && self.relayed_publishers().next().is_some();
+        let able = || {
+            let there = self.publishers.iter().filter(of_group).map(|publisher| publisher.flow);
+            there
+                .filter(|flow| !own || self.gateways.contains(flow))
+                .chain(self.gateways.iter().copied().filter(|_| relays))
+        };
         let choose = |flows: &mut dyn Iterator<Item = &'w FlowId>| rendezvous::choose(self.topic.as_str(), flows);
         let current = choose(&mut able().filter(|flow| self.carries_out(flow)));
         match current {
@@ -317,10 +386,10 @@ impl<'w> TopicView<'w> {
             .is_some_and(|part| part.carrying == Carrying::Carries)
     }
 
-    /// A flow of a group that is going away and has not said yet where the next one begins.
+    /// A flow of a group that is going away, or is no gateway any more, and has not said yet where the next one begins.
     fn leaving_carrier(&self, group: Group<'w>) -> Option<&'w FlowId> {
         let leaving = |(id, flow): &(&'w FlowId, &'w FlowView)| {
-            flow.state == FlowState::Draining
+            (flow.state == FlowState::Draining || !flow.role.is_gateway())
                 && flow.reach != Reach::Down
                 && *id != self.me
                 && Group::of(id, flow) == group
@@ -333,8 +402,9 @@ impl<'w> TopicView<'w> {
     /// nobody there wants it, nobody.
     pub(crate) fn other_carrier(&self) -> Option<FlowId> {
         let on_layer = |publisher: &&Publisher<'_>| publisher.group == self.group && publisher.scope == Scope::Layer;
-        let outside = || self.requesters.iter().filter(|requester| requester.group != self.group);
-        let published = self.publishers.iter().filter(on_layer);
+        let is_outside = |requester: &&Requester<'_>| requester.group != self.group || requester.scope == Scope::Inter;
+        let outside = || self.requesters.iter().filter(is_outside);
+        let published = self.publishers.iter().filter(on_layer).chain(self.relayed_publishers());
         self.pairs(published, outside()).next()?;
         self.owner().filter(|owner| *owner != self.me).cloned()
     }

@@ -238,4 +238,6 @@ fn only_routes(entry: &wire::Entry) -> bool {
         && entry.layer_advertise.is_none()
         && entry.node_request.is_none()
         && entry.layer_request.is_none()
+        && entry.outside_advertise.is_none()
+        && entry.outside_request.is_none()
 }

@@ -29,6 +29,7 @@ pub(super) fn merge<'a>(leases: &(impl Iterator<Item = LeaseView<'a>> + Clone)) 
     TopicEntry {
         node: of(Scope::Node),
         layer: of(Scope::Layer),
+        ..TopicEntry::default()
     }
 }
 

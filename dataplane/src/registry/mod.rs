@@ -10,6 +10,7 @@
 
 mod access;
 mod announce;
+mod gateways;
 mod holder;
 mod kept;
 mod leases;
@@ -32,6 +33,7 @@ use blaze_domain::control::{
     Answer, ControlError, ControlMessage, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload,
 };
 use blaze_domain::names::ChannelName;
+use blaze_domain::node_file::AutoBool;
 use blaze_domain::{Durability, FlowId, Scope, TopicName};
 use blaze_proto::link::link_control::{Body, RouteState};
 
@@ -51,17 +53,40 @@ pub use stored::{Restored, UnsavedLease};
 pub use types::{AnswerOut, Changes, ControlOutcome, EventDraft, RegistryConfig, RemoteLease, SyncFaults};
 pub(crate) use wire::MAX_ROUTES;
 
-use crate::world::{FlowState, FlowView, Reach, ScopeEntry, World};
+use crate::world::{FlowState, FlowView, Reach, Role, ScopeEntry, World};
+
+/// A message to another flow that waits for [`Registry::poll`].
+struct Outgoing {
+    /// `None`: to everybody on the channel of the layer broker.
+    to: Option<FlowId>,
+    body: Body,
+}
+
+/// Where flows hear each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Way {
+    /// On the inter scope.
+    Link,
+    /// On the channel of the layer broker.
+    Layer,
+}
 
 /// All that a flow knows of who publishes and who wants which topic.
 pub struct Registry {
     config: RegistryConfig,
     leases: LeaseTable,
     routes: BTreeMap<TopicName, Vec<RouteState>>,
+    /// What flows of other groups are told.
     announcer: Announcer,
+    /// What flows are told that share the layer broker, on its channel.
+    layer_announcer: Announcer,
+    /// Parts of snapshots that were said on that channel lately: version and part.
+    said_parts: BTreeMap<(u64, u32), Instant>,
+    /// A gateway spoke for flows of its group when it was last looked at.
+    spoke_for_others: bool,
     remotes: BTreeMap<FlowId, Remote>,
     world: World,
-    outgoing: VecDeque<(FlowId, Body)>,
+    outgoing: VecDeque<Outgoing>,
     /// For the channel of the layer broker; `None` = everybody there.
     layer_outgoing: Vec<(Option<FlowId>, Body)>,
     /// Where flows stopped that carried a topic out of the layer.
@@ -90,6 +115,8 @@ impl Registry {
             topics: BTreeMap::new(),
             settled: false,
             parts: BTreeMap::new(),
+            gateway: AutoBool::Auto,
+            role: Role::Gateway,
         };
         Self {
             leases: LeaseTable::new(config.max_leases.min(MAX_LEASED_ENTRIES), config.lease_stores.clone()),
@@ -98,6 +125,9 @@ impl Registry {
             off: BTreeSet::new(),
             routes: BTreeMap::new(),
             announcer: Announcer::default(),
+            layer_announcer: Announcer::default(),
+            said_parts: BTreeMap::new(),
+            spoke_for_others: false,
             remotes: BTreeMap::new(),
             world: World {
                 me: config.me.clone(),
@@ -128,7 +158,7 @@ impl Registry {
     #[must_use]
     pub fn faults(&self) -> SyncFaults {
         SyncFaults {
-            left_out_routes: self.announcer.left_out,
+            left_out_routes: self.announcer.left_out.max(self.layer_announcer.left_out),
             ..self.faults
         }
     }
@@ -352,7 +382,7 @@ impl Registry {
             } else {
                 own.topics.insert(topic.clone(), merged);
             }
-            self.announcer.mark(now, topic.clone());
+            self.mark(now, &topic);
             changed.insert(topic);
         }
         changed
@@ -439,7 +469,7 @@ impl Registry {
         } else {
             self.routes.insert(topic.clone(), routes);
         }
-        self.announcer.mark(now, topic.clone());
+        self.mark(now, topic);
     }
 }
 

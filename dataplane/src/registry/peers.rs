@@ -3,23 +3,24 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
+use blaze_domain::node_file::AutoBool;
 use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
 use blaze_proto::link::link_control::{Body, Hello, Kind, RouteState, State};
 
 use super::remote::Remote;
 use super::types::RemoteLease;
-use super::{Registry, wire};
-use crate::world::{FlowState, FlowView, LayerScopeId, Reach};
+use super::{Outgoing, Registry, Way};
+use crate::world::{FlowState, FlowView, LayerScopeId, Reach, Role};
 
 /// Most other flows that are followed.
-pub const MAX_FLOWS: usize = 1024;
+pub const MAX_FLOWS: usize = 1280;
 /// Snapshots that are pulled at a time, so that their unfinished parts stay few.
 const MAX_PULLS: usize = 8;
 /// Messages to other flows that wait for [`Registry::poll`]; snapshot parts beyond it are asked for again.
 const MAX_OUTGOING: usize = 2048;
 
 impl Registry {
-    /// Version and digest of the announced state, for the own Hello.
+    /// Version and digest of what flows of other groups are told, for the own Hello on the inter scope.
     #[must_use]
     pub fn announced(&self) -> (u64, u64) {
         self.announcer.announced()
@@ -27,7 +28,7 @@ impl Registry {
 
     /// Another flow said Hello on the inter scope. Returns the topics to plan anew.
     pub fn on_hello(&mut self, now: Instant, from: &FlowId, hello: &Hello) -> BTreeSet<TopicName> {
-        let mut changed = self.hear(now, from, hello);
+        let mut changed = self.hear(now, from, hello, Way::Link);
         if let Some(remote) = self.remotes.get_mut(from) {
             remote.ways.link.get_or_insert(Reach::Up);
         }
@@ -36,7 +37,7 @@ impl Registry {
     }
 
     /// Another flow said Hello somewhere. Returns the topics to plan anew.
-    pub(super) fn hear(&mut self, now: Instant, from: &FlowId, hello: &Hello) -> BTreeSet<TopicName> {
+    pub(super) fn hear(&mut self, now: Instant, from: &FlowId, hello: &Hello, way: Way) -> BTreeSet<TopicName> {
         let Some(kind) = kind_of(hello).filter(|_| {
             *from != self.config.me && from.layer.as_str() == hello.layer && from.node.as_str() == hello.node
         }) else {
@@ -50,6 +51,11 @@ impl Registry {
         };
         let layer_scope = (hello.layer_scope_id != 0).then_some(LayerScopeId(hello.layer_scope_id));
         let mut changed = BTreeSet::new();
+        // Of a flow that shares the layer broker counts what it says there: on the inter scope it speaks to others, and under
+        // lives of their own.
+        if way == Way::Link && self.is_heard_on_layer(from) {
+            return changed;
+        }
         match self.world.flows.get(from).map(|view| view.epoch) {
             Some(epoch) if hello.epoch < epoch => {
                 self.faults.old_epochs += 1;
@@ -68,6 +74,14 @@ impl Registry {
             self.faults.too_many_flows += 1;
             return changed;
         }
+        let (gateway, role) = match way {
+            Way::Link => (AutoBool::Yes, Role::Gateway),
+            Way::Layer => self.said_role(now, from, hello),
+        };
+        let patience = match way {
+            Way::Link => Duration::ZERO,
+            Way::Layer => self.patience(from),
+        };
         let view = self.world.flows.entry(from.clone()).or_insert_with(|| FlowView {
             kind,
             epoch: hello.epoch,
@@ -78,6 +92,8 @@ impl Registry {
             topics: BTreeMap::new(),
             settled: false,
             parts: BTreeMap::new(),
+            gateway,
+            role,
         });
         // One that is heard in two places may say of itself what it said before.
         let state = if is_new || rank(state) >= rank(view.state) {
@@ -85,10 +101,11 @@ impl Registry {
         } else {
             view.state
         };
-        let same = !is_new && (view.kind, view.state, view.layer_scope) == (kind, state, layer_scope);
-        (view.kind, view.state, view.layer_scope) = (kind, state, layer_scope);
+        let said = (kind, state, layer_scope, gateway, role);
+        let same = !is_new && (view.kind, view.state, view.layer_scope, view.gateway, view.role) == said;
+        (view.kind, view.state, view.layer_scope, view.gateway, view.role) = said;
         let remote = self.remotes.entry(from.clone()).or_insert_with(Remote::new);
-        remote.on_hello(now, hello.registry_version, hello.registry_digest);
+        remote.on_hello(now, hello.registry_version, hello.registry_digest, patience);
         if !same {
             // Which flow receives, reads or answers hangs on all live flows, whatever their own topics are.
             changed.extend(self.all_topics());
@@ -113,6 +130,15 @@ impl Registry {
     /// Another flow sent a Delta, a SnapshotRequest or a Snapshot; other bodies are not the registry's. Returns the
     /// topics to plan anew.
     pub fn on_control(&mut self, now: Instant, from: &FlowId, body: Body) -> BTreeSet<TopicName> {
+        let answers = matches!(body, Body::SnapshotRequest(_));
+        if !answers && self.is_heard_on_layer(from) {
+            return BTreeSet::new();
+        }
+        self.take(now, from, body, Way::Link)
+    }
+
+    /// The same, wherever it was heard.
+    pub(super) fn take(&mut self, now: Instant, from: &FlowId, body: Body, way: Way) -> BTreeSet<TopicName> {
         let (Some(remote), Some(view)) = (self.remotes.get_mut(from), self.world.flows.get_mut(from)) else {
             self.faults.unknown_flows += 1;
             return BTreeSet::new();
@@ -121,11 +147,18 @@ impl Registry {
             Body::Delta(delta) => remote.on_delta(now, delta, &mut view.topics, &mut self.faults),
             Body::Snapshot(snapshot) => remote.on_snapshot(now, snapshot, &mut view.topics, &mut self.faults),
             Body::SnapshotRequest(request) => {
-                for part in self.announcer.request(now, &request) {
+                // On the channel of the layer broker all hear the answer.
+                let (to, mut parts) = match way {
+                    Way::Link => (Some(from.clone()), self.announcer.request(now, &request)),
+                    Way::Layer => (None, self.layer_announcer.request(now, &request)),
+                };
+                parts.retain(|part| to.is_some() || self.say_part(now, part.version, part.part));
+                for part in parts {
                     if self.outgoing.len() >= MAX_OUTGOING {
                         self.faults.dropped_replies += 1;
                     } else {
-                        self.outgoing.push_back((from.clone(), Body::Snapshot(part)));
+                        let (to, body) = (to.clone(), Body::Snapshot(part));
+                        self.outgoing.push_back(Outgoing { to, body });
                     }
                 }
                 return BTreeSet::new();
@@ -175,29 +208,28 @@ impl Registry {
         let topics = self.all_topics();
         self.remotes.remove(flow);
         self.world.flows.remove(flow);
-        self.outgoing.retain(|(to, _)| to != flow);
+        self.outgoing.retain(|message| message.to.as_ref() != Some(flow));
         topics
     }
 
     /// What is to be sent to other flows now; each encodes to at most [`MAX_LINK_CONTROL_BYTES`](super::MAX_LINK_CONTROL_BYTES).
     pub fn poll(&mut self, now: Instant) -> Vec<(FlowId, Body)> {
-        let mut messages: Vec<(FlowId, Body)> = self.outgoing.drain(..).collect();
+        let mut messages = Vec::new();
         let mut layer = Vec::new();
-        self.announcer.tidy(now);
-        let own = self.world.flows.get(&self.config.me);
-        let routes = &self.routes;
-        let deltas = self.announcer.announce(now, |topic| {
-            let entry = own.and_then(|own| own.topics.get(topic));
-            let routes = routes.get(topic).map(Vec::as_slice);
-            (entry.is_some() || routes.is_some())
-                .then(|| wire::to_wire(topic, &entry.cloned().unwrap_or_default(), routes.unwrap_or_default()))
-        });
-        for (flow, _) in self.remotes.iter().filter(|(_, remote)| remote.ways.over_link()) {
+        for Outgoing { to, body } in self.outgoing.drain(..) {
+            match to {
+                Some(to) => messages.push((to, body)),
+                None => layer.push((None, body)),
+            }
+        }
+        let (deltas, layer_deltas) = self.announce(now);
+        // Those who share the layer broker hear of it there whatever becomes of the link: what is handed over must arrive.
+        let over_link = |remote: &Remote| remote.ways.over_link() && !remote.ways.over_layer();
+        for (flow, _) in self.remotes.iter().filter(|(_, remote)| over_link(remote)) {
             messages.extend(deltas.iter().map(|delta| (flow.clone(), Body::Delta(delta.clone()))));
         }
-        // Those who share the layer broker hear of it there whatever becomes of the link: what is handed over must arrive.
         if self.remotes.values().any(|remote| remote.ways.over_layer()) {
-            layer.extend(deltas.into_iter().map(|delta| (None, Body::Delta(delta))));
+            layer.extend(layer_deltas.into_iter().map(|delta| (None, Body::Delta(delta))));
         }
         // First the pulls that go on: one that is given up makes room for another. Then those that waited longest.
         let mut order: Vec<(bool, Instant, FlowId)> = self
@@ -216,16 +248,17 @@ impl Registry {
                 .remotes
                 .get_mut(&flow)
                 .and_then(|remote| remote.poll(now, may_start));
-            messages.extend(request.map(|request| (flow, Body::SnapshotRequest(request))));
+            let Some(request) = request.map(Body::SnapshotRequest) else {
+                continue;
+            };
+            if self.is_heard_on_layer(&flow) {
+                layer.push((Some(flow), request));
+            } else {
+                messages.push((flow, request));
+            }
         }
-        // Where there is no link, over the layer broker.
-        let (over_layer, over_link) = messages.into_iter().partition::<Vec<_>, _>(|(flow, _)| {
-            let ways = self.remotes.get(flow).map(|remote| remote.ways);
-            ways.is_some_and(|ways| !ways.over_link() && ways.over_layer())
-        });
-        layer.extend(over_layer.into_iter().map(|(flow, body)| (Some(flow), body)));
         self.layer_outgoing = layer;
-        over_link
+        messages
     }
 
     fn pulls(&self) -> usize {
@@ -247,11 +280,12 @@ impl Registry {
         requests
             .filter_map(|(_, remote)| remote.next_poll())
             .chain(self.announcer.due())
+            .chain(self.layer_announcer.due())
             .min()
     }
 
     /// What other flows told of a topic, by flow and scope. The layer scope of a flow that shares the own layer broker
-    /// is left out: those services hold leases here.
+    /// is left out: those services hold leases here. What a gateway tells of flows of other groups is of its inter scope.
     pub fn remote_leases<'a>(&'a self, topic: &'a TopicName) -> impl Iterator<Item = RemoteLease<'a>> {
         let shares = |flow: &FlowId, view: &FlowView| {
             flow.layer == self.config.me.layer
@@ -268,14 +302,18 @@ impl Registry {
                 let layer = entry
                     .filter(|_| !shares(flow, view))
                     .map(|entry| (Scope::Layer, &entry.layer));
-                node.into_iter().chain(layer).filter_map(move |(scope, entry)| {
-                    (entry.advertise.is_some() || entry.request.is_some()).then_some(RemoteLease {
-                        flow,
-                        scope,
-                        advertise: entry.advertise.as_ref(),
-                        request: entry.request.as_ref(),
+                let outside = entry.map(|entry| (Scope::Inter, &entry.outside));
+                node.into_iter()
+                    .chain(layer)
+                    .chain(outside)
+                    .filter_map(move |(scope, entry)| {
+                        (entry.advertise.is_some() || entry.request.is_some()).then_some(RemoteLease {
+                            flow,
+                            scope,
+                            advertise: entry.advertise.as_ref(),
+                            request: entry.request.as_ref(),
+                        })
                     })
-                })
             })
     }
 
@@ -293,7 +331,10 @@ impl Registry {
 }
 
 fn is_reachable(remote: &Remote) -> bool {
-    remote.ways.over_link() || remote.ways.over_layer()
+    match remote.ways.layer {
+        Some(sign) => !sign.over,
+        None => remote.ways.over_link(),
+    }
 }
 
 /// A flow begins, is ready, and goes: never the other way round in one life.

@@ -49,6 +49,10 @@ fn atoms(entry: &wire::Entry) -> Vec<wire::Entry> {
             layer_advertise: entry.layer_advertise.clone(),
             ..blank()
         },
+        wire::Entry {
+            outside_advertise: entry.outside_advertise.clone(),
+            ..blank()
+        },
     ];
     let mut request = |request: Option<wire::Request>, place: fn(wire::Entry, wire::Request) -> wire::Entry| {
         let Some(mut request) = request else { return };
@@ -68,6 +72,10 @@ fn atoms(entry: &wire::Entry) -> Vec<wire::Entry> {
     });
     request(entry.layer_request.clone(), |entry, request| wire::Entry {
         layer_request: Some(request),
+        ..entry
+    });
+    request(entry.outside_request.clone(), |entry, request| wire::Entry {
+        outside_request: Some(request),
         ..entry
     });
     atoms.extend(entry.route_state.iter().map(|route| wire::Entry {
@@ -91,6 +99,8 @@ fn absorb(into: &mut wire::Entry, piece: wire::Entry) {
     into.layer_advertise = into.layer_advertise.take().or(piece.layer_advertise);
     request(&mut into.node_request, piece.node_request);
     request(&mut into.layer_request, piece.layer_request);
+    into.outside_advertise = into.outside_advertise.take().or(piece.outside_advertise);
+    request(&mut into.outside_request, piece.outside_request);
     into.route_state.extend(piece.route_state);
 }
 

@@ -32,6 +32,14 @@ impl Pull {
         }
     }
 
+    /// A pull of what another flow has asked for; what does not come is asked for later.
+    pub(super) fn overheard(now: Instant, retry: Duration) -> Self {
+        Self {
+            next_request: now + retry,
+            ..Self::new(now)
+        }
+    }
+
     /// Whether all parts came.
     pub(super) fn is_complete(&self) -> bool {
         self.version.is_some() && self.missing == 0

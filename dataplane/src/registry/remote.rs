@@ -70,6 +70,10 @@ pub(super) struct Remote {
     pub(super) ways: Ways,
     /// Since when it has been ready, without a break.
     pub(super) ready_since: Option<Instant>,
+    /// The life that its process began with, as it says on the channel of the layer broker.
+    pub(super) began: Option<u64>,
+    /// Since when it has been a gateway, if it was none while it carried topics before.
+    pub(super) new_gateway: Option<Instant>,
 }
 
 /// The entries of a flow, as its view in the world has them.
@@ -91,6 +95,8 @@ impl Remote {
             retry: DEFAULT_RETRY,
             ways: Ways::default(),
             ready_since: None,
+            began: None,
+            new_gateway: None,
         }
     }
 
@@ -128,8 +134,8 @@ impl Remote {
         self.pull_at = None;
     }
 
-    /// The flow told which version it has announced.
-    pub(super) fn on_hello(&mut self, now: Instant, version: u64, digest: u64) {
+    /// The flow told which version it has announced. What is to be pulled is not asked for within `patience`.
+    pub(super) fn on_hello(&mut self, now: Instant, version: u64, digest: u64, patience: Duration) {
         if version < self.version {
             // A late Hello, unless the next ones say so too.
             self.older_hellos += 1;
@@ -146,7 +152,9 @@ impl Remote {
             return;
         }
         self.doubt |= version == self.version;
-        self.plan_pull(now);
+        if self.pull.is_none() && self.pull_at.is_none() {
+            self.plan_pull(now + patience);
+        }
     }
 
     fn settle(&mut self) {
@@ -263,6 +271,11 @@ impl Remote {
         topics: &mut Topics,
         faults: &mut SyncFaults,
     ) -> BTreeSet<TopicName> {
+        if self.pull.is_none() && self.pull_at.is_some() {
+            // Somebody else has asked for what this one was about to ask for, and all hear the answer.
+            self.pull_at = None;
+            self.pull = Some(Pull::overheard(now, self.retry));
+        }
         let Some(pull) = &mut self.pull else {
             faults.unasked_parts += 1;
             return BTreeSet::new();

@@ -1,8 +1,8 @@
 //! Flows of the own layer on the channel that they share on their layer broker, with or without an inter scope between them.
 //!
 //! A flow that was ever heard there lives as long as it is heard there: whoever has lost the broker cannot carry its topics,
-//! whatever the inter scope says. Deltas are broadcast, requests and snapshots name whom they are for; between two flows
-//! with a link they go over that.
+//! whatever the inter scope says, and what it says there is what counts, with or without a link. Deltas are broadcast, requests
+//! and snapshots name whom they are for.
 
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use blaze_domain::{FlowId, TopicName};
 use blaze_proto::link::link_control::{Body, Hello};
 
-use super::Registry;
 use super::remote::Remote;
+use super::{Registry, Way};
 use crate::world::{FlowState, Reach, SETTLED_AFTER};
 
 /// A flow that was not heard on the layer broker for this long is gone.
@@ -58,25 +58,28 @@ impl Ways {
 }
 
 impl Registry {
-    /// A flow that shares the layer broker said Hello there; the server took that at `appended_ms` of its clock. Returns the
-    /// topics to plan anew.
+    /// A flow that shares the layer broker said Hello there, and the life that its process `began` with; the server took that at
+    /// `appended_ms` of its clock. Returns the topics to plan anew.
     pub fn on_layer_hello(
         &mut self,
         now: Instant,
         from: &FlowId,
         hello: &Hello,
+        began: u64,
         appended_ms: Option<i64>,
     ) -> BTreeSet<TopicName> {
         let own = self.world.own().and_then(|own| own.layer_scope);
         if from.layer != self.config.me.layer || own.is_none_or(|own| own.0 != hello.layer_scope_id) {
             return BTreeSet::new();
         }
-        let mut changed = self.hear(now, from, hello);
+        self.follow_life(from, hello.epoch, began);
+        let mut changed = self.hear(now, from, hello, Way::Layer);
         let epoch = self.world.flows.get(from).map(|view| view.epoch);
         if epoch != Some(hello.epoch) {
             return changed;
         }
         if let Some(remote) = self.remotes.get_mut(from) {
+            remote.began = Some(began);
             remote.ways.layer = Some(Sign {
                 at: now,
                 appended_ms,
@@ -99,7 +102,7 @@ impl Registry {
             }
             return self.update_reach(now, from);
         }
-        self.on_control(now, from, body)
+        self.take(now, from, body, Way::Layer)
     }
 
     /// Nothing can be heard while the layer broker is away, which says nothing of who lives.
@@ -155,6 +158,7 @@ impl Registry {
                 settled = true;
             }
         }
+        settled |= self.end_of_grace(now);
         if settled { self.all_topics() } else { BTreeSet::new() }
     }
 
@@ -185,7 +189,7 @@ impl Registry {
     /// Whether a change of what is told to others has not been handed out yet.
     #[must_use]
     pub fn has_unannounced(&self) -> bool {
-        self.announcer.due().is_some()
+        self.announcer.due().is_some() || self.layer_announcer.due().is_some()
     }
 
     /// Flows that were ever heard on the layer broker, and the time since the last sign of life.

@@ -46,6 +46,8 @@ pub(super) fn to_wire(topic: &TopicName, entry: &TopicEntry, routes: &[wire::Rou
         node_request: entry.node.request.as_ref().map(request_to_wire),
         layer_request: entry.layer.request.as_ref().map(request_to_wire),
         route_state: routes.iter().take(MAX_ROUTES).map(trim_route).collect(),
+        outside_advertise: entry.outside.advertise.as_ref().map(advertise_to_wire),
+        outside_request: entry.outside.request.as_ref().map(request_to_wire),
     }
 }
 
@@ -162,6 +164,7 @@ pub(super) fn from_wire(entry: &wire::Entry) -> Result<(TopicName, TopicEntry), 
     let merged = TopicEntry {
         node: scope(entry.node_advertise.as_ref(), entry.node_request.as_ref())?,
         layer: scope(entry.layer_advertise.as_ref(), entry.layer_request.as_ref())?,
+        outside: scope(entry.outside_advertise.as_ref(), entry.outside_request.as_ref())?,
     };
     Ok((topic, merged))
 }

@@ -88,9 +88,12 @@ fn any_entry() -> impl Strategy<Value = (TopicName, TopicEntry, Vec<wire::RouteS
         text(200),
         scope(),
         scope(),
+        scope(),
         proptest::collection::vec(route, 0..=MAX_ROUTES),
     )
-        .prop_map(|(topic, node, layer, routes)| (topic.parse().unwrap(), TopicEntry { node, layer }, routes))
+        .prop_map(|(topic, node, layer, outside, routes)| {
+            (topic.parse().unwrap(), TopicEntry { node, layer, outside }, routes)
+        })
 }
 
 fn encoded(body: Body) -> usize {
@@ -124,7 +127,12 @@ proptest! {
             prop_assert_eq!(&back_topic, topic);
             // Only sources may have been left out.
             let mut expected = entry.clone();
-            for (expected, back) in [(&mut expected.node, &back.node), (&mut expected.layer, &back.layer)] {
+            let scopes = [
+                (&mut expected.node, &back.node),
+                (&mut expected.layer, &back.layer),
+                (&mut expected.outside, &back.outside),
+            ];
+            for (expected, back) in scopes {
                 if let (Some(expected), Some(back)) = (&mut expected.advertise, &back.advertise) {
                     prop_assert_eq!(back.more_sources, back.sources.len() < expected.sources.len());
                     prop_assert!(!back.sources.is_empty());

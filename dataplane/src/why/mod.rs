@@ -23,6 +23,8 @@ use trace::{Trace, Tracer, fault};
 
 /// Pairs of publisher and requester that are looked at; those that the flow has a part in come first.
 const MAX_PAIRS: usize = 256;
+/// Why a flow that is not on the inter scope knows nothing of other groups.
+const NO_GATEWAY: &str = "no flow of its group is on the inter scope";
 /// Steps in an answer.
 const MAX_STEPS: usize = 64;
 
@@ -174,7 +176,7 @@ impl<'w> Explainer<'_, 'w> {
         let mut found: Vec<Publisher<'w>> = Vec::new();
         for publisher in &self.view.publishers {
             let same = |other: &Publisher<'_>| {
-                publisher.scope == Scope::Layer && other.scope == Scope::Layer && other.group == publisher.group
+                publisher.scope != Scope::Node && other.scope == publisher.scope && other.group == publisher.group
             };
             match found.iter_mut().find(|other| same(other)) {
                 Some(other) if publisher.flow == self.view.me => *other = *publisher,
@@ -210,7 +212,7 @@ impl<'w> Explainer<'_, 'w> {
         let all: Vec<Requester<'w>> = living.iter().copied().chain(self.silent_requesters()).collect();
         for requester in all.iter().filter(|requester| self.is_asked(requester, &all)) {
             let shared = |other: &Requester<'_>| {
-                requester.scope == Scope::Layer && other.scope == Scope::Layer && other.group == requester.group
+                requester.scope != Scope::Node && other.scope == requester.scope && other.group == requester.group
             };
             match found.iter_mut().find(|other| shared(other)) {
                 Some(other) if requester.flow == self.view.me && self.carries(requester.flow) => *other = *requester,
@@ -265,6 +267,10 @@ impl<'w> Explainer<'_, 'w> {
     /// Of a node its own requesters; if it has none, those of the layer scope that it is on.
     fn is_asked(&self, requester: &Requester<'w>, all: &[Requester<'w>]) -> bool {
         let Some(to) = &self.input.to else { return true };
+        if requester.scope == Scope::Inter {
+            // A gateway does not say which layers it speaks for.
+            return to.layer != self.view.me.layer;
+        }
         let in_node = |requester: &Requester<'_>| {
             requester.flow.layer == to.layer && to.node.as_ref().is_none_or(|node| requester.flow.node == *node)
         };
@@ -283,8 +289,14 @@ impl<'w> Explainer<'_, 'w> {
         {
             return (me, code, detail);
         }
+        let outside = to.is_some_and(|to| to.layer != me.layer);
+        let alone = self.view.lacks_gateway();
+        if outside && alone {
+            return (me, WhyCode::PeerDown, NO_GATEWAY.to_owned());
+        }
         match self.hint(kind) {
             Some(hint) => (&hint.flow, hint.code, format!("{} of {}", hint.code, hint.service)),
+            None if alone => (me, code, format!("{}, and {NO_GATEWAY}", nobody())),
             None => (me, code, nobody()),
         }
     }
@@ -313,10 +325,12 @@ fn pairs_of<'w>(
     requester: &Requester<'w>,
     limit: usize,
 ) -> Vec<Trace> {
+    // What flows outside send one another is not for a flow that is not on the inter scope to say.
+    let here = |publisher: &&Publisher<'w>| [publisher.scope, requester.scope] != [Scope::Inter; 2];
     let wanted = |publisher: &&Publisher<'w>| publisher.pairing(requester.request) != Pairing::OtherOrigin;
-    let wanted: Vec<_> = publishers.iter().filter(wanted).collect();
+    let wanted: Vec<_> = publishers.iter().filter(here).filter(wanted).collect();
     let all = if wanted.is_empty() {
-        publishers.iter().take(1).collect()
+        publishers.iter().filter(here).take(1).collect()
     } else {
         wanted
     };

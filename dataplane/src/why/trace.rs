@@ -85,8 +85,14 @@ impl<'w> Tracer<'_, 'w> {
         );
         if self.plan(&mut trace, publisher, requester) {
             self.note_owner(&mut trace, publisher, requester);
+            if publisher.scope == Scope::Inter {
+                self.over_gateways(&mut trace, StepKind::Deliver);
+            }
             for hop in self.hops(publisher, requester) {
                 self.hop(&mut trace, &hop);
+            }
+            if requester.scope == Scope::Inter {
+                self.over_gateways(&mut trace, StepKind::Bridge);
             }
         }
         trace
@@ -139,6 +145,31 @@ impl<'w> Tracer<'_, 'w> {
         }
         self.note_broker(trace, publisher, requester);
         true
+    }
+
+    /// What the gateways say of their way into the layer or out of it, for a flow that is not on the inter scope.
+    fn over_gateways(&self, trace: &mut Trace, step: StepKind) {
+        let gateways = self.view.gateways();
+        let here = &self.view.me.layer;
+        let fits = |route: &&super::RouteFacts| {
+            let way = match step {
+                StepKind::Deliver => route.receiver.as_ref() == Some(&route.flow),
+                _ => route.receiver.as_ref().is_some_and(|receiver| *receiver != route.flow),
+            };
+            gateways.contains(&&route.flow) && route.step == step && way
+        };
+        let before = trace.steps.len();
+        for route in self.input.routes.iter().filter(fits) {
+            let to = route.receiver.as_ref().filter(|receiver| **receiver != route.flow);
+            let to = to.map_or_else(|| here.to_string(), ToString::to_string);
+            let detail = format!("the gateway {} says so of its way to {to}", route.flow);
+            trace.add(&route.flow, route.step, route.ok, route.code, detail);
+        }
+        if trace.steps.len() == before {
+            let names: Vec<String> = gateways.iter().map(ToString::to_string).collect();
+            let detail = format!("over a gateway: {}", names.join(", "));
+            trace.add(self.view.me, StepKind::Plan, true, WhyCode::Ok, detail);
+        }
     }
 
     /// Of several flows that share a layer broker one carries what is published there: the others say which.

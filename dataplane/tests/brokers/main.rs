@@ -40,6 +40,7 @@ impl Node {
         let supervisor = Supervisor::new(me.to_owned());
         let (node, layer) = (node.connect(), layer.connect());
         let settings = FlowSettings {
+            gateway: blaze_domain::node_file::AutoBool::Auto,
             me: me.parse().unwrap(),
             kind: LayerKind::Fog,
             admin: "127.0.0.1:0".parse().unwrap(),

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use blaze_brokers::{Content, PublishOutcome, Publisher, PublisherOptions, Received};
 use blaze_domain::names::ChannelName;
-use blaze_domain::node_file::AccessRules;
+use blaze_domain::node_file::{AccessRules, AutoBool};
 use blaze_domain::{FlowId, LayerKind, Origin, Priority, Scope, TopicName, WriterId};
 use blaze_flow::control::{ControlConfig, ControlCore, Output};
 use blaze_flow::flow::plane::PlaneState;
@@ -193,7 +193,8 @@ impl<'a> Simulation<'a> {
                 epoch,
                 node_scope: true,
                 layer_scope: Some(layer_scope),
-                replicas: false,
+                replicas: None,
+                gateway: AutoBool::Auto,
                 inter_scope: true,
                 layer_answers_need_id: false,
                 layer_names: LayerNames::Any,
@@ -525,6 +526,7 @@ impl<'a> Simulation<'a> {
                 Output::Publish { .. }
                 | Output::LayerScope { .. }
                 | Output::Replicas { .. }
+                | Output::Inter { .. }
                 | Output::SaveLease(_)
                 | Output::Prepare { .. }
                 | Output::Release { .. }

@@ -94,6 +94,11 @@ pub(crate) struct Flow {
     /// Position of the next message, of each topic that is read.
     pub(crate) reads: BTreeMap<(TopicName, Scope), usize>,
     pub(crate) peers: usize,
+    /// On the inter scope.
+    pub(crate) inside: bool,
+    pub(crate) was_inside: bool,
+    /// When it has said good-bye there.
+    pub(crate) leaves: Option<Instant>,
 }
 
 pub(crate) struct Packet {

@@ -119,10 +119,25 @@ impl World {
             };
             return self.kafka.lock().entry("peers".to_owned()).or_default().push(record);
         }
-        let Some(engine) = &mut self.flows[index].plane.engine else {
+        let flow = &mut self.flows[index];
+        let Some(engine) = &mut flow.plane.engine else {
             return;
         };
         match output {
+            Output::Inter { join: true } => {
+                if flow.was_inside {
+                    // As in production: whoever comes back has a new life there.
+                    flow.epoch += 1;
+                    engine.restart(now, flow.epoch);
+                    flow.control.set_epoch(flow.epoch);
+                }
+                (flow.inside, flow.was_inside) = (true, true);
+                flow.control.joined(now);
+            }
+            Output::Inter { join: false } => {
+                engine.goodbye(now);
+                flow.leaves = Some(now);
+            }
             Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
             Output::Announce { version, digest } => engine.set_registry(now, version, digest),
             Output::State(state) => {
@@ -209,6 +224,16 @@ impl World {
     pub(crate) fn leave(&mut self, index: usize) {
         let now = self.now;
         let flow = &mut self.flows[index];
+        if flow
+            .leaves
+            .is_some_and(|since| now - since >= Duration::from_millis(100))
+            && let Some(engine) = &mut flow.plane.engine
+        {
+            (flow.inside, flow.leaves) = (false, None);
+            engine.restart(now, flow.epoch);
+            flow.plane.pump(now, |_| {});
+            flow.control.left(now);
+        }
         match flow.life {
             Life::Draining(since) => {
                 let over = now - since >= Duration::from_millis(600);

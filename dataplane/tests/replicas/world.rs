@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::Content;
-use blaze_domain::node_file::AccessRules;
+use blaze_domain::node_file::{AccessRules, AutoBool};
 use blaze_domain::{FlowId, LayerKind, Origin, Scope, TopicName, WriterId};
 use blaze_flow::control::{ControlConfig, ControlCore};
 use blaze_flow::flow::plane::PlaneState;
@@ -30,6 +30,9 @@ const WALL_NS: u64 = 1_700_000_000_000_000_000;
 /// From the robot to the cloud, and back.
 const UP: &str = "imu/data";
 const DOWN: &str = "cmd/vel";
+/// From the node of each cloud flow to the robot, and from the robot to each.
+pub(crate) const STATUS: &str = "status";
+pub(crate) const TELEOP: &str = "teleop";
 /// Between two messages of a publisher.
 const PERIOD: Duration = Duration::from_millis(20);
 
@@ -54,10 +57,26 @@ pub(crate) struct World {
     pub(crate) handed_over: u64,
     /// How many messages the services of a node had when its flow was started again, each time.
     pub(crate) lives: BTreeMap<usize, Vec<usize>>,
+    /// How many flows share Kafka.
+    pub(crate) clouds: usize,
+    /// Services on the nodes of the cloud publish, too.
+    pub(crate) of_nodes: bool,
+    /// What services on nodes have published: flow and sequence.
+    pub(crate) said: Vec<(usize, u64)>,
+    pub(crate) round: u64,
 }
 
 impl World {
     pub(crate) fn new(seed: u64) -> Self {
+        let mut world = Self::with(seed, 2);
+        world.run_for(Duration::from_secs(6));
+        world.publishing = true;
+        world.next_publish = world.now;
+        world
+    }
+
+    /// A robot and so many flows on one Kafka, which have just begun.
+    pub(crate) fn with(seed: u64, clouds: usize) -> Self {
         let mut random = StdRng::seed_from_u64(seed);
         let now = Instant::now();
         let mut world = Self {
@@ -79,18 +98,27 @@ impl World {
             split: false,
             handed_over: 0,
             lives: BTreeMap::new(),
+            clouds,
+            of_nodes: false,
+            said: Vec::new(),
+            round: 0,
         };
-        for index in 0..3 {
+        for index in 0..=clouds {
             let flow = world.make_flow(index, 1);
             world.flows.push(flow);
         }
-        for index in 0..3 {
+        for index in 0..=clouds {
             world.lease(index);
         }
-        world.run_for(Duration::from_secs(4));
-        world.publishing = true;
-        world.next_publish = world.now;
         world
+    }
+
+    /// Another flow comes to the same Kafka.
+    pub(crate) fn add(&mut self) {
+        self.clouds += 1;
+        let flow = self.make_flow(self.clouds, 1);
+        self.flows.push(flow);
+        self.lease(self.clouds);
     }
 
     pub(crate) fn wall(&self) -> u64 {
@@ -99,9 +127,12 @@ impl World {
 
     fn make_flow(&self, index: usize, epoch: u64) -> Flow {
         let robot = index == 0;
-        let id: FlowId = ["edge/robot-1", "cloud/cloud-1", "cloud/cloud-2"][index]
-            .parse()
-            .unwrap();
+        let name = if robot {
+            "edge/robot-1".to_owned()
+        } else {
+            format!("cloud/cloud-{index}")
+        };
+        let id: FlowId = name.parse().unwrap();
         let kind = if robot { LayerKind::Edge } else { LayerKind::Cloud };
         let layer_scope = (!robot).then(|| LayerScopeId::kafka(""));
         let control = ControlConfig {
@@ -110,7 +141,8 @@ impl World {
             epoch,
             node_scope: true,
             layer_scope,
-            replicas: !robot,
+            replicas: (!robot).then_some(LayerScope::Kafka),
+            gateway: AutoBool::Auto,
             inter_scope: true,
             layer_answers_need_id: true,
             layer_names: LayerNames::Any,
@@ -133,8 +165,11 @@ impl World {
             max_datagram: 1300,
             limits: Limits::default(),
         };
+        let inside = control.begins_inside();
+        let mut control = ControlCore::new(control, self.now);
+        control.hears_replicas(self.now);
         Flow {
-            control: ControlCore::new(control, self.now),
+            control,
             plane: PlaneState {
                 core,
                 engine: Some(Engine::new(engine, self.now, self.wall())),
@@ -144,6 +179,9 @@ impl World {
             life: Life::Alive,
             reads: BTreeMap::new(),
             peers: self.kafka.lock().get("peers").map_or(0, Vec::len),
+            inside,
+            was_inside: inside,
+            leaves: None,
         }
     }
 
@@ -162,6 +200,13 @@ impl World {
         for message in messages {
             control.control(now, wall_ms, scope, message.as_bytes());
         }
+        let of_node = match index {
+            0 => [message("request", STATUS), message("advertise", TELEOP)],
+            _ => [message("advertise", STATUS), message("request", TELEOP)],
+        };
+        for message in of_node {
+            control.control(now, wall_ms, Scope::Node, message.as_bytes());
+        }
         if index > 0 {
             // A service on the replica's own node wants what the layer publishes, too.
             control.control(now, wall_ms, Scope::Node, message("request", DOWN).as_bytes());
@@ -169,7 +214,7 @@ impl World {
     }
 
     pub(crate) fn random_cloud(&mut self) -> usize {
-        self.random.random_range(1..=2)
+        self.random.random_range(1..=self.clouds)
     }
 
     pub(crate) fn end(&mut self, index: usize, end: End) {
@@ -245,7 +290,41 @@ impl World {
         }
     }
 
+    /// Services on all nodes whose flow lives publish one message each.
+    pub(crate) fn publish_on_nodes(&mut self) {
+        self.round += 1;
+        let sequence = self.round;
+        let alive: Vec<usize> = (0..=self.clouds)
+            .filter(|index| self.flows[*index].life == Life::Alive)
+            .collect();
+        for index in alive {
+            let (topic, id) = (if index == 0 { TELEOP } else { STATUS }, &self.flows[index].id);
+            let origin = Origin {
+                layer: id.layer.to_string(),
+                node: id.node.to_string(),
+                service: "s".into(),
+                ..Origin::default()
+            };
+            let header = Header {
+                reliable: true,
+                ..Header::new(topic, origin, node_writer(index), sequence, self.wall())
+            };
+            let record = Record {
+                content: Content::Frame(Frame::new(&header, Bytes::from_static(b"payload")).unwrap()),
+                at: self.now,
+                by: usize::MAX,
+            };
+            let channel = channel(index, Scope::Node, topic);
+            self.redis.lock().entry(channel).or_default().push(record);
+            self.said.push((index, sequence));
+        }
+    }
+
     fn publish(&mut self) {
+        if self.of_nodes && self.now >= self.next_publish && !self.publishing {
+            self.next_publish += PERIOD;
+            self.publish_on_nodes();
+        }
         if !self.publishing || self.now < self.next_publish {
             return;
         }
@@ -279,7 +358,10 @@ impl World {
         for a in 0..self.flows.len() {
             for b in 0..self.flows.len() {
                 let lives = (self.flows[a].epoch, self.flows[b].epoch);
-                let both = a != b && [a, b].iter().all(|at| self.flows[*at].life == Life::Alive);
+                let both = a != b
+                    && [a, b]
+                        .iter()
+                        .all(|at| self.flows[*at].life == Life::Alive && self.flows[*at].inside);
                 if both && self.known.get(&(a, b)) != Some(&lives) && self.random.random_bool(0.05) {
                     self.known.insert((a, b), lives);
                     let endpoint = Endpoint {
@@ -312,7 +394,7 @@ impl World {
     fn holes(&self) -> usize {
         let log = self.redis.lock();
         let mut holes = 0;
-        for index in 1..=2 {
+        for index in 1..=self.clouds {
             let all = log
                 .get(&channel(index, Scope::Node, DOWN))
                 .map_or(&[][..], Vec::as_slice);
@@ -351,4 +433,11 @@ impl World {
             holes: self.holes(),
         }
     }
+}
+
+/// The writer of what services on a flow's node publish.
+pub(crate) fn node_writer(index: usize) -> WriterId {
+    let mut writer = [0xAB; 16];
+    writer[..8].copy_from_slice(&(index as u64).to_le_bytes());
+    WriterId(writer)
 }

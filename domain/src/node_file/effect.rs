@@ -33,7 +33,7 @@ const KEYS: &[(&str, &[&str])] = &[
             "links",
         ],
     ),
-    ("flow", &["pool_threads", "gateway"]),
+    ("flow", &["pool_threads"]),
 ];
 
 /// Keys without effect in the entries of `flow.topics`.

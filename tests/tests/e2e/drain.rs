@@ -34,6 +34,7 @@ async fn flow(
 ) -> anyhow::Result<RunningFlow> {
     let me: FlowId = name.parse()?;
     let settings = FlowSettings {
+        gateway: blaze_domain::node_file::AutoBool::Auto,
         me: me.clone(),
         kind,
         admin: (Ipv4Addr::LOCALHOST, 0).into(),

@@ -137,6 +137,7 @@ impl Inside {
         };
         let options = FlowOptions {
             settings: FlowSettings {
+                gateway: blaze_domain::node_file::AutoBool::Auto,
                 me: FlowId::new("edge".parse().unwrap(), "robot-1".parse().unwrap()),
                 kind: LayerKind::Edge,
                 admin: "127.0.0.1:0".parse().unwrap(),

@@ -9,6 +9,7 @@ mod contract;
 mod demo;
 mod frozen;
 mod garbage;
+mod gateways;
 mod late;
 mod plain_clients;
 mod replicas;

@@ -5,8 +5,10 @@ use std::time::{Duration, Instant};
 use axum::Json;
 use axum::extract::State;
 use blaze_domain::FlowId;
+use blaze_domain::node_file::AutoBool;
 use serde_json::{Value, json};
 
+use super::super::inter::InterScope;
 use super::{App, answer, rounded};
 use crate::control::ControlCore;
 use crate::link::{Engine, PeerState};
@@ -41,12 +43,20 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
         .replicas(now)
         .map(|row| replica_row(&control, row))
         .collect();
+    let gateways: Vec<&FlowId> = control.gateways().collect();
+    let own = control.world().own();
+    let gateway = json!({
+        "setting": own.map(|own| setting(own.gateway)), "stage": control.stage().as_str(), "gateways": gateways,
+    });
     drop(control);
-    let link = shared.transport.as_ref().map(|transport| {
-        let status = transport.status();
+    let status = shared.inter.as_ref().and_then(InterScope::status);
+    let link = status.map(|status| {
         json!({"endpoints": status.endpoints, "addresses": status.addresses, "participants_rebuilt": status.rebuilds})
     });
-    answer(&shared, json!({"peers": rows, "replicas": replicas, "link": link}))
+    answer(
+        &shared,
+        json!({"peers": rows, "replicas": replicas, "gateway": gateway, "link": link}),
+    )
 }
 
 /// A flow that shares the layer broker, as it is heard there.
@@ -62,7 +72,18 @@ fn replica_row(control: &ControlCore, (flow, silent): (&FlowId, Duration)) -> Va
         "flow": flow, "epoch": view.map(|view| view.epoch), "state": state,
         "settled": view.is_some_and(|view| view.settled), "last_heard_ms": rounded(silent.as_secs_f64() * 1e3),
         "in_step": control.registry().is_in_step_with(flow),
+        "role": view.map(|view| if view.role.is_gateway() { "gateway" } else { "member" }),
+        "gateway": view.map(|view| setting(view.gateway)),
     })
+}
+
+/// As it stands in the node file.
+fn setting(gateway: AutoBool) -> Value {
+    match gateway {
+        AutoBool::Auto => json!("auto"),
+        AutoBool::Yes => json!(true),
+        AutoBool::No => json!(false),
+    }
 }
 
 fn peer_state(state: PeerState) -> &'static str {

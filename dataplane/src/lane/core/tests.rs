@@ -68,6 +68,7 @@ fn lane_spec() -> crate::plan::LaneSpec {
         priority: None,
         from: Vec::new(),
         degraded: None,
+        relays: Vec::new(),
     }
 }
 

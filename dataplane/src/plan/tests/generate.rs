@@ -4,9 +4,11 @@ use std::collections::BTreeMap;
 
 use blaze_domain::{FlowId, LayerKind};
 
+use crate::plan::told::{told_inside, told_outside};
+
 use super::worlds::{advertise, flow, request, topic};
 use crate::world::{
-    Advertise, FlowState, LayerScopeId, OriginFilter, Reach, Request, ScopeEntry, Source, TopicEntry, World,
+    Advertise, FlowState, LayerScopeId, OriginFilter, Reach, Request, Role, ScopeEntry, Source, TopicEntry, World,
 };
 
 const SERVICES: [&str; 3] = ["driver", "filter", "logger"];
@@ -79,6 +81,81 @@ impl System {
             system.reroll_layer(dice, &id);
         }
         system
+    }
+
+    /// One with a group of more than 16 flows, where some flows of each group are not on the inter scope. Types and
+    /// sources that are not named are left out: where a gateway tells of several scopes as of one, they match more than they do.
+    pub(crate) fn with_gateways(dice: &mut Dice) -> Self {
+        let mut system = Self::random(dice);
+        for n in 0..17 + dice.below(6) {
+            let name: FlowId = format!("layer-9/n9{n}").parse().unwrap();
+            system.nodes.push(name.node.to_string());
+            system.world.flows.insert(name, flow(Some(1)));
+        }
+        for id in system.ids() {
+            if id.layer.as_str() == "layer-9" {
+                system.reroll_flow(dice, &id);
+                if dice.percent(40) {
+                    system.reroll_node(dice, &id);
+                }
+            }
+        }
+        let first = system
+            .ids()
+            .into_iter()
+            .find(|id| id.layer.as_str() == "layer-9")
+            .unwrap();
+        system.reroll_layer(dice, &first);
+        for view in system.world.flows.values_mut() {
+            let shares = view.layer_scope.is_some();
+            view.role = if shares && dice.percent(70) {
+                Role::Member
+            } else {
+                Role::Gateway
+            };
+        }
+        system.tell_precisely();
+        system
+    }
+
+    pub(crate) fn tell_precisely(&mut self) {
+        let topics = self.world.flows.values_mut().flat_map(|view| view.topics.values_mut());
+        for entry in topics.flat_map(|entry| [&mut entry.node, &mut entry.layer]) {
+            entry.advertise.iter_mut().for_each(|offer| {
+                offer.type_name.clear();
+                offer.more_sources = false;
+            });
+            entry.request.iter_mut().for_each(|ask| ask.type_name.clear());
+        }
+    }
+
+    /// What a flow knows: of its group everything, of others what their gateways tell, if it is on the inter scope, or else
+    /// what a gateway of its own tells.
+    pub(crate) fn known_to(&self, me: &FlowId) -> World {
+        let all = |me: &FlowId| World {
+            me: me.clone(),
+            ..self.world.clone()
+        };
+        let own = &self.world.flows[me];
+        if self.world.flows.values().all(|view| view.role.is_inside()) {
+            return all(me);
+        }
+        let group = |id: &FlowId| share_broker((me, own.layer_scope), (id, self.world.flows[id].layer_scope));
+        let mut known = all(me);
+        known
+            .flows
+            .retain(|id, view| group(id) || (own.role.is_inside() && view.role.is_inside()));
+        for (id, view) in &mut known.flows {
+            if !group(id) {
+                view.topics.clear();
+                view.topics
+                    .extend(told_outside(&all(id), &topic()).map(|told| (topic(), told)));
+            } else if id != me && view.role.is_gateway() && !own.role.is_gateway() {
+                let outside = told_inside(&self.known_to(id), &topic());
+                view.topics.entry(topic()).or_default().outside = outside;
+            }
+        }
+        known
     }
 
     pub(crate) fn ids(&self) -> Vec<FlowId> {

@@ -9,7 +9,6 @@ use super::generate::{Dice, System};
 use super::simulate::{Intake, Simulation, is_live};
 use super::worlds::topic;
 use crate::plan::{PlanRules, Target, TopicPlan, plan_topic};
-use crate::world::World;
 
 type Plans = BTreeMap<FlowId, TopicPlan>;
 
@@ -27,13 +26,9 @@ fn worlds() -> u64 {
 fn plans(system: &System, previous: &Plans) -> Plans {
     let live = system.world.flows.iter().filter(|(_, view)| is_live(view));
     live.map(|(id, _)| {
-        let world = World {
-            me: id.clone(),
-            ..system.world.clone()
-        };
         (
             id.clone(),
-            plan_topic(&world, &topic(), &PlanRules::default(), previous.get(id)),
+            plan_topic(&system.known_to(id), &topic(), &PlanRules::default(), previous.get(id)),
         )
     })
     .collect()
@@ -62,6 +57,46 @@ fn each_message_reaches_each_requester_once_over_one_path() {
         "{carried} messages, {bridges} bridges"
     );
     println!("{worlds} worlds, {bridges} bridges, {carried} messages carried");
+}
+
+/// Of each group some flows are on the inter scope for the others, of one with more than 16.
+#[test]
+fn behind_gateways_each_message_reaches_each_requester_once_over_one_path() {
+    let (mut carried, mut over_gateways) = (0, 0);
+    let worlds = worlds() / 8;
+    for seed in 0..worlds {
+        let mut dice = Dice(seed ^ 0x6A7E);
+        let mut system = System::with_gateways(&mut dice);
+        let mut past = Plans::new();
+        for step in 0..3 {
+            let plans = plans(&system, &past);
+            let intakes: &[Intake] = if step == 0 {
+                &[Intake::Bridges, Intake::Delivery]
+            } else {
+                &[Intake::Delivery]
+            };
+            for intake in intakes {
+                let mut simulation = Simulation::new(&system, &plans, *intake);
+                if let Err(fault) = simulation.run() {
+                    panic!(
+                        "seed {seed} step {step} ({intake:?}): {fault}\n{plans:#?}\n{:#?}",
+                        system.world
+                    );
+                }
+                carried += simulation.carried;
+                over_gateways += simulation.relayed;
+            }
+            past = plans;
+            system.change(&mut dice);
+            system.tell_precisely();
+        }
+    }
+    let worlds = usize::try_from(worlds).unwrap();
+    assert!(
+        carried > 10 * worlds && over_gateways > worlds,
+        "{carried} messages, {over_gateways} relayed"
+    );
+    println!("{worlds} worlds, {carried} messages carried, {over_gateways} over a gateway for another flow");
 }
 
 #[test]

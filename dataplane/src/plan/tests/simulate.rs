@@ -11,7 +11,7 @@ use blaze_domain::{FlowId, Scope};
 use super::generate::{System, share_broker};
 use super::worlds::topic;
 use crate::plan::{LaneSpec, PlanRules, Target, TopicPlan, delivery};
-use crate::world::{Advertise, FlowState, FlowView, Reach, Request, ScopeEntry, Source, World};
+use crate::world::{Advertise, FlowState, FlowView, Reach, Request, ScopeEntry, Source};
 
 /// Something that services attach to. A layer scope is named by the first flow that uses it.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -58,6 +58,8 @@ pub(super) struct Simulation<'a> {
     useful: BTreeSet<BridgeKey>,
     /// Messages that reached a requester over a bridge.
     pub(super) carried: usize,
+    /// Messages that a gateway sent to another group for a flow that is not on the inter scope.
+    pub(super) relayed: usize,
 }
 
 pub(super) fn is_live(view: &FlowView) -> bool {
@@ -88,6 +90,7 @@ impl<'a> Simulation<'a> {
             intake,
             useful: BTreeSet::new(),
             carried: 0,
+            relayed: 0,
         }
     }
 
@@ -212,7 +215,7 @@ impl<'a> Simulation<'a> {
 
     /// A flow that read a message passes it on.
     fn bridge(
-        &self,
+        &mut self,
         message: &Message,
         flow: &FlowId,
         copy: &Copy,
@@ -220,7 +223,8 @@ impl<'a> Simulation<'a> {
         queue: &mut VecDeque<Copy>,
     ) -> Result<(), String> {
         let scope = scope_of(&copy.place);
-        for bridge in self.plans[flow].bridges.iter().filter(|bridge| bridge.from == scope) {
+        let plans = self.plans;
+        for bridge in plans[flow].bridges.iter().filter(|bridge| bridge.from == scope) {
             if !carries(&bridge.lane, message) {
                 continue;
             }
@@ -231,7 +235,11 @@ impl<'a> Simulation<'a> {
                 continue;
             };
             if scope == Scope::Layer && copy.hops > 0 {
-                continue;
+                let relayed = copy.hops == 1 && bridge.lane.relays(&message.layer, &message.source.node);
+                if !relayed {
+                    continue;
+                }
+                self.relayed += 1;
             }
             if copy.crossed || receiver == flow || *layer != receiver.layer {
                 return Err(format!(
@@ -270,11 +278,7 @@ impl<'a> Simulation<'a> {
         if self.intake == Intake::Bridges {
             return bridges.map(|bridge| (bridge.to.clone(), bridge.lane.clone())).collect();
         }
-        let world = World {
-            me: receiver.clone(),
-            ..self.system.world.clone()
-        };
-        let delivery = delivery(&world, &topic(), &PlanRules::default());
+        let delivery = delivery(&self.system.known_to(receiver), &topic(), &PlanRules::default());
         let framed = delivery.node_framed.map(|lane| (Target::Node { bare: false }, lane));
         let bare = delivery.node_bare.map(|lane| (Target::Node { bare: true }, lane));
         let layer = delivery.layer.map(|lane| (Target::Layer, lane));
@@ -314,6 +318,12 @@ impl<'a> Simulation<'a> {
                 .into_iter()
                 .filter(|flow| copy.writer.as_ref() != Some(flow));
             asked.extend(readers.flat_map(|flow| self.node_requests(flow)));
+            // Who is not on the inter scope writes for other groups, too.
+            let apart = |flow: &FlowId| !self.view(flow).role.is_inside();
+            if copy.writer.as_ref().is_some_and(apart) {
+                let all = self.places().into_iter();
+                asked.extend(all.filter_map(|(_, entry)| entry.request.as_ref()));
+            }
         }
         if copy.writer.is_some() && !asked.iter().any(|request| wants_origin(request, message)) {
             return Err(format!(
@@ -358,7 +368,21 @@ impl<'a> Simulation<'a> {
             Place::Node(_) | Place::Bare(_) => live(to_flow),
             Place::Layer(_) => !self.readers(to).is_empty(),
         };
-        born == to || (!self.readers(born).is_empty() && to_live)
+        let joined = |place: &Place| {
+            let (Place::Node(flow) | Place::Bare(flow) | Place::Layer(flow)) = place;
+            let layer = self.layer_of(flow);
+            let inside = |id: &FlowId| live(id) && self.view(id).role.is_inside();
+            let mut flows = self.flows().map(|(id, _)| id);
+            flows.any(|id| inside(id) && (id == flow || (layer.is_some() && self.layer_of(id) == layer)))
+        };
+        let one_group = self.group_of(born) == self.group_of(to);
+        born == to || (!self.readers(born).is_empty() && to_live && (one_group || (joined(born) && joined(to))))
+    }
+
+    /// The layer scope that a place belongs to, or the flow that has none.
+    fn group_of(&self, place: &Place) -> Place {
+        let (Place::Node(flow) | Place::Bare(flow) | Place::Layer(flow)) = place;
+        self.layer_of(flow).unwrap_or_else(|| Place::Node(flow.clone()))
     }
 
     /// Every request that matches was served once.
@@ -406,6 +430,10 @@ impl<'a> Simulation<'a> {
     /// A bridge from the layer to the node of a flow that takes the same from the inter scope, while another flow of the
     /// layer asks for something of the same publishing scope too, so that its sender may have chosen that one.
     fn stands_by(&self, flow: &FlowId, from: Scope, to: &Target) -> bool {
+        if !self.view(flow).role.is_inside() && (from == Scope::Layer || *to == Target::Layer) {
+            // It is not told which origins there are outside.
+            return true;
+        }
         let takes_it = self.useful.contains(&(flow.clone(), Scope::Inter, to.clone()));
         let Some(layer) = self.layer_of(flow).filter(|_| from == Scope::Layer && takes_it) else {
             return false;
@@ -416,17 +444,19 @@ impl<'a> Simulation<'a> {
             sent.any(|message| requests.iter().any(|request| wants(request, message)))
         };
         let shared = self.requests_at(&layer);
-        let others: Vec<_> = self
+        let (others, members): (Vec<_>, Vec<_>) = self
             .readers(&layer)
             .into_iter()
             .filter(|other| *other != flow)
-            .collect();
+            .partition(|other| self.view(other).role.is_inside());
+        let for_members = |born: &Place| members.iter().any(|other| wanted(&self.node_requests(other), born));
         messages.iter().map(|message| &message.born).any(|born| {
             let outside = match born {
                 Place::Node(born) | Place::Bare(born) => self.layer_of(born).as_ref() != Some(&layer),
                 Place::Layer(_) => *born != layer,
             };
-            let could = |other: &FlowId| wanted(&shared, born) || wanted(&self.node_requests(other), born);
+            let could =
+                |other: &FlowId| wanted(&shared, born) || wanted(&self.node_requests(other), born) || for_members(born);
             let sent = outside && !self.readers(born).is_empty();
             sent && wanted(&self.node_requests(flow), born) && others.iter().any(|other| could(other))
         })

@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use blaze_domain::node_file::AutoBool;
 use blaze_domain::{Durability, FlowId, LayerKind, Reliability, TopicName};
 
 use crate::world::{
-    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, ScopeEntry, Source,
-    TopicEntry, World,
+    Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, Role, ScopeEntry,
+    Source, TopicEntry, World,
 };
 
 pub(crate) fn topic() -> TopicName {
@@ -74,6 +75,8 @@ pub(crate) fn flow(layer_scope: Option<u64>) -> FlowView {
         topics: BTreeMap::new(),
         settled: false,
         parts: BTreeMap::new(),
+        gateway: AutoBool::Auto,
+        role: Role::Gateway,
     }
 }
 
@@ -101,6 +104,9 @@ pub(crate) fn world(lines: &[&str]) -> World {
                 "starting" => view.state = FlowState::Starting,
                 "draining" => view.state = FlowState::Draining,
                 "settled" => view.settled = true,
+                "member" => view.role = Role::Member,
+                "new" => view.role = Role::NewGateway,
+                "leaving" => view.role = Role::Leaving,
                 "carries" => part.carrying = Carrying::Carries,
                 "handed" => part.carrying = Carrying::HandedOver([7].into()),
                 word if word.starts_with('>') => part.receivers.push(id(&word[1..])),

@@ -61,7 +61,7 @@ impl Pair {
             ..hello(&self.flows[from])
         };
         let (name, ms) = (self.names()[from].clone(), self.server_ms());
-        self.flows[1 - from].on_layer_hello(self.now, &name, &said, Some(ms));
+        self.flows[1 - from].on_layer_hello(self.now, &name, &said, said.epoch, Some(ms));
     }
 
     fn run(&mut self, time: Duration) {
@@ -200,7 +200,7 @@ fn a_new_life_ends_the_one_before_and_late_words_of_that_count_no_more() {
         state: State::Starting.into(),
         ..hello(&again)
     };
-    pair.flows[1].on_layer_hello(now, &id("cloud/a"), &said, Some(ms));
+    pair.flows[1].on_layer_hello(now, &id("cloud/a"), &said, said.epoch, Some(ms));
     assert!(!pair.flows[1].is_carried_elsewhere(&topic("t")));
     assert!(matches!(
         pair.flows[1].begin_carrying(now, &topic("t"), true),
@@ -227,7 +227,7 @@ fn a_flow_does_not_go_back_to_what_it_was_and_settles_after_five_seconds() {
     pair.flows[0].set_state(FlowState::Draining);
     pair.hello(0);
     let (now, ms) = (pair.now, pair.server_ms());
-    pair.flows[1].on_layer_hello(now, &id("cloud/a"), &late, Some(ms));
+    pair.flows[1].on_layer_hello(now, &id("cloud/a"), &late, late.epoch, Some(ms));
     pair.flows[1].watch_flows(now);
     assert_eq!((pair.sees(1).state, pair.sees(1).settled), (FlowState::Draining, false));
 }
@@ -266,9 +266,9 @@ fn who_shares_nothing_is_not_heard_there() {
     };
     assert!(
         pair.flows[1]
-            .on_layer_hello(now, &id("cloud/a"), &other_broker, None)
+            .on_layer_hello(now, &id("cloud/a"), &other_broker, other_broker.epoch, None)
             .is_empty()
     );
-    pair.flows[1].on_layer_hello(now, &id("fog/a"), &said, None);
+    pair.flows[1].on_layer_hello(now, &id("fog/a"), &said, said.epoch, None);
     assert_eq!(pair.flows[1].world().flows.len(), 1);
 }

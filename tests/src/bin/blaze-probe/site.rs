@@ -129,6 +129,7 @@ async fn start_flow(
         Role::Listen => ("cloud", LayerKind::Cloud, "probe-2"),
     };
     let settings = FlowSettings {
+        gateway: blaze_domain::node_file::AutoBool::Auto,
         me: FlowId::new(layer.parse()?, node.parse()?),
         kind,
         admin: (Ipv4Addr::LOCALHOST, 0).into(),

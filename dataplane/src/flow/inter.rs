@@ -1,0 +1,271 @@
+//! The inter scope of a flow: its transport, which comes and goes while the flow runs, as gateways do.
+//!
+//! ```text
+//! control core ─► want ─► thread `inter`: start, or let out, say good-bye and stop ─► News ─► control core
+//! ```
+
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use blaze_domain::{FlowId, Priority};
+use bytes::Bytes;
+use parking_lot::{Condvar, Mutex};
+
+use super::epochs::Epochs;
+use super::plane::{News, Plane};
+use super::settings::InterSettings;
+use crate::link::dds::{self, DdsConfig, DdsStatus, DdsTransport};
+use crate::link::transport::{Endpoint, SendOutcome, Transport};
+use crate::link::{DownReason, LinkEvent};
+
+/// Between attempts to start a transport.
+const RETRY: Duration = Duration::from_secs(1);
+/// How long what is queued may take to leave before the good-bye …
+const DRAIN: Duration = Duration::from_millis(600);
+/// … and how long the good-bye may take.
+const GOODBYE: Duration = Duration::from_millis(100);
+/// How often it is looked whether what is queued has left.
+const LOOK: Duration = Duration::from_millis(10);
+
+/// The inter scope of one flow, whether it is joined or not.
+pub(crate) struct InterScope {
+    settings: InterSettings,
+    me: FlowId,
+    epochs: Epochs,
+    plane: Arc<Plane>,
+    transport: Mutex<Option<Arc<DdsTransport>>>,
+    wish: Mutex<Wish>,
+    changed: Condvar,
+    /// Why it could not be joined.
+    trouble: Mutex<String>,
+    /// It was joined before: whoever joins again has a new life there.
+    was_joined: AtomicBool,
+}
+
+/// What the thread is to do.
+#[derive(Debug, Default)]
+struct Wish {
+    joined: bool,
+    stop: bool,
+}
+
+impl InterScope {
+    /// An inter scope that is not joined.
+    pub(super) fn new(settings: InterSettings, me: FlowId, epochs: Epochs, plane: Arc<Plane>) -> Self {
+        Self {
+            settings,
+            me,
+            epochs,
+            plane,
+            transport: Mutex::default(),
+            wish: Mutex::default(),
+            changed: Condvar::new(),
+            trouble: Mutex::default(),
+            was_joined: AtomicBool::new(false),
+        }
+    }
+
+    /// Joins it now.
+    ///
+    /// # Errors
+    /// The configuration can never work, or there is no thread.
+    pub(super) fn join(&self) -> anyhow::Result<()> {
+        let epoch = if self.was_joined.swap(true, Ordering::Relaxed) {
+            let epoch = self.epochs.renew();
+            self.plane.begin_life(epoch);
+            epoch
+        } else {
+            // Nothing has been on the inter scope under it.
+            self.epochs.first()
+        };
+        let (settings, sink, epochs) = (&self.settings, Arc::clone(&self.plane), self.epochs.clone());
+        let transport = DdsTransport::start(DdsConfig {
+            domain: settings.domain,
+            listen: settings.listen_address(),
+            peers: settings.peers.iter().map(ToString::to_string).collect(),
+            peer_slots: settings.peer_slots,
+            mtu: settings.mtu.into(),
+            chunking: settings.chunking,
+            local: Endpoint {
+                flow: self.me.clone(),
+                epoch,
+            },
+            next_epoch: Arc::new(move || epochs.renew()),
+            sink: Arc::new(move |event| sink.transport_event(event)),
+        })
+        .context("brokers.inter.dds")?;
+        let addresses = transport.addresses();
+        self.plane
+            .with(|state| state.engine.as_mut().map(|engine| engine.set_addresses(addresses)));
+        self.trouble.lock().clear();
+        *self.transport.lock() = Some(Arc::new(transport));
+        self.wish.lock().joined = true;
+        Ok(())
+    }
+
+    /// Wants to be on it, or not.
+    pub(super) fn want(&self, joined: bool) {
+        self.wish.lock().joined = joined;
+        self.changed.notify_all();
+    }
+
+    /// Ends the thread; what is joined stays so.
+    pub(super) fn stop(&self) {
+        self.wish.lock().stop = true;
+        self.changed.notify_all();
+    }
+
+    /// The thread: joins and leaves as is wanted, until it is stopped.
+    pub(super) fn run(&self) {
+        let mut pause = None;
+        while let Some(join) = self.next(pause.take()) {
+            if !join {
+                self.leave();
+                self.plane.push(News::Left);
+                continue;
+            }
+            match self.join() {
+                Ok(()) => self.plane.push(News::Joined),
+                Err(error) => {
+                    let text = format!("{error:#}");
+                    if std::mem::replace(&mut *self.trouble.lock(), text.clone()) != text {
+                        tracing::warn!(error = text, "cannot join the inter scope, trying on");
+                    }
+                    pause = Some(RETRY);
+                }
+            }
+        }
+    }
+
+    /// Waits for something to do: to join, or to leave. `None`: nothing any more.
+    fn next(&self, pause: Option<Duration>) -> Option<bool> {
+        let joined = || self.transport.lock().is_some();
+        let mut wish = self.wish.lock();
+        if let Some(pause) = pause {
+            self.changed.wait_for(&mut wish, pause);
+        }
+        while !wish.stop && wish.joined == joined() {
+            self.changed.wait(&mut wish);
+        }
+        (!wish.stop).then_some(wish.joined)
+    }
+
+    fn leave(&self) {
+        let until = Instant::now() + DRAIN;
+        let still_draining = || {
+            self.plane.with(|state| {
+                state.run_timers(Instant::now());
+                state.core.is_draining()
+            })
+        };
+        while Instant::now() < until && still_draining() {
+            std::thread::sleep(LOOK);
+        }
+        self.plane
+            .with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
+        std::thread::sleep(GOODBYE);
+        // The pacer may still hold it for the datagram that it sends.
+        drop(self.transport.lock().take());
+        self.plane.drop_peers();
+    }
+
+    /// Whether it is joined.
+    pub(crate) fn is_joined(&self) -> bool {
+        self.current().is_some()
+    }
+
+    fn current(&self) -> Option<Arc<DdsTransport>> {
+        self.transport.lock().clone()
+    }
+
+    /// What the transport says of itself, while there is one.
+    pub(crate) fn status(&self) -> Option<DdsStatus> {
+        self.current().map(|transport| transport.status())
+    }
+
+    /// Why it could not be joined; empty if nothing is wrong.
+    pub(crate) fn trouble(&self) -> String {
+        self.trouble.lock().clone()
+    }
+
+    /// Makes and drops writers as peers come and go. Of a peer that is down the control writer stays: it carries Hello
+    /// until the peer is forgotten, says Goodbye or begins a new life.
+    pub(super) fn follow(&self, news: &News) {
+        let endpoint = |flow: &FlowId, epoch: u64| Endpoint {
+            flow: flow.clone(),
+            epoch,
+        };
+        let event = match news {
+            News::Discovered(found) => return self.connect(found),
+            News::Link(event) => event.as_ref(),
+            News::Rebuilt(_) | News::Joined | News::Left => return,
+        };
+        match event {
+            LinkEvent::PeerUp { flow, epoch } => self.connect(&endpoint(flow, *epoch)),
+            LinkEvent::PeerDown {
+                flow,
+                epoch,
+                reason: DownReason::Silent,
+            } => {
+                self.disconnect(&endpoint(flow, *epoch), &[Priority::State, Priority::Bulk]);
+            }
+            LinkEvent::PeerDown { flow, epoch, .. }
+            | LinkEvent::PeerForgotten { flow, epoch }
+            | LinkEvent::PeerRemoved { flow, epoch } => {
+                self.disconnect(&endpoint(flow, *epoch), Priority::ALL);
+            }
+            LinkEvent::Addresses(addresses) => self.learn_addresses(addresses),
+            _ => {}
+        }
+    }
+
+    fn sizes(&self) -> (usize, blaze_domain::node_file::Chunking, IpAddr) {
+        let settings = &self.settings;
+        (settings.mtu.into(), settings.chunking, settings.listen_address())
+    }
+}
+
+/// That of the transport, while there is one; before and after it nothing is sent.
+impl Transport for InterScope {
+    fn send(&self, to: &Endpoint, class: Priority, datagram: Bytes) -> SendOutcome {
+        self.current()
+            .map_or(SendOutcome::NotSent, |transport| transport.send(to, class, datagram))
+    }
+
+    fn connect(&self, to: &Endpoint) {
+        if let Some(transport) = self.current() {
+            transport.connect(to);
+        }
+    }
+
+    fn disconnect(&self, to: &Endpoint, classes: &[Priority]) {
+        if let Some(transport) = self.current() {
+            transport.disconnect(to, classes);
+        }
+    }
+
+    fn learn_addresses(&self, addresses: &[String]) {
+        if let Some(transport) = self.current() {
+            transport.learn_addresses(addresses);
+        }
+    }
+
+    fn addresses(&self) -> Vec<String> {
+        self.current()
+            .map(|transport| transport.addresses())
+            .unwrap_or_default()
+    }
+
+    fn wire_bytes(&self, datagram_bytes: usize) -> usize {
+        let (mtu, chunking, listen) = self.sizes();
+        dds::wire_bytes(mtu, chunking, listen, datagram_bytes)
+    }
+
+    fn max_datagram_bytes(&self) -> usize {
+        let (mtu, chunking, listen) = self.sizes();
+        dds::max_datagram_bytes(mtu, chunking, listen)
+    }
+}
