@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::{FlowId, LayerKind};
 use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Body, Channel, Goodbye, Hello, Kind, LayerScope, State};
+use blaze_proto::link::link_control::{Body, Channel, Egress, Goodbye, Hello, Kind, LayerScope, State};
 use bytes::Bytes;
 use prost::Message as _;
 
@@ -150,6 +150,7 @@ impl ControlCore {
             LayerScope::None
         };
         let (registry_version, registry_digest) = self.registry.announced();
+        let load = self.balance.own();
         Hello {
             layer: self.config.me.layer.to_string(),
             node: self.config.me.node.to_string(),
@@ -160,6 +161,11 @@ impl ControlCore {
             state: state.into(),
             layer_scope: shown.into(),
             layer_scope_id: scope.map_or(0, |id| id.0),
+            egress: Some(Egress {
+                demand_bytes_per_s: load.out_bytes_per_s,
+                limit_bytes_per_s: load.limit_bytes_per_s,
+            }),
+            ingress_bytes_per_s: Some(load.in_bytes_per_s),
             ..Hello::default()
         }
     }

@@ -11,6 +11,7 @@
 //! message crosses the inter scope once per other group that wants it, to one receiver, which writes its node scope for
 //! its own requesters and its layer scope for everybody else's. What crossed the inter scope never leaves a layer again.
 
+pub(crate) mod balance;
 mod lane;
 pub(crate) mod rendezvous;
 mod rules;

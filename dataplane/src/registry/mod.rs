@@ -13,6 +13,7 @@ mod announce;
 mod holder;
 mod kept;
 mod leases;
+mod loads;
 mod merge;
 mod names;
 mod parts;
@@ -38,11 +39,12 @@ use blaze_proto::link::link_control::{Body, RouteState};
 use announce::{Announcer, MAX_LEASED_ENTRIES};
 use leases::LeaseTable;
 pub use leases::{LapseReason, LapsedLease, LeaseKey, LeaseView, Terms};
+pub use loads::{Load, REST};
 use names::NameBook;
 pub use names::{LayerNames, NameFault, peers_channel};
 pub use parts::LEGACY;
 use parts::Legacies;
-pub(crate) use parts::carrying_states;
+pub(crate) use parts::{MAX_PARTITIONS, carrying_states};
 pub use peers::MAX_FLOWS;
 pub use pieces::MAX_LINK_CONTROL_BYTES;
 use remote::Remote;
@@ -68,6 +70,8 @@ pub struct Registry {
     legacies: Legacies,
     /// Topics whose carrier has changed.
     urgent: BTreeSet<TopicName>,
+    /// When flows of the group last gave or got a topic by load.
+    moves: BTreeMap<FlowId, Instant>,
     faults: SyncFaults,
     names: NameBook,
     /// Topics that a bridge of this flow reads from or writes to the layer scope.
@@ -107,6 +111,7 @@ impl Registry {
             layer_outgoing: Vec::new(),
             legacies: Legacies::new(),
             urgent: BTreeSet::new(),
+            moves: BTreeMap::new(),
             faults: SyncFaults::default(),
             config,
         }

@@ -11,6 +11,7 @@ use blaze_domain::{FlowId, TopicName};
 use blaze_proto::link::link_control::{Body, Hello};
 
 use super::Registry;
+use super::loads::Load;
 use super::remote::Remote;
 use crate::world::{FlowState, Reach, SETTLED_AFTER};
 
@@ -77,6 +78,7 @@ impl Registry {
             return changed;
         }
         if let Some(remote) = self.remotes.get_mut(from) {
+            remote.load = Load::said(hello);
             remote.ways.layer = Some(Sign {
                 at: now,
                 appended_ms,

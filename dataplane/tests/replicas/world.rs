@@ -23,7 +23,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use serde_json::json;
 
-use crate::parts::{End, Flow, Found, Life, Log, Packet, Record, channel};
+use crate::parts::{End, Flow, Found, Life, Log, Packet, Record, Stream, channel};
 
 const STEP: Duration = Duration::from_millis(5);
 const WALL_NS: u64 = 1_700_000_000_000_000_000;
@@ -54,10 +54,18 @@ pub(crate) struct World {
     pub(crate) handed_over: u64,
     /// How many messages the services of a node had when its flow was started again, each time.
     pub(crate) lives: BTreeMap<usize, Vec<usize>>,
+    /// More topics from the cloud to the robot.
+    pub(crate) streams: Vec<Stream>,
 }
 
 impl World {
+    /// Two replicas.
     pub(crate) fn new(seed: u64) -> Self {
+        Self::with(seed, 2, &[])
+    }
+
+    /// So many replicas, and more topics to the robot: bytes of a message, messages per second.
+    pub(crate) fn with(seed: u64, replicas: usize, streams: &[(usize, u32)]) -> Self {
         let mut random = StdRng::seed_from_u64(seed);
         let now = Instant::now();
         let mut world = Self {
@@ -79,17 +87,30 @@ impl World {
             split: false,
             handed_over: 0,
             lives: BTreeMap::new(),
+            streams: Vec::new(),
         };
-        for index in 0..3 {
+        for (number, (bytes, hz)) in streams.iter().enumerate() {
+            world.streams.push(Stream {
+                topic: format!("stream/{number}").parse().unwrap(),
+                bytes: *bytes,
+                period: Duration::from_secs(1) / *hz,
+                next: now,
+                sent: 0,
+            });
+        }
+        for index in 0..=replicas {
             let flow = world.make_flow(index, 1);
             world.flows.push(flow);
         }
-        for index in 0..3 {
+        for index in 0..=replicas {
             world.lease(index);
         }
         world.run_for(Duration::from_secs(4));
         world.publishing = true;
         world.next_publish = world.now;
+        for stream in &mut world.streams {
+            stream.next = world.now;
+        }
         world
     }
 
@@ -99,9 +120,12 @@ impl World {
 
     fn make_flow(&self, index: usize, epoch: u64) -> Flow {
         let robot = index == 0;
-        let id: FlowId = ["edge/robot-1", "cloud/cloud-1", "cloud/cloud-2"][index]
-            .parse()
-            .unwrap();
+        let name = if robot {
+            "edge/robot-1".to_owned()
+        } else {
+            format!("cloud/cloud-{index}")
+        };
+        let id: FlowId = name.parse().unwrap();
         let kind = if robot { LayerKind::Edge } else { LayerKind::Cloud };
         let layer_scope = (!robot).then(|| LayerScopeId::kafka(""));
         let control = ControlConfig {
@@ -144,6 +168,7 @@ impl World {
             life: Life::Alive,
             reads: BTreeMap::new(),
             peers: self.kafka.lock().get("peers").map_or(0, Vec::len),
+            measured: self.now,
         }
     }
 
@@ -157,6 +182,9 @@ impl World {
         } else {
             (Scope::Layer, [message("request", UP), message("advertise", DOWN)])
         };
+        let op = if index == 0 { "request" } else { "advertise" };
+        let streams = self.streams.iter().map(|stream| message(op, stream.topic.as_str()));
+        let messages: Vec<String> = messages.into_iter().chain(streams).collect();
         let (now, wall_ms) = (self.now, self.wall() / 1_000_000);
         let control = &mut self.flows[index].control;
         for message in messages {
@@ -176,6 +204,10 @@ impl World {
         // Not always at the same moment between two Hellos and two messages.
         let pause = self.random.random_range(0..120);
         self.run_for(STEP * pause);
+        self.end_now(index, end);
+    }
+
+    pub(crate) fn end_now(&mut self, index: usize, end: End) {
         let (now, wall_ms) = (self.now, self.wall() / 1_000_000);
         let flow = &mut self.flows[index];
         self.handed_over += flow.control.handovers().0;
@@ -245,7 +277,38 @@ impl World {
         }
     }
 
+    fn publish_streams(&mut self) {
+        let wall = self.wall();
+        for (number, stream) in self.streams.iter_mut().enumerate() {
+            while stream.next <= self.now {
+                stream.next += stream.period;
+                stream.sent += 1;
+                let origin = Origin {
+                    layer: "cloud".into(),
+                    service: "s".into(),
+                    ..Origin::default()
+                };
+                let writer = WriterId([100 + number as u8; 16]);
+                let header = Header {
+                    reliable: true,
+                    ..Header::new(stream.topic.as_str(), origin, writer, stream.sent, wall)
+                };
+                let payload = Bytes::from(vec![0; stream.bytes]);
+                let record = Record {
+                    content: Content::Frame(Frame::new(&header, payload).unwrap()),
+                    at: self.now,
+                    by: usize::MAX,
+                };
+                let mut log = self.kafka.lock();
+                log.entry(stream.topic.to_string()).or_default().push(record);
+            }
+        }
+    }
+
     fn publish(&mut self) {
+        if self.publishing {
+            self.publish_streams();
+        }
         if !self.publishing || self.now < self.next_publish {
             return;
         }

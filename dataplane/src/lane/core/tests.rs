@@ -36,6 +36,9 @@ impl LaneLink for NotingLink {
     fn drop_lane(&mut self, lane: LaneId) -> u64 {
         self.waiting.remove(&lane).unwrap_or(0)
     }
+    fn is_suspect(&self, _to: &FlowId) -> bool {
+        self.refuse
+    }
 }
 
 #[derive(Default)]
