@@ -9,6 +9,7 @@ use prometheus::{CounterVec, Encoder, GaugeVec, Opts, Registry, TextEncoder};
 
 use super::routes::SourceState;
 use super::{Shared, class_label};
+use crate::control::MoveReason;
 use crate::lane::path::{BridgeState, Phase, TopicId, TopicPath};
 use crate::registry::Terms;
 
@@ -49,6 +50,8 @@ struct Page {
     peer_rtt: GaugeVec,
     leases: GaugeVec,
     link: CounterVec,
+    load: GaugeVec,
+    moves: CounterVec,
     build: GaugeVec,
     started: GaugeVec,
     latency: parking_lot::Mutex<String>,
@@ -129,6 +132,18 @@ impl Page {
                 "blaze_flow_link_events_total",
                 "Things that happened on the link.",
                 &["event"],
+            )?,
+            load: gauge(
+                &r,
+                "blaze_flow_load_bytes_per_second",
+                "Payload that the flow carries over the inter scope, as the other flows of its layer are told.",
+                &["direction"],
+            )?,
+            moves: counter(
+                &r,
+                "blaze_flow_moves_total",
+                "Topics that went to another flow of the layer.",
+                &["reason"],
             )?,
             started: gauge(
                 &r,
@@ -338,6 +353,17 @@ impl Page {
         self.link
             .with_label_values(&["kept_lease_skipped"])
             .inc_by(control.skipped_leases as f64);
+        let (load, moves) = (control.load(), control.moves());
+        for (direction, bytes_per_s) in [("out", load.out_bytes_per_s), ("in", load.in_bytes_per_s)] {
+            self.load.with_label_values(&[direction]).set(bytes_per_s as f64);
+        }
+        for (reason, count) in [
+            (MoveReason::Load.as_str(), moves.by_load),
+            (MoveReason::Settled.as_str(), moves.settled),
+            ("taken_back", moves.taken_back),
+        ] {
+            self.moves.with_label_values(&[reason]).inc_by(count as f64);
+        }
         let (handed_over, taken_over) = control.handovers();
         for (event, count) in [
             ("topic_handed_over", handed_over),

@@ -51,8 +51,9 @@ pub(crate) fn next_move(me: &FlowId, group: &[Member<'_>], topics: &[Burden<'_>]
     let own = group.iter().find(|member| member.flow == me && !member.rests)?;
     let others = || group.iter().filter(|member| member.flow != me && !member.rests);
     let least = others().min_by_key(|member| (member.bytes_per_s, member.flow))?;
-    let total: u64 = group.iter().map(|member| member.bytes_per_s).sum();
-    let mean = total as f64 / group.len() as f64;
+    // Not as integers: what others say may be absurd.
+    let total: f64 = group.iter().map(|member| member.bytes_per_s as f64).sum();
+    let mean = total / group.len() as f64;
     let gap = own.bytes_per_s.checked_sub(least.bytes_per_s)?;
     if gap <= MIN_GAP || own.bytes_per_s as f64 <= ABOVE_MEAN * mean {
         return None;

@@ -189,6 +189,8 @@ fn dies_in_the_middle(of_giver: bool, told: bool) {
     let mut repeats = 0;
     for seed in seeds() {
         let (mut world, before) = World::skewed(seed, 3);
+        // So that there is always something on its way.
+        world.one_way = Duration::from_millis(30);
         let moved = world.moves();
         world.run_until(60 * SECOND, "nothing is ever moved", |world| {
             let giver = &world.flows[1].control;
@@ -261,4 +263,60 @@ fn over_a_slow_link_nothing_moves() {
     assert_eq!((world.moves(), world.carried()), (0, [(1, STREAMS.len())].into()));
     let became = world.finish();
     assert_eq!((became.lost, became.twice), (0, 0), "{became:?}");
+}
+
+/// What is on its way when a topic is to go is acknowledged too late: the topic stays, and goes on where it stopped.
+#[test]
+fn a_move_that_takes_too_long_is_taken_back() {
+    for seed in seeds() {
+        let (mut world, before) = World::skewed(seed, 2);
+        world.one_way = Duration::from_millis(30);
+        let mut taken_back = 0;
+        while world.moves() < 2 {
+            world.run_until(60 * SECOND, "nothing is ever moved", |world| {
+                !world.flows[1].control.emptying().is_empty()
+            });
+            let late = taken_back < 2;
+            if late {
+                world.one_way = Duration::from_millis(400);
+            }
+            world.run_for(Duration::from_millis(500));
+            world.one_way = Duration::from_millis(30);
+            taken_back += u64::from(late);
+            assert_eq!(world.flows[1].control.moves().taken_back, taken_back, "seed {seed}");
+            world.run_for(SECOND);
+            assert_eq!(world.carried().values().sum::<usize>(), STREAMS.len(), "seed {seed}");
+        }
+        let nothing = Became {
+            repeats: before,
+            ..Became::default()
+        };
+        assert_eq!(world.finish(), nothing, "seed {seed}");
+    }
+}
+
+/// Replicas are stopped and killed while topics move.
+#[test]
+fn moves_and_ends_of_replicas_go_together() {
+    for seed in seeds() {
+        let (mut world, _) = World::skewed(seed, 3);
+        for round in 0..6 {
+            world.run_for(12 * SECOND);
+            let victim = 1 + (seed as usize + round) % 3;
+            let end = if round % 2 == 0 { End::Stopped } else { End::Killed };
+            world.end(victim, end);
+            world.run_for(4 * SECOND);
+            world.restart(victim);
+        }
+        world.run_for(8 * SECOND);
+        let carried = world.carried();
+        assert_eq!(
+            carried.values().sum::<usize>(),
+            STREAMS.len(),
+            "seed {seed}: {carried:?}"
+        );
+        assert!(world.moves() > 0, "seed {seed}");
+        let became = world.finish();
+        assert_eq!((became.lost, became.twice), (0, 0), "seed {seed}: {became:?}");
+    }
 }

@@ -149,6 +149,22 @@ fn what_is_about_even_or_little_stays() {
 }
 
 #[test]
+fn absurd_loads_do_no_harm() {
+    let group = Group::new(vec![u64::MAX / 2, 0, 0], &[(0, u64::MAX / 2), (0, 300 * KIB)]);
+    assert!(group.proposal(0).is_some());
+    let flows = ["cloud/a", "cloud/b", "cloud/c"].map(id);
+    let members = [u64::MAX, u64::MAX, 0].map(|bytes_per_s| bytes_per_s);
+    let members: Vec<Member<'_>> = (flows.iter().zip(members))
+        .map(|(flow, bytes_per_s)| Member {
+            flow,
+            bytes_per_s,
+            rests: false,
+        })
+        .collect();
+    assert_eq!(next_move(&flows[0], &members, &[]), None);
+}
+
+#[test]
 fn whoever_carries_most_has_the_first_word_and_one_that_rests_is_left_alone() {
     let topics: Vec<(usize, u64)> = [(0, 5), (0, 4), (1, 4), (1, 4)]
         .map(|(at, load)| (at, load * 100 * KIB))
