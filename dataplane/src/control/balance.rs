@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use blaze_domain::{FlowId, TopicName};
+use blaze_domain::{FlowId, Scope, TopicName};
 
-use super::ControlCore;
+use super::{ControlCore, ScopeHealth};
 use crate::lane::load::{Loads, TopicLoad};
 use crate::plan::TopicPlan;
 use crate::plan::balance::{Burden, MIN_GAP, Member, Proposal, next_move};
@@ -236,7 +236,9 @@ impl ControlCore {
 
     /// Gives a topic away, if this flow carries too much for a while.
     fn give(&mut self, now: Instant, carried: &[TopicLoad]) {
-        let idle = self.state == FlowState::Ready && self.balance.gift.is_none() && self.carriers.is_idle();
+        // While the layer broker is away nobody hears where a topic was stopped.
+        let heard = self.state == FlowState::Ready && self.scopes.health(Scope::Layer) == ScopeHealth::Up;
+        let idle = heard && self.balance.gift.is_none() && self.carriers.is_idle();
         let Some(proposal) = idle.then(|| self.proposal(now, carried)).flatten() else {
             self.balance.uneven = None;
             return;

@@ -47,6 +47,8 @@ use parts::Legacies;
 pub(crate) use parts::{MAX_PARTITIONS, carrying_states};
 pub use peers::MAX_FLOWS;
 pub use pieces::MAX_LINK_CONTROL_BYTES;
+#[cfg(test)]
+pub(crate) use pieces::entry_hash;
 use remote::Remote;
 pub use replicas::SILENT;
 pub use stored::{Restored, UnsavedLease};

@@ -3,6 +3,7 @@
 #![cfg(feature = "kafka")]
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
+mod balance;
 mod contract;
 mod demo;
 mod frozen;

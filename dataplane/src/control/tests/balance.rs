@@ -7,6 +7,7 @@ use prost::Message as _;
 
 use super::*;
 use crate::lane::load::{Loads, TopicLoad};
+use crate::registry::entry_hash;
 use crate::world::{Carrying, Handover};
 
 const TOPICS: [&str; 3] = ["t0", "t1", "t2"];
@@ -30,6 +31,10 @@ struct Pair {
     /// Topics that could be handed over exactly.
     may_move: &'static [&'static str],
     version: u64,
+    /// What `fog/fog-2` has announced.
+    entries: BTreeMap<String, Entry>,
+    /// What is given up has arrived at once.
+    arrives: bool,
     steps: u64,
     /// Who carries what was to change, in order.
     duties: Vec<(TopicName, Duty)>,
@@ -43,6 +48,8 @@ impl Pair {
             weights,
             may_move: &TOPICS,
             version: 0,
+            entries: BTreeMap::new(),
+            arrives: false,
             steps: 0,
             duties: Vec::new(),
         };
@@ -105,6 +112,7 @@ impl Pair {
     fn hello(&mut self) {
         let hello = Hello {
             registry_version: self.version,
+            registry_digest: self.entries.values().map(entry_hash).fold(0, u64::wrapping_add),
             egress: Some(Egress {
                 demand_bytes_per_s: self.load.unwrap_or(0) * KIB,
                 limit_bytes_per_s: 0,
@@ -123,18 +131,21 @@ impl Pair {
             route_state: carrying_states(&other(), carrying),
             ..Entry::default()
         };
+        let entries: Vec<Entry> = parts.iter().map(entry).collect();
+        self.entries
+            .extend(entries.iter().map(|entry| (entry.topic.clone(), entry.clone())));
         let delta = Delta {
             from_version: self.version,
             to_version: self.version + 1,
             part: 0,
             parts: 1,
-            entries: parts.iter().map(entry).collect(),
+            entries,
         };
         self.version += 1;
         self.say(Body::Delta(delta));
     }
 
-    /// Does what the executor does; nothing is emptied.
+    /// Does what the executor does.
     fn serve(&mut self) {
         for output in std::mem::take(&mut self.bench.outputs) {
             if let Output::Plan { topic, duty, .. } = output {
@@ -146,6 +157,10 @@ impl Pair {
                     self.duties.push((topic, duty));
                 }
             }
+        }
+        for topic in self.bench.core.emptying().into_iter().filter(|_| self.arrives) {
+            let now = self.bench.now;
+            self.bench.core.emptied(now, 0, &topic);
         }
     }
 
@@ -317,7 +332,9 @@ fn what_weighs_little_goes_to_whom_hashing_prefers() {
     let prefers = |name: &&str| crate::plan::rendezvous::choose(name, able.iter()) == Some(&able[0]);
     let expected: Vec<&str> = TOPICS.into_iter().filter(prefers).collect();
     assert!(!expected.is_empty(), "the names are not well chosen");
+    pair.arrives = true;
     pair.run(7_000);
+    assert_eq!(pair.bench.core.moves().settled, expected.len() as u64);
     let gone: Vec<&str> = TOPICS
         .into_iter()
         .filter(|name| !pair.carried().contains(name))
