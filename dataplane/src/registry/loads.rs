@@ -47,7 +47,7 @@ impl Registry {
     /// What a flow that shares the layer broker says of its load.
     #[must_use]
     pub fn load_of(&self, flow: &FlowId) -> Option<Load> {
-        self.remotes.get(flow)?.load
+        self.remotes.get(flow)?.ways.layer?.load
     }
 
     /// The other flows that could be given a topic now: they share the layer broker, live and have settled.

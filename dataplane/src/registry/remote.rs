@@ -14,7 +14,6 @@ use blaze_domain::TopicName;
 use blaze_proto::link::link_control as wire;
 
 use super::announce::MAX_ENTRIES;
-use super::loads::Load;
 use super::pieces::{entry_hash, join};
 use super::pull::Pull;
 use super::replicas::Ways;
@@ -71,8 +70,6 @@ pub(super) struct Remote {
     pub(super) ways: Ways,
     /// Since when it has been ready, without a break.
     pub(super) ready_since: Option<Instant>,
-    /// What it says that it carries, on the channel of the layer broker.
-    pub(super) load: Option<Load>,
 }
 
 /// The entries of a flow, as its view in the world has them.
@@ -94,7 +91,6 @@ impl Remote {
             retry: DEFAULT_RETRY,
             ways: Ways::default(),
             ready_since: None,
-            load: None,
         }
     }
 

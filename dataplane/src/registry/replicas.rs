@@ -28,6 +28,8 @@ pub(super) struct Sign {
     pub(super) appended_ms: Option<i64>,
     /// It is too old, or was the last on purpose.
     pub(super) over: bool,
+    /// What the flow carries, as it says.
+    pub(super) load: Option<Load>,
 }
 
 /// How another flow can be reached.
@@ -78,11 +80,11 @@ impl Registry {
             return changed;
         }
         if let Some(remote) = self.remotes.get_mut(from) {
-            remote.load = Load::said(hello);
             remote.ways.layer = Some(Sign {
                 at: now,
                 appended_ms,
                 over: false,
+                load: Load::said(hello),
             });
         }
         changed.extend(self.update_reach(now, from));

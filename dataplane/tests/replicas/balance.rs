@@ -4,11 +4,13 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use blaze_brokers::Content;
-use blaze_domain::{Scope, TopicName};
+use blaze_domain::{Origin, Scope, TopicName, WriterId};
 use blaze_flow::plan::TopicPlan;
 use blaze_flow::world::{Carrying, Hold};
+use blaze_proto::{Frame, Header};
+use bytes::Bytes;
 
-use crate::parts::{End, Life, channel};
+use crate::parts::{End, Life, Record, channel};
 use crate::world::World;
 
 const SECOND: Duration = Duration::from_secs(1);
@@ -55,6 +57,35 @@ impl World {
         }
         let repeats = world.became().repeats;
         (world, repeats)
+    }
+
+    /// What services of the cloud publish, besides.
+    pub(crate) fn publish_streams(&mut self) {
+        let wall = self.wall();
+        for (number, stream) in self.streams.iter_mut().enumerate() {
+            while stream.next <= self.now {
+                stream.next += stream.period;
+                stream.sent += 1;
+                let origin = Origin {
+                    layer: "cloud".into(),
+                    service: "s".into(),
+                    ..Origin::default()
+                };
+                let writer = WriterId([100 + number as u8; 16]);
+                let header = Header {
+                    reliable: true,
+                    ..Header::new(stream.topic.as_str(), origin, writer, stream.sent, wall)
+                };
+                let payload = Bytes::from(vec![0; stream.bytes]);
+                let record = Record {
+                    content: Content::Frame(Frame::new(&header, payload).unwrap()),
+                    at: self.now,
+                    by: usize::MAX,
+                };
+                let mut log = self.kafka.lock();
+                log.entry(stream.topic.to_string()).or_default().push(record);
+            }
+        }
     }
 
     /// How many streams each replica carries.
@@ -127,7 +158,7 @@ impl World {
             (_, Carrying::HandedOver(handover)) => handover.to.as_ref(),
             _ => None,
         });
-        let to = named.next().expect("it gives nothing");
+        let to = named.next().unwrap();
         self.flows.iter().position(|flow| flow.id == *to).unwrap()
     }
 

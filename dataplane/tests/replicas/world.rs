@@ -277,34 +277,6 @@ impl World {
         }
     }
 
-    fn publish_streams(&mut self) {
-        let wall = self.wall();
-        for (number, stream) in self.streams.iter_mut().enumerate() {
-            while stream.next <= self.now {
-                stream.next += stream.period;
-                stream.sent += 1;
-                let origin = Origin {
-                    layer: "cloud".into(),
-                    service: "s".into(),
-                    ..Origin::default()
-                };
-                let writer = WriterId([100 + number as u8; 16]);
-                let header = Header {
-                    reliable: true,
-                    ..Header::new(stream.topic.as_str(), origin, writer, stream.sent, wall)
-                };
-                let payload = Bytes::from(vec![0; stream.bytes]);
-                let record = Record {
-                    content: Content::Frame(Frame::new(&header, payload).unwrap()),
-                    at: self.now,
-                    by: usize::MAX,
-                };
-                let mut log = self.kafka.lock();
-                log.entry(stream.topic.to_string()).or_default().push(record);
-            }
-        }
-    }
-
     fn publish(&mut self) {
         if self.publishing {
             self.publish_streams();

@@ -1,5 +1,7 @@
 //! The message path alone: a link that only takes notes, brokers that only collect.
 
+mod load;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
