@@ -84,6 +84,8 @@ pub struct Part {
     pub carrying: Carrying,
     /// The flows that it sends the topic to over the inter scope, sorted.
     pub receivers: Vec<FlowId>,
+    /// Of the own flow, while it carries the topic: whether it keeps it.
+    pub hold: Hold,
 }
 
 /// Whether a flow carries what services of its layer scope publish to other groups.
@@ -94,8 +96,39 @@ pub enum Carrying {
     No,
     /// It does.
     Carries,
-    /// It did, and whoever comes next begins at these offsets, by partition.
-    HandedOver(Arc<[i64]>),
+    /// It did, and another one goes on.
+    HandedOver(Handover),
+}
+
+/// Where a flow stopped that carried a topic out of its layer, and who goes on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Handover {
+    /// Offsets that the next one begins at, by partition.
+    pub offsets: Arc<[i64]>,
+    /// The flow that it is given to; `None`, and when that one is gone: whoever hashing chooses.
+    pub to: Option<FlowId>,
+}
+
+#[cfg(test)]
+impl<const N: usize> From<[i64; N]> for Handover {
+    fn from(offsets: [i64; N]) -> Self {
+        Self {
+            offsets: offsets.into(),
+            to: None,
+        }
+    }
+}
+
+/// Whether a flow keeps what it carries out of its layer.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Hold {
+    /// Until one that hashing prefers has settled.
+    #[default]
+    Hashing,
+    /// It does: the topic was placed by load, or weighs too much to be moved by a hash.
+    Stays,
+    /// It gives it to this flow.
+    GivesTo(FlowId),
 }
 
 /// Identity of a layer broker; two flows of one layer with the same value reach each other over it.

@@ -18,6 +18,40 @@ pub struct Bridges {
     pub flow: String,
     /// Its bridges.
     pub bridges: Vec<Bridge>,
+    #[serde(default)]
+    not_owner: Vec<Elsewhere>,
+    #[serde(default)]
+    balance: Option<Balance>,
+}
+
+/// A topic of the layer that another flow carries out of it.
+#[derive(Debug, Clone, Deserialize)]
+struct Elsewhere {
+    topic: String,
+    owner: String,
+}
+
+/// How much the flow carries, and what it gave to other flows of its layer.
+#[derive(Debug, Clone, Default, Deserialize)]
+struct Balance {
+    #[serde(default)]
+    out_bytes_per_s: u64,
+    #[serde(default)]
+    in_bytes_per_s: u64,
+    #[serde(default)]
+    moves: BTreeMap<String, u64>,
+    #[serde(default)]
+    last_move: Option<LastMove>,
+}
+
+#[derive(Debug, Clone, Deserialize)]
+struct LastMove {
+    topic: String,
+    #[serde(default)]
+    to: Option<String>,
+    reason: String,
+    #[serde(default)]
+    ago_s: f64,
 }
 
 /// One bridge: a topic taken from one scope and written to another.
@@ -46,6 +80,8 @@ pub struct Bridge {
     /// Why it failed, if it did.
     #[serde(default, deserialize_with = "super::text_or_null")]
     pub detail: String,
+    #[serde(default)]
+    load_bytes_per_s: Option<f64>,
     #[serde(default)]
     latency_ms: Option<Percentiles>,
 }
@@ -103,6 +139,7 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
         text.push_str(
             "No bridges: nothing that is published here is asked for elsewhere. `blaze why TOPIC` says what is missing.\n",
         );
+        text.push_str(&group_text(&answer));
         return Ok(text);
     }
     let columns = [
@@ -112,6 +149,7 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
         ("STATE", Align::Left),
         ("IN", Align::Right),
         ("OUT", Align::Right),
+        ("KiB/s", Align::Right),
         ("QUEUED", Align::Right),
         ("p50/ms", Align::Right),
         ("p99/ms", Align::Right),
@@ -122,7 +160,41 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
     for bridge in answer.bridges.iter().filter(|bridge| !bridge.detail.is_empty()) {
         text.push_str(&format!("{} {}: {}\n", bridge.topic, bridge.state, bridge.detail));
     }
+    text.push_str(&group_text(&answer));
     Ok(text)
+}
+
+/// What the flow carries among those of its layer; nothing where it shares its layer with nobody.
+fn group_text(answer: &Bridges) -> String {
+    let mut text = String::new();
+    for elsewhere in &answer.not_owner {
+        text.push_str(&format!(
+            "{} is carried out of the layer by {}\n",
+            elsewhere.topic, elsewhere.owner
+        ));
+    }
+    let Some(balance) = &answer.balance else { return text };
+    if answer.not_owner.is_empty() && balance.moves.values().all(|count| *count == 0) {
+        return text;
+    }
+    text.push_str(&format!(
+        "load: {} KiB/s out, {} KiB/s in; topics that went to other flows: {}\n",
+        kib(balance.out_bytes_per_s as f64),
+        kib(balance.in_bytes_per_s as f64),
+        dropped_text(&balance.moves),
+    ));
+    if let Some(last) = &balance.last_move {
+        let to = last.to.as_deref().unwrap_or("the one that hashing chose");
+        text.push_str(&format!(
+            "last: {} to {to}, {:.0} s ago ({})\n",
+            last.topic, last.ago_s, last.reason
+        ));
+    }
+    text
+}
+
+fn kib(bytes_per_s: f64) -> String {
+    number(Some(bytes_per_s / 1024.0), 1)
 }
 
 fn row(bridge: &Bridge) -> Vec<String> {
@@ -140,6 +212,7 @@ fn row(bridge: &Bridge) -> Vec<String> {
         bridge.state.clone(),
         bridge.input.messages.to_string(),
         bridge.output.messages.to_string(),
+        bridge.load_bytes_per_s.map_or_else(|| number(None, 1), kib),
         bridge.queued.to_string(),
         number(bridge.latency_ms.and_then(|latency| latency.p50), 2),
         number(bridge.latency_ms.and_then(|latency| latency.p99), 2),
@@ -172,13 +245,31 @@ mod tests {
             {"id": "imu/data|node>inter|cloud", "topic": "imu/data", "from": {"scope": "node", "broker": "memory"},
              "to": {"scope": "inter", "broker": "dds", "layer": "cloud", "flow": "cloud/cloud-1"}, "state": "up",
              "since_s": 3, "in": {"messages": 100, "bytes": 1}, "out": {"messages": 97, "bytes": 1}, "queued": 1,
+             "load_bytes_per_s": 16896,
              "dropped": {"queue_full": 0, "lifespan": 2}, "latency_ms": {"p50": 0.51, "p99": null}}]});
         let flow = "127.0.0.1:9101".parse().unwrap();
         assert_eq!(
             table(&flow, &value, None).unwrap(),
             "flow edge/robot-1\n\
-             TOPIC     FROM         TO                               STATE   IN  OUT  QUEUED  p50/ms  p99/ms  DROPPED\n\
-             imu/data  node:memory  inter:dds cloud (cloud/cloud-1)  up     100   97       1    0.51       -  lifespan 2\n"
+             TOPIC     FROM         TO                               STATE   IN  OUT  KiB/s  QUEUED  p50/ms  p99/ms  DROPPED\n\
+             imu/data  node:memory  inter:dds cloud (cloud/cloud-1)  up     100   97   16.5       1    0.51       -  lifespan 2\n"
+        );
+    }
+
+    #[test]
+    fn who_carries_what_of_a_layer_is_said_below() {
+        let value = json!({"flow": "cloud/cloud-1", "bridges": [], "not_owner": [{"topic": "cmd/vel", "owner": "cloud/cloud-2"}],
+            "balance": {"out_bytes_per_s": 102_400, "in_bytes_per_s": 0, "moves": {"load": 1, "settled": 0, "taken_back": 0},
+                        "last_move": {"topic": "map", "to": "cloud/cloud-2", "reason": "load", "ago_s": 12.4}}});
+        let flow = "127.0.0.1:9101".parse().unwrap();
+        let text = table(&flow, &value, None).unwrap();
+        assert!(
+            text.ends_with(
+                "cmd/vel is carried out of the layer by cloud/cloud-2\n\
+                 load: 100.0 KiB/s out, 0.0 KiB/s in; topics that went to other flows: load 1\n\
+                 last: map to cloud/cloud-2, 12 s ago (load)\n"
+            ),
+            "{text}"
         );
     }
 

@@ -11,6 +11,32 @@ use crate::output::{Align, number, render_table};
 #[derive(Debug, Deserialize)]
 struct Peers {
     peers: Vec<Peer>,
+    #[serde(default)]
+    replicas: Vec<Replica>,
+}
+
+/// Another flow of the layer.
+#[derive(Debug, Deserialize)]
+struct Replica {
+    flow: String,
+    #[serde(default, deserialize_with = "super::text_or_null")]
+    state: String,
+    #[serde(default)]
+    settled: bool,
+    #[serde(default)]
+    last_heard_ms: Option<f64>,
+    #[serde(default)]
+    carries: u64,
+    #[serde(default)]
+    load: Option<Load>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Load {
+    #[serde(default)]
+    out_bytes_per_s: f64,
+    #[serde(default)]
+    in_bytes_per_s: f64,
 }
 
 #[derive(Debug, Deserialize)]
@@ -38,6 +64,7 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
     let mut text = heading(value);
     if answer.peers.is_empty() {
         text.push_str("No peers: no other flow has been heard. Check brokers.inter: domain, listen and peers.\n");
+        text.push_str(&replicas(&answer.replicas, width));
         return Ok(text);
     }
     let columns = [
@@ -52,7 +79,39 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
     ];
     let rows = answer.peers.iter().map(row).collect();
     text.push_str(&render_table(&columns, rows, width));
+    text.push_str(&replicas(&answer.replicas, width));
     Ok(text)
+}
+
+/// The other flows of the layer, below a line of their own; nothing where there are none.
+fn replicas(replicas: &[Replica], width: Option<u16>) -> String {
+    if replicas.is_empty() {
+        return String::new();
+    }
+    let columns = [
+        ("REPLICA", Align::Left),
+        ("STATE", Align::Left),
+        ("HEARD/ms", Align::Right),
+        ("CARRIES", Align::Right),
+        ("OUT KiB/s", Align::Right),
+        ("IN KiB/s", Align::Right),
+    ];
+    let row = |replica: &Replica| {
+        let state = if replica.settled { "settled" } else { &replica.state };
+        let kib = |of: fn(&Load) -> f64| number(replica.load.as_ref().map(|load| of(load) / 1024.0), 1);
+        vec![
+            replica.flow.clone(),
+            state.to_owned(),
+            number(replica.last_heard_ms, 0),
+            replica.carries.to_string(),
+            kib(|load| load.out_bytes_per_s),
+            kib(|load| load.in_bytes_per_s),
+        ]
+    };
+    format!(
+        "\n{}",
+        render_table(&columns, replicas.iter().map(row).collect(), width)
+    )
 }
 
 fn row(peer: &Peer) -> Vec<String> {
@@ -91,6 +150,25 @@ mod tests {
              FLOW           KIND  STATE  ADDRESS   HEARD/ms  RTT/ms  LOSS/%     CLOCK/ms\n\
              fog/fog-1      fog   up     10.0.3.1       120    0.40    1.50  -0.01 ±0.20\n\
              cloud/cloud-1        down   -                -       -       -            -\n"
+        );
+    }
+
+    #[test]
+    fn other_flows_of_the_layer_have_a_table_of_their_own() {
+        let value = json!({"flow": "cloud/cloud-1", "peers": [], "replicas": [
+            {"flow": "cloud/cloud-2", "epoch": 7, "state": "ready", "settled": true, "last_heard_ms": 120, "in_step": true,
+             "carries": 3, "load": {"out_bytes_per_s": 102_400, "in_bytes_per_s": 512, "limit_bytes_per_s": null}},
+            {"flow": "cloud/cloud-3", "state": "starting", "settled": false, "last_heard_ms": 20, "load": null}]});
+        let flow = "127.0.0.1:9101".parse().unwrap();
+        let text = table(&flow, &value, None).unwrap();
+        assert!(
+            text.ends_with(
+                "\n\
+                 REPLICA        STATE     HEARD/ms  CARRIES  OUT KiB/s  IN KiB/s\n\
+                 cloud/cloud-2  settled        120        3      100.0       0.5\n\
+                 cloud/cloud-3  starting        20        0          -         -\n"
+            ),
+            "{text}"
         );
     }
 }

@@ -9,6 +9,7 @@
 //! Without input or output: what it wants done comes out of [`ControlCore::poll`]. Production carries it out with tasks and
 //! brokers, the simulated network with plain calls.
 
+mod balance;
 mod carrying;
 mod gateways;
 mod info;
@@ -31,6 +32,8 @@ use crate::link::LinkEvent;
 use crate::plan::{PlanRules, TopicPlan, plan_topic};
 use crate::registry::{EventDraft, LayerNames, MAX_ROUTES, Registry, RegistryConfig, UnsavedLease, carrying_states};
 use crate::world::{FlowState, LayerScopeId, OriginFilter, Reach, World};
+use balance::Balance;
+pub use balance::{LastMove, MoveReason, Moves, STAY};
 use carrying::Carriers;
 pub use carrying::Duty;
 use gateways::Gateways;
@@ -77,7 +80,8 @@ pub enum Output {
         plan: TopicPlan,
         /// What local advertisements say.
         info: Box<TopicInfo>,
-        /// What changes of who carries it out of the layer. After [`Duty::GivesUp`] call [`ControlCore::given_up`].
+        /// What changes of who carries it out of the layer. After [`Duty::GivesUp`] call [`ControlCore::given_up`] at once, and
+        /// then look at [`ControlCore::emptying`].
         duty: Duty,
     },
     /// Put a message on the channel that flows share on the layer broker.
@@ -189,6 +193,7 @@ pub struct ControlCore {
     replicas: Replicas,
     gateways: Gateways,
     carriers: Carriers,
+    balance: Balance,
     /// Where other flows say that they are found.
     addresses: BTreeMap<FlowId, String>,
     /// Control payloads or parts of them that were refused.
@@ -222,6 +227,7 @@ impl ControlCore {
             replicas: Replicas::new(config.epoch),
             gateways,
             carriers: Carriers::default(),
+            balance: Balance::default(),
             config,
             registry,
             plans: BTreeMap::new(),
@@ -312,6 +318,7 @@ impl ControlCore {
             dirty.urgent = true;
         }
         self.plan_due(now, wall_ms);
+        self.hand_over_all(now, wall_ms);
     }
 
     /// Takes a payload of the control channel of a scope.
@@ -394,6 +401,7 @@ impl ControlCore {
             self.reconciled = now;
             self.touch_all(now);
         }
+        self.take_back_late(now, wall_ms);
         self.plan_due(now, wall_ms);
         for (to, body) in self.registry.poll(now) {
             self.outputs.push_back(Output::Link {
@@ -463,7 +471,7 @@ impl ControlCore {
         let topics: Vec<TopicName> = self
             .dirty
             .iter()
-            .filter(|(_, dirty)| due(dirty))
+            .filter(|(topic, dirty)| due(dirty) && !self.carriers.awaits_places(topic))
             .map(|(topic, _)| topic.clone())
             .collect();
         for topic in topics {

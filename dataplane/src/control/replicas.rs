@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use blaze_domain::node_file::AutoBool;
 use blaze_domain::{FlowId, LayerKind};
 use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Body, Channel, Gateway, Goodbye, Hello, Kind, LayerScope, State};
+use blaze_proto::link::link_control::{Body, Channel, Egress, Gateway, Goodbye, Hello, Kind, LayerScope, State};
 use bytes::Bytes;
 use prost::Message as _;
 
@@ -154,6 +154,7 @@ impl ControlCore {
             AutoBool::Yes => Gateway::Always,
             AutoBool::No => Gateway::Never,
         };
+        let load = self.balance.own();
         Hello {
             layer: self.config.me.layer.to_string(),
             node: self.config.me.node.to_string(),
@@ -166,6 +167,11 @@ impl ControlCore {
             gateway: gateway.into(),
             is_gateway: self.gateways.role().is_gateway(),
             layer_scope_id: scope.map_or(0, |id| id.0),
+            egress: Some(Egress {
+                demand_bytes_per_s: load.out_bytes_per_s,
+                limit_bytes_per_s: load.limit_bytes_per_s,
+            }),
+            ingress_bytes_per_s: Some(load.in_bytes_per_s),
             ..Hello::default()
         }
     }

@@ -1,5 +1,7 @@
 //! The control core as a flow with real brokers drives it.
 
+mod balance;
+
 use blaze_domain::LayerKind;
 use blaze_domain::node_file::AccessRules;
 use serde_json::{Value, json};

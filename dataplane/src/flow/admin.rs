@@ -19,6 +19,7 @@ use serde_json::{Map, Value, json};
 use super::Shared;
 use super::plane::wall_ns;
 use super::routes::SourceState;
+use crate::control::ControlCore;
 use crate::lane::path::{BridgeState, Phase, Sink, TopicPath};
 use crate::plan::Target;
 use crate::registry::{LeaseView, Terms};
@@ -221,8 +222,27 @@ async fn bridges(State(shared): App) -> Json<Value> {
     let not_owner: Vec<Value> = plans
         .filter_map(|(topic, plan)| Some(json!({"topic": topic, "owner": plan.carrier.as_ref()?})))
         .collect();
+    let balance = balance(now, &control);
     drop(control);
-    answer(&shared, json!({"bridges": rows, "not_owner": not_owner}))
+    answer(
+        &shared,
+        json!({"bridges": rows, "not_owner": not_owner, "balance": balance}),
+    )
+}
+
+/// How much this flow carries, and the topics that it gave to other flows of its layer.
+fn balance(now: Instant, control: &ControlCore) -> Value {
+    let (load, moves) = (control.load(), control.moves());
+    let last = moves.last.as_ref().map(|last| {
+        json!({
+            "topic": last.topic, "to": last.to, "reason": last.reason.as_str(),
+            "ago_s": rounded(now.saturating_duration_since(last.at).as_secs_f64()),
+        })
+    });
+    json!({
+        "out_bytes_per_s": load.out_bytes_per_s, "in_bytes_per_s": load.in_bytes_per_s,
+        "moves": {"load": moves.by_load, "settled": moves.settled, "taken_back": moves.taken_back}, "last_move": last,
+    })
 }
 
 fn scope_and_broker(shared: &Shared, scope: Scope) -> Value {
@@ -287,7 +307,7 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
         "from": scope_and_broker(shared, bridge.from), "to": to, "state": state, "since_s": rounded(since),
         "in": {"messages": bridge.stats.taken.messages, "bytes": bridge.stats.taken.bytes},
         "out": {"messages": bridge.stats.out.messages, "bytes": bridge.stats.out.bytes},
-        "queued": bridge.stats.queued(), "dropped": dropped,
+        "load_bytes_per_s": bridge.load(), "queued": bridge.stats.queued(), "dropped": dropped,
         "latency_ms": {
             "p50": bridge.stats.latency.quantile_ms(0.5), "p99": bridge.stats.latency.quantile_ms(0.99),
         },

@@ -26,6 +26,8 @@ use crate::world::FlowState;
 const TICK: Duration = Duration::from_millis(20);
 /// Between attempts to subscribe to a broker that is away.
 const RETRY: Duration = Duration::from_millis(250);
+/// How often it is measured what this flow carries.
+const MEASURE: Duration = Duration::from_secs(1);
 /// Control payloads that are taken at once, and that wait at most.
 const BATCH: usize = 64;
 const MAX_WAITING: usize = 4096;
@@ -45,6 +47,8 @@ pub(super) struct ControlTask {
     pub(super) was_ready: bool,
     pub(super) writers: HashMap<(Scope, ChannelName), Arc<dyn Publisher>>,
     pub(super) leave: Leave,
+    /// When it was last measured what this flow carries.
+    pub(super) measured: Instant,
 }
 
 /// How a flow goes, step by step.
@@ -128,6 +132,7 @@ impl ControlTask {
         for (channel, other) in collisions.unwrap_or_default() {
             self.refuse_name(now, &channel, other);
         }
+        self.measure(now);
         {
             let mut control = self.shared.control.lock();
             for news in self.shared.plane.take_news() {
@@ -150,17 +155,49 @@ impl ControlTask {
                 self.ready.notify_one();
             }
         }
+        self.carry_out_all(now);
+        self.empty(now);
+        for (topic, writer) in self.shared.plane.with(|state| state.core.take_superseded()) {
+            self.forget_writer(&topic, writer);
+        }
+        // A flow without an inter scope has no pacer that would do it.
+        self.shared.plane.with(|state| state.run_timers(now));
+    }
+
+    /// Tells the control core once a second what this flow carries.
+    fn measure(&mut self, now: Instant) {
+        if now.saturating_duration_since(self.measured) < MEASURE {
+            return;
+        }
+        self.measured = now;
+        let loads = self.shared.plane.read(|state| state.measure(now));
+        let limit = self.shared.egress.budget() as u64;
+        self.shared.control.lock().set_loads(now, &loads, limit);
+    }
+
+    /// Topics that were given up are handed over as soon as nothing of them waits in a lane.
+    fn empty(&mut self, now: Instant) {
+        let mut topics = self.shared.control.lock().emptying();
+        if topics.is_empty() {
+            return;
+        }
+        self.shared.plane.with(|state| {
+            state.run_timers(now);
+            topics.retain(|topic| state.core.has_emptied(topic));
+        });
+        for topic in &topics {
+            self.shared.control.lock().emptied(now, wall_ms(), topic);
+        }
+        self.carry_out_all(now);
+    }
+
+    fn carry_out_all(&mut self, now: Instant) {
         // Not locked meanwhile: what is carried out may have a consequence, which is carried out too.
         loop {
             let output = self.shared.control.lock().poll();
             let Some(output) = output else { break };
             self.carry_out(now, output);
         }
-        for (topic, writer) in self.shared.plane.with(|state| state.core.take_superseded()) {
-            self.forget_writer(&topic, writer);
-        }
-        // A flow without an inter scope has no pacer that would do it.
-        self.shared.plane.with(|state| state.run_timers(now));
     }
 
     fn carry_out(&mut self, now: Instant, output: Output) {

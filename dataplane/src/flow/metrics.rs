@@ -1,5 +1,7 @@
 //! `/metrics`: the counters of the flow in Prometheus' words. Made anew for each scrape from the state under its lock.
 
+mod latency;
+
 use std::collections::BTreeMap;
 use std::time::Instant;
 
@@ -10,16 +12,14 @@ use prometheus::{CounterVec, Encoder, GaugeVec, Opts, Registry, TextEncoder};
 use super::inter::InterScope;
 use super::routes::SourceState;
 use super::{Shared, class_label};
-use crate::lane::path::{BridgeState, Phase, TopicId, TopicPath};
+use crate::control::MoveReason;
+use crate::lane::path::{Phase, TopicId, TopicPath};
 use crate::registry::Terms;
+use latency::Histogram;
 
 /// Topics that have label values of their own; the rest share one.
 const MAX_TOPICS: u32 = 1000;
 const OTHER: &str = "_other";
-/// Upper bounds of the latency buckets in seconds.
-const BUCKETS: [f64; 14] = [
-    0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0,
-];
 
 /// The text of one scrape.
 pub(super) fn render(shared: &Shared) -> String {
@@ -50,6 +50,8 @@ struct Page {
     peer_rtt: GaugeVec,
     leases: GaugeVec,
     link: CounterVec,
+    load: GaugeVec,
+    moves: CounterVec,
     build: GaugeVec,
     started: GaugeVec,
     latency: parking_lot::Mutex<String>,
@@ -130,6 +132,18 @@ impl Page {
                 "blaze_flow_link_events_total",
                 "Things that happened on the link.",
                 &["event"],
+            )?,
+            load: gauge(
+                &r,
+                "blaze_flow_load_bytes_per_second",
+                "Payload that the flow carries over the inter scope, as the other flows of its layer are told.",
+                &["direction"],
+            )?,
+            moves: counter(
+                &r,
+                "blaze_flow_moves_total",
+                "Topics that went to another flow of the layer.",
+                &["reason"],
             )?,
             started: gauge(
                 &r,
@@ -338,6 +352,17 @@ impl Page {
         self.link
             .with_label_values(&["kept_lease_skipped"])
             .inc_by(control.skipped_leases as f64);
+        let (load, moves) = (control.load(), control.moves());
+        for (direction, bytes_per_s) in [("out", load.out_bytes_per_s), ("in", load.in_bytes_per_s)] {
+            self.load.with_label_values(&[direction]).set(bytes_per_s as f64);
+        }
+        for (reason, count) in [
+            (MoveReason::Load.as_str(), moves.by_load),
+            (MoveReason::Settled.as_str(), moves.settled),
+            ("taken_back", moves.taken_back),
+        ] {
+            self.moves.with_label_values(&[reason]).inc_by(count as f64);
+        }
         let (handed_over, taken_over) = control.handovers();
         for (event, count) in [
             ("topic_handed_over", handed_over),
@@ -354,37 +379,6 @@ impl Page {
         let mut text = String::from_utf8_lossy(&text).into_owned();
         text.push_str(&self.latency.lock());
         Ok(text)
-    }
-}
-
-/// A latency histogram as Prometheus counts: cumulative, in seconds.
-#[derive(Default)]
-struct Histogram {
-    below: [u64; BUCKETS.len()],
-    count: u64,
-    sum_s: f64,
-}
-
-impl Histogram {
-    fn add(&mut self, bridge: &BridgeState) {
-        let latency = &bridge.stats.latency;
-        for (below, bound) in self.below.iter_mut().zip(BUCKETS) {
-            *below += latency.count_up_to_us((bound * 1e6) as u64);
-        }
-        self.count += latency.count();
-        self.sum_s += latency.sum_us() as f64 / 1e6;
-    }
-
-    fn write(&self, topic: &str, to: &str, text: &mut String) {
-        use std::fmt::Write as _;
-        let labels = format!("topic=\"{topic}\",to=\"{to}\"");
-        let name = "blaze_flow_bridge_latency_seconds";
-        for (below, bound) in self.below.iter().zip(BUCKETS) {
-            let _ = writeln!(text, "{name}_bucket{{{labels},le=\"{bound}\"}} {below}");
-        }
-        let _ = writeln!(text, "{name}_bucket{{{labels},le=\"+Inf\"}} {}", self.count);
-        let _ = writeln!(text, "{name}_sum{{{labels}}} {}", self.sum_s);
-        let _ = writeln!(text, "{name}_count{{{labels}}} {}", self.count);
     }
 }
 

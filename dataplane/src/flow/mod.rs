@@ -110,8 +110,8 @@ impl Shared {
     fn tell_link(&self) {
         let now = Instant::now();
         let limit = self.egress.budget() as u64;
+        let demand = self.control.lock().load().out_bytes_per_s;
         self.plane.read(|state| {
-            let demand = state.core.link_demand(now) as u64;
             if let Some(engine) = &mut state.engine {
                 engine.set_wall_clock(now, wall_ns());
                 engine.set_egress(SaidEgress {
@@ -273,6 +273,7 @@ pub async fn start_with(
         was_ready: false,
         writers: HashMap::new(),
         leave: leave.clone(),
+        measured: now,
     };
     let control = supervisor.spawn("control", TaskPolicy::MayEnd, task.run());
     watch_brokers(&shared, &supervisor, epoch);

@@ -9,11 +9,12 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::Received;
-use blaze_domain::{DropReason, Scope};
+use blaze_domain::{DropReason, FlowId, Scope};
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::Notify;
 
 use crate::lane::core::{DataCore, LaneLink};
+use crate::lane::load::Loads;
 use crate::lane::path::TopicId;
 use crate::link::transport::{Endpoint, TransportEvent};
 use crate::link::{Engine, LaneId, LinkEvent, Submit, Transmit};
@@ -65,6 +66,9 @@ impl LaneLink for NoLink {
     fn drop_lane(&mut self, _lane: LaneId) -> u64 {
         0
     }
+    fn is_suspect(&self, _to: &FlowId) -> bool {
+        true
+    }
 }
 
 impl PlaneState {
@@ -73,6 +77,14 @@ impl PlaneState {
         match &mut self.engine {
             Some(engine) => self.core.ingest(now, wall_ns, topic, from, batch, engine),
             None => self.core.ingest(now, wall_ns, topic, from, batch, &mut NoLink),
+        }
+    }
+
+    /// Takes a sample of what every bridge carries; to be called once a second.
+    pub fn measure(&mut self, now: Instant) -> Loads {
+        match &self.engine {
+            Some(engine) => self.core.measure(now, engine),
+            None => self.core.measure(now, &NoLink),
         }
     }
 

@@ -7,6 +7,7 @@ use blaze_domain::{DropReason, Priority, Scope};
 
 use super::admit::Admitted;
 use super::core::LaneLink;
+use super::load::LoadMeter;
 use super::measure::RateMeter;
 use super::path::{BridgeState, Phase, Sink, TopicId};
 use super::reading::For;
@@ -32,6 +33,7 @@ impl BridgeState {
             sink,
             stats: BridgeStats::default(),
             out_rate: RateMeter::new(now),
+            load: LoadMeter::new(now),
         }
     }
 
@@ -40,6 +42,7 @@ impl BridgeState {
         let begins = matches!(self.phase, Phase::Draining { .. } | Phase::Ended);
         if begins {
             self.phase = Phase::Up { since: now };
+            self.load = LoadMeter::new(now);
         }
         let begins = begins || (planned.lane.durable && !self.lane.durable);
         self.ended = None;
@@ -168,6 +171,7 @@ impl BridgeState {
             self.stats.dropped.add(DropReason::MaxRate, 1);
             return;
         }
+        self.load.add(bytes);
         match &mut self.sink {
             Sink::Publish { writer, bare, .. } => {
                 let Some(writer) = writer else {

@@ -27,7 +27,7 @@ use super::reading::For;
 use super::stats::Drops;
 use super::window::DuplicateWindow;
 use super::writer::{NewWriter, Writer};
-use crate::link::{Engine, LaneId, Submit};
+use crate::link::{Engine, LaneId, PeerState, Submit};
 use crate::plan::Target;
 
 /// Writers whose duplicate window a flow keeps; the least recently used go first.
@@ -50,6 +50,8 @@ pub trait LaneLink {
     fn queued(&self, lane: LaneId) -> u64;
     /// Drops what is queued of a lane, and gives how many messages that were; the caller counts them.
     fn drop_lane(&mut self, lane: LaneId) -> u64;
+    /// Whether a flow does not acknowledge for the moment, or is not known.
+    fn is_suspect(&self, to: &FlowId) -> bool;
 }
 
 impl LaneLink for Engine {
@@ -61,6 +63,9 @@ impl LaneLink for Engine {
     }
     fn drop_lane(&mut self, lane: LaneId) -> u64 {
         Engine::drop_lane(self, lane).messages
+    }
+    fn is_suspect(&self, to: &FlowId) -> bool {
+        self.peer(to).is_none_or(|peer| peer.state != PeerState::Up)
     }
 }
 
@@ -178,19 +183,6 @@ impl DataCore {
         bridges.any(|bridge| matches!(bridge.phase, Phase::Draining { .. }))
     }
 
-    /// Bytes of payload per second that local publishers have for other flows: one copy per lane.
-    pub fn link_demand(&mut self, now: Instant) -> f64 {
-        let mut demand = 0.0;
-        for path in &mut self.topics {
-            let is_lane = |b: &&BridgeState| matches!((&b.phase, &b.sink), (Phase::Up { .. }, Sink::Lane { .. }));
-            let lanes = path.bridges.iter().filter(is_lane).count();
-            if lanes > 0 {
-                demand += path.in_rate.rate(now).1 * lanes as f64;
-            }
-        }
-        demand
-    }
-
     /// Puts a mark into the counters of every bridge: what happened since the one before is "lately".
     pub fn mark(&mut self) {
         self.topics.iter_mut().for_each(TopicPath::mark);
@@ -211,6 +203,11 @@ impl DataCore {
         batch: &mut Vec<Received>,
         link: &mut dyn LaneLink,
     ) {
+        if from == Scope::Layer && !self.path(topic).reads(from) {
+            // What still comes after the last bridge has gone is nobody's. Who reads on from there must not find it noted.
+            batch.clear();
+            return;
+        }
         for received in batch.drain(..) {
             let kept = received.kept;
             let meant = match from {

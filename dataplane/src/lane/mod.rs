@@ -5,6 +5,7 @@ mod bridge;
 pub mod core;
 mod early;
 pub mod kept;
+pub mod load;
 pub mod measure;
 pub mod path;
 mod places;

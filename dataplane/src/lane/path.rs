@@ -9,6 +9,7 @@ use blaze_domain::{DropReason, FlowId, LayerName, Priority, Scope, TopicName, Wr
 use blaze_proto::Frame;
 
 use super::core::FORGET;
+use super::load::LoadMeter;
 use super::measure::RateMeter;
 use super::reading::Places;
 use super::stats::{BridgeStats, Drops};
@@ -137,6 +138,8 @@ pub struct BridgeState {
     pub stats: BridgeStats,
     /// Written per second.
     pub out_rate: RateMeter,
+    /// Carried, after filters and rate.
+    pub load: LoadMeter,
 }
 
 impl BridgeState {

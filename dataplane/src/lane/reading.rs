@@ -58,6 +58,11 @@ impl Places {
         }
     }
 
+    /// Whether it is known of every partition where the next one begins, and they are few enough to be told.
+    pub(super) fn are_exact(&self, most: usize) -> bool {
+        (1..=most).contains(&self.next.len())
+    }
+
     /// Where the one that comes next begins; empty where nothing is known of it.
     fn stopped_at(&self) -> Vec<i64> {
         if self.next.is_empty() {

@@ -119,6 +119,7 @@ impl Engine {
             clock: Some(clock),
             egress: self.egress,
             public_key: Bytes::new(),
+            ingress_bytes_per_s: None,
             // Who is on the inter scope is a gateway, if its group has any.
             ..Hello::default()
         }

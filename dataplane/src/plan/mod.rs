@@ -15,6 +15,7 @@
 //! flows of other groups ask for, and read there what those publish: to them, other groups are what a gateway says of them.
 
 pub mod gateway;
+pub(crate) mod balance;
 mod lane;
 pub(crate) mod rendezvous;
 mod rules;

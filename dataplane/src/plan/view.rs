@@ -1,5 +1,7 @@
 //! The world as one topic sees it: publishers, requesters, and who of them matches whom.
 
+mod successor;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::iter;
 
@@ -355,9 +357,9 @@ impl<'w> TopicView<'w> {
 
     /// The same of any group.
     ///
-    /// Whoever carries the topic stays until it gives it up: only this flow itself gives up what it carries, to a better one
-    /// that has settled, or to the better one of two that both do. Of a flow that is going away its word is awaited, where
-    /// the next one begins.
+    /// Whoever carries the topic stays until it gives it up: only this flow itself gives up what it carries, to the one that it
+    /// chose by load, to a better one that has settled, or to the better one of two that both do. Of a flow that is going away
+    /// its word is awaited, where the next one begins.
     pub(crate) fn owner_in(&self, group: Group<'w>) -> Option<&'w FlowId> {
         let of_group = |publisher: &&Publisher<'_>| publisher.group == group && publisher.scope == Scope::Layer;
         let own = group == self.group;
@@ -371,12 +373,10 @@ impl<'w> TopicView<'w> {
         let choose = |flows: &mut dyn Iterator<Item = &'w FlowId>| rendezvous::choose(self.topic.as_str(), flows);
         let current = choose(&mut able().filter(|flow| self.carries_out(flow)));
         match current {
-            Some(current) if current == self.me => {
-                choose(&mut able().filter(|flow| *flow == current || self.is_settled(flow)))
-            }
+            Some(current) if current == self.me => self.successor(able()),
             Some(current) => Some(current),
             None if self.leaving_carrier(group).is_some() => None,
-            None => choose(&mut able()),
+            None => self.given_to(group, able()).or_else(|| choose(&mut able())),
         }
     }
 

@@ -14,6 +14,7 @@ mod gateways;
 mod holder;
 mod kept;
 mod leases;
+mod loads;
 mod merge;
 mod names;
 mod parts;
@@ -40,13 +41,16 @@ use blaze_proto::link::link_control::{Body, RouteState};
 use announce::{Announcer, MAX_LEASED_ENTRIES};
 use leases::LeaseTable;
 pub use leases::{LapseReason, LapsedLease, LeaseKey, LeaseView, Terms};
+pub use loads::{Load, REST};
 use names::NameBook;
 pub use names::{LayerNames, NameFault, peers_channel};
 pub use parts::LEGACY;
 use parts::Legacies;
-pub(crate) use parts::carrying_states;
+pub(crate) use parts::{MAX_PARTITIONS, carrying_states};
 pub use peers::MAX_FLOWS;
 pub use pieces::MAX_LINK_CONTROL_BYTES;
+#[cfg(test)]
+pub(crate) use pieces::entry_hash;
 use remote::Remote;
 pub use replicas::SILENT;
 pub use stored::{Restored, UnsavedLease};
@@ -93,6 +97,8 @@ pub struct Registry {
     legacies: Legacies,
     /// Topics whose carrier has changed.
     urgent: BTreeSet<TopicName>,
+    /// When flows of the group last gave or got a topic by load.
+    moves: BTreeMap<FlowId, Instant>,
     faults: SyncFaults,
     names: NameBook,
     /// Topics that a bridge of this flow reads from or writes to the layer scope.
@@ -137,6 +143,7 @@ impl Registry {
             layer_outgoing: Vec::new(),
             legacies: Legacies::new(),
             urgent: BTreeSet::new(),
+            moves: BTreeMap::new(),
             faults: SyncFaults::default(),
             config,
         }

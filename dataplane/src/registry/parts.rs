@@ -1,7 +1,7 @@
 //! Who carries what is published on a layer scope out of the layer: as it travels, and what follows when it changes.
 //!
 //! ```text
-//! carry ─► (drain, or a better one has settled) ─► handover: next_offset ─► the next one begins there
+//! carry ─► (drain, a better one has settled, or one has less to carry) ─► handover: next_offset ─► the next one begins there
 //!       └► silence ─► the next one begins on the broker a second before the last sign of life
 //! ```
 
@@ -17,14 +17,14 @@ use super::Registry;
 use super::announce::MAX_ENTRIES;
 use super::remote::Remote;
 use super::wire::MAX_ROUTES;
-use crate::world::{Carrying, Part, Reach};
+use crate::world::{Carrying, Handover, Hold, Part, Reach};
 
 /// A route state with this step says that the flow carries the topic out of its layer.
 const CARRY: &str = "carry";
 /// One with this step says that it did, and where in a partition the next one begins.
 const HANDOVER: &str = "handover";
 /// Partitions whose offsets are handed over; of topics with more only the time of the last sign of life is known.
-pub(super) const MAX_PARTITIONS: usize = MAX_ROUTES / 2;
+pub(crate) const MAX_PARTITIONS: usize = MAX_ROUTES / 2;
 /// What a flow has left behind is taken up within this time: later it would be old.
 pub const LEGACY: Duration = Duration::from_secs(10);
 /// How much before the last sign of life of a flow that has died the next one begins.
@@ -42,9 +42,9 @@ pub(super) type Legacies = BTreeMap<TopicName, Legacy>;
 /// The route states that say who carries a topic.
 #[must_use]
 pub(crate) fn carrying_states(me: &FlowId, carrying: &Carrying) -> Vec<RouteState> {
-    let state = |step: &str, next_offset: u64| RouteState {
+    let state = |step: &str, receiver: &FlowId, next_offset: u64| RouteState {
         to_layer: me.layer.to_string(),
-        receiver: me.to_string(),
+        receiver: receiver.to_string(),
         step: step.to_owned(),
         ok: true,
         code: "ok".to_owned(),
@@ -52,11 +52,12 @@ pub(crate) fn carrying_states(me: &FlowId, carrying: &Carrying) -> Vec<RouteStat
     };
     match carrying {
         Carrying::No => Vec::new(),
-        Carrying::Carries => vec![state(CARRY, 0)],
-        Carrying::HandedOver(offsets) => {
+        Carrying::Carries => vec![state(CARRY, me, 0)],
+        Carrying::HandedOver(Handover { offsets, to }) => {
+            let to = to.as_ref().unwrap_or(me);
             let offsets = offsets.iter().take(MAX_PARTITIONS);
             offsets
-                .map(|offset| state(HANDOVER, u64::try_from(*offset).unwrap_or(0)))
+                .map(|offset| state(HANDOVER, to, u64::try_from(*offset).unwrap_or(0)))
                 .collect()
         }
     }
@@ -64,17 +65,20 @@ pub(crate) fn carrying_states(me: &FlowId, carrying: &Carrying) -> Vec<RouteStat
 
 /// The part of a flow in a topic, as its route states tell; of its receivers those of one layer.
 pub(super) fn part_of(flow: &FlowId, routes: &[RouteState], layer: &str) -> Part {
-    let offsets: Arc<[i64]> = routes
-        .iter()
-        .filter(|route| route.step == HANDOVER)
+    let handed = || routes.iter().filter(|route| route.step == HANDOVER);
+    let offsets: Arc<[i64]> = handed()
         .map(|route| i64::try_from(route.next_offset).unwrap_or(i64::MAX))
         .collect();
+    let to = handed().next().and_then(|route| route.receiver.parse::<FlowId>().ok());
     let carrying = if routes.iter().any(|route| route.step == CARRY) {
         Carrying::Carries
     } else if offsets.is_empty() {
         Carrying::No
     } else {
-        Carrying::HandedOver(offsets)
+        Carrying::HandedOver(Handover {
+            offsets,
+            to: to.filter(|to| to != flow && to.layer == flow.layer),
+        })
     };
     let sent = routes.iter().filter(|route| route.step == "bridge");
     let receivers: BTreeSet<FlowId> = sent
@@ -84,6 +88,7 @@ pub(super) fn part_of(flow: &FlowId, routes: &[RouteState], layer: &str) -> Part
     Part {
         carrying,
         receivers: receivers.into_iter().collect(),
+        hold: Hold::default(),
     }
 }
 
@@ -122,20 +127,61 @@ impl Registry {
         flow.layer == self.config.me.layer && own.is_some() && view.is_some_and(|view| view.layer_scope == own)
     }
 
+    fn part(&self, flow: &FlowId, topic: &TopicName) -> Option<&Part> {
+        self.world.flows.get(flow)?.parts.get(topic)
+    }
+
     fn carrying(&self, flow: &FlowId, topic: &TopicName) -> Option<&Carrying> {
-        Some(&self.world.flows.get(flow)?.parts.get(topic)?.carrying)
+        self.part(flow, topic).map(|part| &part.carrying)
+    }
+
+    /// Whether the own flow keeps a topic that it carries, or is about to.
+    pub fn set_hold(&mut self, topic: &TopicName, hold: Hold) {
+        if let Some(own) = self.world.flows.get_mut(&self.config.me) {
+            own.parts.entry(topic.clone()).or_default().hold = hold;
+        }
+    }
+
+    /// Whether the own flow keeps a topic that it carries.
+    #[must_use]
+    pub fn hold(&self, topic: &TopicName) -> &Hold {
+        self.part(&self.config.me, topic)
+            .map_or(&Hold::Hashing, |part| &part.hold)
+    }
+
+    /// A flow of the group has given this one the topic by name.
+    #[must_use]
+    pub fn was_given(&self, topic: &TopicName) -> bool {
+        let others = self.world.flows.keys().filter(|flow| **flow != self.config.me);
+        let mut given = others
+            .filter(|flow| self.shares_layer(flow))
+            .map(|flow| self.carrying(flow, topic));
+        given.any(|carrying| match carrying {
+            Some(Carrying::HandedOver(handover)) => handover.to.as_ref() == Some(&self.config.me),
+            _ => false,
+        })
     }
 
     /// The own part in a topic, as it is told to others.
     pub(super) fn note_own_part(&mut self, now: Instant, topic: &TopicName, routes: &[RouteState]) {
         let me = self.config.me.clone();
-        let part = part_of(&me, routes, me.layer.as_str());
+        let mut part = part_of(&me, routes, me.layer.as_str());
         let carrying = part.carrying.clone();
+        let before = self.part(&me, topic);
+        let moves = before.is_none_or(|before| before.carrying != carrying);
+        if let (Carrying::Carries, Some(before)) = (&carrying, before) {
+            part.hold = before.hold.clone();
+        }
         self.put_part(&me, topic, part);
         match carrying {
             Carrying::Carries => drop(self.legacies.remove(topic)),
-            // Should the next one fail before it begins, this flow knows where.
-            Carrying::HandedOver(offsets) => self.leave_behind(now, topic, Begin::At(offsets)),
+            Carrying::HandedOver(handover) => {
+                if moves {
+                    self.note_move(now, &me, &handover);
+                }
+                // Should the next one fail before it begins, this flow knows where.
+                self.leave_behind(now, topic, Begin::At(handover.offsets));
+            }
             Carrying::No => {}
         }
     }
@@ -153,7 +199,10 @@ impl Registry {
             let moves = self.carrying(flow, &topic).unwrap_or(&Carrying::No) != &part.carrying;
             if shares && moves {
                 match &part.carrying {
-                    Carrying::HandedOver(offsets) => self.leave_behind(now, &topic, Begin::At(Arc::clone(offsets))),
+                    Carrying::HandedOver(handover) => {
+                        self.note_move(now, flow, handover);
+                        self.leave_behind(now, &topic, Begin::At(Arc::clone(&handover.offsets)));
+                    }
                     Carrying::Carries => drop(self.legacies.remove(&topic)),
                     Carrying::No => {}
                 }
@@ -220,6 +269,10 @@ mod tests {
             Carrying::Carries,
             Carrying::HandedOver([0].into()),
             Carrying::HandedOver([17, 0, i64::MAX].into()),
+            Carrying::HandedOver(Handover {
+                to: Some("cloud/b".parse().unwrap()),
+                ..[5, 6].into()
+            }),
         ] {
             let part = part_of(&me, &carrying_states(&me, &carrying), "cloud");
             assert_eq!(part.carrying, carrying);
@@ -230,7 +283,7 @@ mod tests {
     #[test]
     fn offsets_beyond_what_fits_are_left_out_and_absurd_ones_do_no_harm() {
         let me: FlowId = "cloud/a".parse().unwrap();
-        let many = Carrying::HandedOver((0..100).collect());
+        let many = Carrying::HandedOver([7; 100].into());
         assert_eq!(carrying_states(&me, &many).len(), MAX_PARTITIONS);
         let mut states = carrying_states(&me, &Carrying::HandedOver([-5].into()));
         states[0].next_offset = u64::MAX;
@@ -238,6 +291,20 @@ mod tests {
             part_of(&me, &states, "cloud").carrying,
             Carrying::HandedOver([i64::MAX].into())
         );
+    }
+
+    #[test]
+    fn a_topic_is_given_within_the_layer_alone() {
+        let me: FlowId = "cloud/a".parse().unwrap();
+        for receiver in ["cloud/a", "fog/b", "garbage", ""] {
+            let mut states = carrying_states(&me, &Carrying::HandedOver([5].into()));
+            states[0].receiver = receiver.to_owned();
+            assert_eq!(
+                part_of(&me, &states, "cloud").carrying,
+                Carrying::HandedOver([5].into()),
+                "{receiver}"
+            );
+        }
     }
 
     #[test]

@@ -138,7 +138,7 @@ pub(super) fn pack(pieces: impl IntoIterator<Item = wire::Entry>) -> Vec<Vec<wir
 }
 
 /// Hash of one whole entry. The digest of a flow is the wrapping sum over its entries, so their order does not matter.
-pub(super) fn entry_hash(entry: &wire::Entry) -> u64 {
+pub(crate) fn entry_hash(entry: &wire::Entry) -> u64 {
     text_hash(&entry.encode_to_vec())
 }
 

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use blaze_domain::{FlowId, TopicName};
 use blaze_proto::link::link_control::{Body, Hello};
 
+use super::loads::Load;
 use super::remote::Remote;
 use super::{Registry, Way};
 use crate::world::{FlowState, Reach, SETTLED_AFTER};
@@ -27,6 +28,8 @@ pub(super) struct Sign {
     pub(super) appended_ms: Option<i64>,
     /// It is too old, or was the last on purpose.
     pub(super) over: bool,
+    /// What the flow carries, as it says.
+    pub(super) load: Option<Load>,
 }
 
 /// How another flow can be reached.
@@ -84,6 +87,7 @@ impl Registry {
                 at: now,
                 appended_ms,
                 over: false,
+                load: Load::said(hello),
             });
         }
         changed.extend(self.update_reach(now, from));

@@ -7,6 +7,7 @@
 #![allow(clippy::unwrap_used, reason = "the helpers of a test fail like the test")]
 
 mod gateways;
+mod balance;
 mod parts;
 mod tasks;
 mod world;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use blaze_brokers::{Content, Later, PublishOutcome, Publisher};
 use blaze_domain::{FlowId, Priority, Scope, TopicName};
@@ -99,6 +99,17 @@ pub(crate) struct Flow {
     pub(crate) was_inside: bool,
     /// When it has said good-bye there.
     pub(crate) leaves: Option<Instant>,
+    /// When it was last measured what it carries.
+    pub(crate) measured: Instant,
+}
+
+/// A topic of the cloud that the robot asks for.
+pub(crate) struct Stream {
+    pub(crate) topic: TopicName,
+    pub(crate) bytes: usize,
+    pub(crate) period: Duration,
+    pub(crate) next: Instant,
+    pub(crate) sent: u64,
 }
 
 pub(crate) struct Packet {

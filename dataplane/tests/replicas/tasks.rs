@@ -16,6 +16,9 @@ use rand::RngExt;
 use crate::parts::{Life, LogWriter, Packet, Record, channel};
 use crate::world::World;
 
+/// How often it is measured what a flow carries.
+const MEASURE: Duration = Duration::from_secs(1);
+
 impl World {
     /// What the source tasks and the task of the channel of flows do.
     pub(crate) fn read(&mut self, index: usize) {
@@ -86,7 +89,24 @@ impl World {
         for event in news {
             flow.control.link_event(now, event);
         }
+        if now >= flow.measured + MEASURE {
+            flow.measured = now;
+            let loads = flow.plane.measure(now);
+            flow.control.set_loads(now, &loads, 0);
+        }
         flow.control.tick(now, wall_ms);
+        self.carry_out_all(index);
+        let flow = &mut self.flows[index];
+        for topic in flow.control.emptying() {
+            flow.plane.run_timers(now);
+            if flow.plane.core.has_emptied(&topic) {
+                flow.control.emptied(now, wall_ms, &topic);
+            }
+        }
+        self.carry_out_all(index);
+    }
+
+    fn carry_out_all(&mut self, index: usize) {
         while let Some(output) = self.flows[index].control.poll() {
             self.carry_out(index, output);
         }

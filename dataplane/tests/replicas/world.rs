@@ -23,7 +23,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use serde_json::json;
 
-use crate::parts::{End, Flow, Found, Life, Log, Packet, Record, channel};
+use crate::parts::{End, Flow, Found, Life, Log, Packet, Record, Stream, channel};
 
 const STEP: Duration = Duration::from_millis(5);
 const WALL_NS: u64 = 1_700_000_000_000_000_000;
@@ -64,19 +64,34 @@ pub(crate) struct World {
     /// What services on nodes have published: flow and sequence.
     pub(crate) said: Vec<(usize, u64)>,
     pub(crate) round: u64,
+    /// More topics from the cloud to the robot.
+    pub(crate) streams: Vec<Stream>,
 }
 
 impl World {
+    /// Two replicas.
     pub(crate) fn new(seed: u64) -> Self {
-        let mut world = Self::with(seed, 2);
+        Self::loaded(seed, 2, &[])
+    }
+
+    /// So many replicas, and more topics to the robot: bytes of a message, messages per second.
+    pub(crate) fn loaded(seed: u64, replicas: usize, streams: &[(usize, u32)]) -> Self {
+        let mut world = Self::begin(seed, replicas, streams);
         world.run_for(Duration::from_secs(6));
         world.publishing = true;
         world.next_publish = world.now;
+        for stream in &mut world.streams {
+            stream.next = world.now;
+        }
         world
     }
 
     /// A robot and so many flows on one Kafka, which have just begun.
     pub(crate) fn with(seed: u64, clouds: usize) -> Self {
+        Self::begin(seed, clouds, &[])
+    }
+
+    fn begin(seed: u64, clouds: usize, streams: &[(usize, u32)]) -> Self {
         let mut random = StdRng::seed_from_u64(seed);
         let now = Instant::now();
         let mut world = Self {
@@ -102,7 +117,17 @@ impl World {
             of_nodes: false,
             said: Vec::new(),
             round: 0,
+            streams: Vec::new(),
         };
+        for (number, (bytes, hz)) in streams.iter().enumerate() {
+            world.streams.push(Stream {
+                topic: format!("stream/{number}").parse().unwrap(),
+                bytes: *bytes,
+                period: Duration::from_secs(1) / *hz,
+                next: now,
+                sent: 0,
+            });
+        }
         for index in 0..=clouds {
             let flow = world.make_flow(index, 1);
             world.flows.push(flow);
@@ -182,6 +207,7 @@ impl World {
             inside,
             was_inside: inside,
             leaves: None,
+            measured: self.now,
         }
     }
 
@@ -195,6 +221,9 @@ impl World {
         } else {
             (Scope::Layer, [message("request", UP), message("advertise", DOWN)])
         };
+        let op = if index == 0 { "request" } else { "advertise" };
+        let streams = self.streams.iter().map(|stream| message(op, stream.topic.as_str()));
+        let messages: Vec<String> = messages.into_iter().chain(streams).collect();
         let (now, wall_ms) = (self.now, self.wall() / 1_000_000);
         let control = &mut self.flows[index].control;
         for message in messages {
@@ -221,6 +250,10 @@ impl World {
         // Not always at the same moment between two Hellos and two messages.
         let pause = self.random.random_range(0..120);
         self.run_for(STEP * pause);
+        self.end_now(index, end);
+    }
+
+    pub(crate) fn end_now(&mut self, index: usize, end: End) {
         let (now, wall_ms) = (self.now, self.wall() / 1_000_000);
         let flow = &mut self.flows[index];
         self.handed_over += flow.control.handovers().0;
@@ -324,6 +357,9 @@ impl World {
         if self.of_nodes && self.now >= self.next_publish && !self.publishing {
             self.next_publish += PERIOD;
             self.publish_on_nodes();
+        }
+        if self.publishing {
+            self.publish_streams();
         }
         if !self.publishing || self.now < self.next_publish {
             return;

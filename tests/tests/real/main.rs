@@ -5,6 +5,7 @@
 
 mod again;
 mod churn;
+mod balance;
 mod contract;
 mod demo;
 mod frozen;

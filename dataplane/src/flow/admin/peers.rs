@@ -12,7 +12,7 @@ use super::super::inter::InterScope;
 use super::{App, answer, rounded};
 use crate::control::ControlCore;
 use crate::link::{Engine, PeerState};
-use crate::world::{FlowState, Reach};
+use crate::world::{Carrying, FlowState, Reach};
 
 pub(super) async fn peers(State(shared): App) -> Json<Value> {
     let now = Instant::now();
@@ -68,10 +68,16 @@ fn replica_row(control: &ControlCore, (flow, silent): (&FlowId, Duration)) -> Va
         (_, FlowState::Ready) => "ready",
         (_, FlowState::Draining) => "draining",
     });
+    let parts = view.iter().flat_map(|view| view.parts.values());
+    let carries = parts.filter(|part| part.carrying == Carrying::Carries).count();
     json!({
         "flow": flow, "epoch": view.map(|view| view.epoch), "state": state,
         "settled": view.is_some_and(|view| view.settled), "last_heard_ms": rounded(silent.as_secs_f64() * 1e3),
-        "in_step": control.registry().is_in_step_with(flow),
+        "in_step": control.registry().is_in_step_with(flow), "carries": carries,
+        "load": control.registry().load_of(flow).map(|load| json!({
+            "out_bytes_per_s": load.out_bytes_per_s, "in_bytes_per_s": load.in_bytes_per_s,
+            "limit_bytes_per_s": (load.limit_bytes_per_s > 0).then_some(load.limit_bytes_per_s),
+        })),
         "role": view.map(|view| if view.role.is_gateway() { "gateway" } else { "member" }),
         "gateway": view.map(|view| setting(view.gateway)),
     })

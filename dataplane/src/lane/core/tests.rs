@@ -1,5 +1,7 @@
 //! The message path alone: a link that only takes notes, brokers that only collect.
 
+mod load;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -35,6 +37,9 @@ impl LaneLink for NotingLink {
     }
     fn drop_lane(&mut self, lane: LaneId) -> u64 {
         self.waiting.remove(&lane).unwrap_or(0)
+    }
+    fn is_suspect(&self, _to: &FlowId) -> bool {
+        self.refuse
     }
 }
 

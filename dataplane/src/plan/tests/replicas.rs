@@ -3,7 +3,7 @@
 
 use super::worlds::{id, topic, world};
 use crate::plan::{PlanRules, Target, TopicPlan, owner, plan_topic};
-use crate::world::{Carrying, FlowState, FlowView, Reach, World};
+use crate::world::{Carrying, FlowState, FlowView, Handover, Hold, Reach, World};
 use blaze_domain::FlowId;
 
 const FLOWS: [&str; 3] = ["f/a", "f/b", "f/c"];
@@ -90,6 +90,56 @@ fn whoever_carries_a_topic_keeps_it_until_a_better_one_has_settled() {
     assert_eq!(carriers(&world), [], "it gives up, and the other waits for that");
     assert_eq!(plan_of(&world, &second, None).carrier, Some(best.clone()));
     set(&mut world, &second, Carrying::HandedOver([7].into()));
+    assert_eq!(carriers(&world), [best]);
+}
+
+fn hold(world: &mut World, flow: &FlowId, hold: Hold) {
+    view(world, flow).parts.entry(topic()).or_default().hold = hold;
+}
+
+#[test]
+fn what_was_placed_by_load_stays_though_a_better_one_has_settled() {
+    let [best, second, _] = preferred();
+    let mut world = fog();
+    set(&mut world, &second, Carrying::Carries);
+    view(&mut world, &best).settled = true;
+    hold(&mut world, &second, Hold::Stays);
+    assert_eq!(carriers(&world), std::slice::from_ref(&second));
+    set(&mut world, &best, Carrying::Carries);
+    assert_eq!(carriers(&world), [best], "of two the better one has it all the same");
+}
+
+#[test]
+fn a_topic_is_given_to_whom_its_handover_names_and_else_to_whom_hashing_chooses() {
+    let [best, second, third] = preferred();
+    let mut world = fog();
+    set(&mut world, &second, Carrying::Carries);
+    hold(&mut world, &second, Hold::GivesTo(third.clone()));
+    assert_eq!(carriers(&world), [], "the others wait until it has said where");
+    assert_eq!(plan_of(&world, &second, None).carrier, Some(third.clone()));
+    let mut gone = world.clone();
+    view(&mut gone, &third).reach = Reach::Down;
+    assert_eq!(
+        carriers(&gone),
+        std::slice::from_ref(&second),
+        "it keeps what it cannot give"
+    );
+    let handover = Handover {
+        to: Some(third.clone()),
+        ..[7].into()
+    };
+    set(&mut world, &second, Carrying::HandedOver(handover));
+    assert_eq!(carriers(&world), std::slice::from_ref(&third));
+    for flow in [&best, &second] {
+        assert_eq!(plan_of(&world, flow, None).carrier, Some(third.clone()), "all agree");
+    }
+    let mut gone = world.clone();
+    view(&mut gone, &third).reach = Reach::Down;
+    for flow in [&best, &second] {
+        let carries = plan_of(&gone, flow, None).carries_out();
+        assert_eq!(carries, flow == &best, "it died before it began: {flow}");
+    }
+    view(&mut world, &third).state = FlowState::Draining;
     assert_eq!(carriers(&world), [best]);
 }
 

@@ -4,7 +4,8 @@ use blaze_brokers::Begin;
 use blaze_proto::link::link_control::Goodbye;
 
 use super::*;
-use crate::world::{Carrying, SETTLED_AFTER};
+use crate::registry::{Load, REST};
+use crate::world::{Carrying, Handover, SETTLED_AFTER};
 
 const MS: Duration = Duration::from_millis(1);
 
@@ -271,4 +272,68 @@ fn who_shares_nothing_is_not_heard_there() {
     );
     pair.flows[1].on_layer_hello(now, &id("fog/a"), &said, said.epoch, None);
     assert_eq!(pair.flows[1].world().flows.len(), 1);
+}
+
+#[test]
+fn loads_are_told_with_each_hello_and_change_nothing_that_is_announced() {
+    let mut pair = Pair::new(0);
+    pair.run(1000 * MS);
+    let a = id("cloud/a");
+    assert_eq!(pair.flows[1].load_of(&a), None, "an earlier version says nothing");
+    let announced = pair.flows[0].announced();
+    let said = Hello {
+        state: State::Ready.into(),
+        egress: Some(blaze_proto::link::link_control::Egress {
+            demand_bytes_per_s: 700,
+            limit_bytes_per_s: 9000,
+        }),
+        ingress_bytes_per_s: Some(30),
+        ..hello(&pair.flows[0])
+    };
+    let now = pair.now;
+    let changed = pair.flows[1].on_layer_hello(now, &a, &said, None);
+    assert!(changed.is_empty(), "no topic is planned because of a load: {changed:?}");
+    let load = pair.flows[1].load_of(&a).unwrap();
+    let expected = Load {
+        out_bytes_per_s: 700,
+        in_bytes_per_s: 30,
+        limit_bytes_per_s: 9000,
+    };
+    assert_eq!((load, load.total()), (expected, 730));
+    assert_eq!(pair.flows[0].announced(), announced);
+    let absurd = Hello {
+        ingress_bytes_per_s: Some(u64::MAX),
+        ..said
+    };
+    pair.flows[1].on_layer_hello(now, &a, &absurd, None);
+    assert_eq!(pair.flows[1].load_of(&a).unwrap().total(), u64::MAX);
+}
+
+#[test]
+fn one_that_gave_or_got_a_topic_by_name_rests_for_ten_seconds() {
+    let mut pair = Pair::new(0);
+    pair.carries(0, &Carrying::Carries);
+    pair.run(1000 * MS);
+    pair.carries(0, &Carrying::HandedOver([7].into()));
+    pair.run(100 * MS);
+    let [a, b] = pair.names();
+    assert!(
+        !pair.flows[1].rests(pair.now, &a),
+        "a topic that is handed to nobody by name says nothing"
+    );
+    pair.carries(0, &Carrying::Carries);
+    pair.run(100 * MS);
+    pair.carries(
+        0,
+        &Carrying::HandedOver(Handover {
+            to: Some(b.clone()),
+            ..[7].into()
+        }),
+    );
+    pair.run(100 * MS);
+    assert!(pair.flows[1].was_given(&topic("t")) && !pair.flows[0].was_given(&topic("t")));
+    for flow in &pair.flows {
+        assert!(flow.rests(pair.now, &a) && flow.rests(pair.now, &b));
+        assert!(!flow.rests(pair.now + REST, &a) && !flow.rests(pair.now + REST, &b));
+    }
 }
