@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use blaze_domain::{FlowId, Scope, TopicName};
+use blaze_proto::link::link_control::LayerScope;
 
 use super::{ControlCore, ScopeHealth};
 use crate::lane::load::{Loads, TopicLoad};
@@ -185,7 +186,7 @@ impl ControlCore {
             in_bytes_per_s: loads.in_bytes_per_s,
             limit_bytes_per_s,
         };
-        if !self.config.replicas {
+        if self.config.replicas != Some(LayerScope::Kafka) {
             return;
         }
         let plans = &self.plans;

@@ -75,6 +75,11 @@ impl Carriers {
         self.giving_up.contains_key(topic)
     }
 
+    /// Whether a topic is being given up, or was a moment ago.
+    pub(super) fn knows(&self, topic: &TopicName) -> bool {
+        self.gives_up(topic) || self.handed_over.contains_key(topic)
+    }
+
     fn stopped_since(&self, topic: &TopicName) -> Option<Instant> {
         Some(self.giving_up.get(topic)?.stopped.as_ref()?.0)
     }

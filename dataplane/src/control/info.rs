@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 
 use blaze_domain::control::DEFAULT_ENCODING;
-use blaze_domain::{Durability, Reliability, Scope, TopicName};
+use blaze_domain::{Durability, FlowId, Reliability, Scope, TopicName};
 
 use crate::lane::path::{BareInfo, TopicInfo};
 use crate::registry::{LeaseView, Registry, Terms};
-use crate::world::{OriginFilter, World};
+use crate::world::{FlowView, OriginFilter};
 
 /// What the advertisements of a topic on this flow's own brokers say.
 pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
@@ -34,11 +34,11 @@ pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
     }
 }
 
-/// Who advertises a topic as transient_local, on any flow that is not forgotten. One that is down is still one of them: its
-/// services may well live.
-pub(super) fn durable_sources(world: &World, topic: &TopicName) -> BTreeSet<OriginFilter> {
+/// Who advertises a topic as transient_local, of flows that hold it and are not forgotten. One that is down is still one of
+/// them: its services may well live.
+pub(super) fn durable_sources(holders: &[(&FlowId, &FlowView)], topic: &TopicName) -> BTreeSet<OriginFilter> {
     let mut found = BTreeSet::new();
-    for (flow, view) in &world.flows {
+    for (flow, view) in holders {
         let Some(entry) = view.topics.get(topic) else {
             continue;
         };

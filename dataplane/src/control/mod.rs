@@ -29,7 +29,7 @@ use bytes::Bytes;
 
 use crate::lane::path::TopicInfo;
 use crate::link::LinkEvent;
-use crate::plan::{PlanRules, TopicPlan, plan_topic};
+use crate::plan::{PlanRules, Survey, TopicPlan, plan_within};
 use crate::registry::{EventDraft, LayerNames, MAX_ROUTES, Registry, RegistryConfig, UnsavedLease, carrying_states};
 use crate::world::{FlowState, LayerScopeId, OriginFilter, Reach, World};
 use balance::Balance;
@@ -169,6 +169,18 @@ pub struct ControlConfig {
     pub access: AccessRules,
 }
 
+/// From so many topics at once on it pays to look first who has to do with which.
+const MANY: usize = 16;
+
+/// A new plan that has had no consequence yet.
+struct Draft {
+    plan: TopicPlan,
+    /// Who advertises the topic as transient_local.
+    durable: BTreeSet<OriginFilter>,
+    /// Some flow announces something of the topic.
+    is_known: bool,
+}
+
 struct Dirty {
     first: Instant,
     last: Instant,
@@ -283,7 +295,7 @@ impl ControlCore {
 
     /// Tells all services that the flow has started, so that they send their leases again.
     pub fn announce_start(&mut self, wall_ms: u64) {
-        self.tell(&draft(EventKind::FlowStarted, None), wall_ms);
+        self.tell(&event(EventKind::FlowStarted, None), wall_ms);
     }
 
     /// Changes the rules; every topic is planned anew.
@@ -474,18 +486,44 @@ impl ControlCore {
             .filter(|(topic, dirty)| due(dirty) && !self.carriers.awaits_places(topic))
             .map(|(topic, _)| topic.clone())
             .collect();
-        for topic in topics {
-            self.dirty.remove(&topic);
-            self.plan(now, &topic, wall_ms);
+        for topic in &topics {
+            self.dirty.remove(topic);
+        }
+        for (topic, draft) in topics.iter().zip(self.draft(&topics)) {
+            self.carry_out(now, topic, draft, wall_ms);
         }
     }
 
-    fn plan(&mut self, now: Instant, topic: &TopicName, wall_ms: u64) {
-        let previous = self.plans.get(topic);
+    /// Plans topics, without any consequence yet: that of one is nothing to the plan of another.
+    fn draft(&self, topics: &[TopicName]) -> Vec<Draft> {
         let world = self.registry.world();
-        let mut plan = plan_topic(world, topic, &self.config.rules, previous);
+        let survey = if topics.len() < MANY {
+            Survey::new(world)
+        } else {
+            Survey::of_all(world)
+        };
+        let draft = |topic| {
+            let holders = survey.holders(topic);
+            Draft {
+                plan: plan_within(&survey, topic, &self.config.rules, self.plans.get(topic)),
+                durable: durable_sources(&holders, topic),
+                is_known: holders.iter().any(|(_, flow)| flow.topics.contains_key(topic)),
+            }
+        };
+        topics.iter().map(draft).collect()
+    }
+
+    fn carry_out(&mut self, now: Instant, topic: &TopicName, draft: Draft, wall_ms: u64) {
+        let previous = self.plans.get(topic);
+        let Draft {
+            mut plan,
+            durable,
+            is_known,
+        } = draft;
+        if is_known && previous == Some(&plan) && plan.bridges.is_empty() && self.is_idle(topic, &durable) {
+            return;
+        }
         let had_route = previous.is_some_and(|plan| !plan.bridges.is_empty());
-        let durable = durable_sources(world, topic);
         let carried = previous.is_some_and(TopicPlan::carries_out);
         let fault = if plan.uses_layer() {
             self.registry.put_on_layer(topic).err()
@@ -501,10 +539,8 @@ impl ControlCore {
         self.forget_writers(topic, durable);
         let has_route = !plan.bridges.is_empty();
         let duty = self.duty(now, topic, carried, &plan);
-        let world = self.registry.world();
         let info = Box::new(local_info(&self.registry, topic));
-        let unused = plan.bridges.is_empty() && world.flows.values().all(|flow| !flow.topics.contains_key(topic));
-        if unused {
+        if plan.bridges.is_empty() && !is_known {
             self.plans.remove(topic);
         } else {
             self.plans.insert(topic.clone(), plan.clone());
@@ -527,8 +563,17 @@ impl ControlCore {
             } else {
                 EventKind::RouteDown
             };
-            self.tell(&draft(kind, Some(topic.clone())), wall_ms);
+            self.tell(&event(kind, Some(topic.clone())), wall_ms);
         }
+    }
+
+    /// Whether a topic without bridges concerns nobody here: no lease, nothing that is kept, told or handed over. That is most
+    /// of a large fleet's topics, and they are looked at again every few seconds.
+    fn is_idle(&self, topic: &TopicName, durable: &BTreeSet<OriginFilter>) -> bool {
+        self.registry.leases_of(topic).next().is_none()
+            && self.durable.get(topic).is_none_or(|before| before == durable)
+            && !self.registry.has_route_state(topic)
+            && !self.carriers.knows(topic)
     }
 
     /// Notes who advertises a topic as transient_local; what is kept of those who no longer do is to be forgotten.
@@ -564,7 +609,7 @@ impl ControlCore {
     }
 }
 
-fn draft(event: EventKind, topic: Option<TopicName>) -> EventDraft {
+fn event(event: EventKind, topic: Option<TopicName>) -> EventDraft {
     EventDraft {
         event,
         topic,

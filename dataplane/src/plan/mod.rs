@@ -14,11 +14,12 @@
 //! In a large group only some flows are on the inter scope, its [gateways](gateway). The others publish to the layer scope what
 //! flows of other groups ask for, and read there what those publish: to them, other groups are what a gateway says of them.
 
-pub mod gateway;
 pub(crate) mod balance;
+pub mod gateway;
 mod lane;
 pub(crate) mod rendezvous;
 mod rules;
+mod survey;
 pub(crate) mod told;
 mod view;
 
@@ -31,6 +32,7 @@ use blaze_domain::{FlowId, LayerName, Priority, Scope, TopicName, WhyCode};
 
 pub(crate) use lane::asks_too_much;
 pub use rules::PlanRules;
+pub use survey::Survey;
 pub(crate) use view::{Group, Pairing, Publisher, Requester, TopicView, meets_directly, type_detail};
 
 use crate::world::{FlowState, OriginFilter, World};
@@ -217,7 +219,19 @@ pub struct Delivery {
 /// has no bridges.
 #[must_use]
 pub fn plan_topic(world: &World, topic: &TopicName, rules: &PlanRules, previous: Option<&TopicPlan>) -> TopicPlan {
-    let Some(view) = TopicView::new(world, topic) else {
+    plan_within(&Survey::new(world), topic, rules, previous)
+}
+
+/// As [`plan_topic`], of one of many topics.
+#[must_use]
+pub fn plan_within(
+    survey: &Survey<'_>,
+    topic: &TopicName,
+    rules: &PlanRules,
+    previous: Option<&TopicPlan>,
+) -> TopicPlan {
+    let world = survey.world;
+    let Some(view) = TopicView::within(survey, topic) else {
         return TopicPlan::default();
     };
     let lanes = LaneBuilder::new(rules.find(topic));

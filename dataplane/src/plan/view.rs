@@ -4,10 +4,11 @@ mod successor;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::iter;
+use std::sync::Arc;
 
 use blaze_domain::{FlowId, LayerName, Scope, TopicName, WhyCode};
 
-use super::{Blocked, Destination, gateway, rendezvous};
+use super::{Blocked, Destination, Survey, rendezvous};
 use crate::world::{
     Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, Role, TopicEntry, World,
 };
@@ -123,14 +124,22 @@ pub(crate) struct TopicView<'w> {
     /// Whether this flow is on the inter scope.
     role: Role,
     /// Flows of the own group that are on the inter scope for it and carry topics.
-    gateways: Vec<&'w FlowId>,
+    gateways: Arc<[&'w FlowId]>,
     /// Flows of the own group that are not.
-    members: BTreeSet<&'w FlowId>,
+    members: Arc<BTreeSet<&'w FlowId>>,
+    /// Flows that have to do with the topic.
+    holders: Vec<(&'w FlowId, &'w FlowView)>,
 }
 
 impl<'w> TopicView<'w> {
     /// `None` if the world does not hold its own flow.
     pub(crate) fn new(world: &'w World, topic: &'w TopicName) -> Option<Self> {
+        Self::within(&Survey::new(world), topic)
+    }
+
+    /// The same where what topics have in common is known.
+    pub(super) fn within(survey: &Survey<'w>, topic: &'w TopicName) -> Option<Self> {
+        let world = survey.world;
         let (me, own) = world.flows.get_key_value(&world.me)?;
         let mut view = Self {
             world,
@@ -141,10 +150,12 @@ impl<'w> TopicView<'w> {
             requesters: Vec::new(),
             lost_requesters: Vec::new(),
             role: own.role,
-            gateways: gateway::gateways(world).collect(),
-            members: gateway::members(world).collect(),
+            gateways: Arc::clone(&survey.gateways),
+            members: Arc::clone(&survey.members),
+            holders: survey.holders(topic),
         };
-        for (id, flow) in &world.flows {
+        for at in 0..view.holders.len() {
+            let (id, flow) = view.holders[at];
             if let Some(entry) = flow.topics.get(topic) {
                 view.add(id, flow, entry);
             }
@@ -394,7 +405,7 @@ impl<'w> TopicView<'w> {
                 && *id != self.me
                 && Group::of(id, flow) == group
         };
-        let mut flows = self.world.flows.iter().filter(leaving);
+        let mut flows = self.holders.iter().copied().filter(leaving);
         flows.find(|(id, _)| self.carries_out(id)).map(|(id, _)| id)
     }
 

@@ -461,6 +461,12 @@ impl Registry {
         self.leases.lapsed(topic)
     }
 
+    /// Whether something is told of the own flow's routes of a topic.
+    #[must_use]
+    pub fn has_route_state(&self, topic: &TopicName) -> bool {
+        self.routes.contains_key(topic)
+    }
+
     /// What the own flow's routes of a topic do; told to others with its entry.
     pub fn set_route_state(&mut self, now: Instant, topic: &TopicName, routes: Vec<RouteState>) {
         let same = match self.routes.get(topic) {

@@ -6,8 +6,8 @@
 
 #![allow(clippy::unwrap_used, reason = "the helpers of a test fail like the test")]
 
-mod gateways;
 mod balance;
+mod gateways;
 mod parts;
 mod tasks;
 mod world;

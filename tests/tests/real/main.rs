@@ -4,8 +4,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "tests")]
 
 mod again;
-mod churn;
 mod balance;
+mod churn;
 mod contract;
 mod demo;
 mod frozen;

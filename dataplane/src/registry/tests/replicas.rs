@@ -291,7 +291,7 @@ fn loads_are_told_with_each_hello_and_change_nothing_that_is_announced() {
         ..hello(&pair.flows[0])
     };
     let now = pair.now;
-    let changed = pair.flows[1].on_layer_hello(now, &a, &said, None);
+    let changed = pair.flows[1].on_layer_hello(now, &a, &said, said.epoch, None);
     assert!(changed.is_empty(), "no topic is planned because of a load: {changed:?}");
     let load = pair.flows[1].load_of(&a).unwrap();
     let expected = Load {
@@ -305,7 +305,7 @@ fn loads_are_told_with_each_hello_and_change_nothing_that_is_announced() {
         ingress_bytes_per_s: Some(u64::MAX),
         ..said
     };
-    pair.flows[1].on_layer_hello(now, &a, &absurd, None);
+    pair.flows[1].on_layer_hello(now, &a, &absurd, absurd.epoch, None);
     assert_eq!(pair.flows[1].load_of(&a).unwrap().total(), u64::MAX);
 }
 

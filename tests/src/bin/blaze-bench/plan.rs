@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, Scope, TopicName};
-use blaze_flow::plan::{PlanRules, plan_topic};
+use blaze_flow::plan::{PlanRules, Survey, plan_topic, plan_within};
 use blaze_flow::registry::{LayerNames, Registry, RegistryConfig};
 use blaze_flow::world::FlowState;
 use blaze_proto::link::LinkControl;
@@ -224,10 +224,12 @@ pub(crate) fn run() -> anyhow::Result<()> {
             let rules = PlanRules::default();
             let topics = fleet.topics();
             let begin = Instant::now();
+            let survey = Survey::of_all(fleet.hub.world());
             let plans: Vec<_> = topics
                 .iter()
-                .map(|topic| plan_topic(fleet.hub.world(), topic, &rules, None))
+                .map(|topic| plan_within(&survey, topic, &rules, None))
                 .collect();
+            drop(survey);
             let full = begin.elapsed();
             let bridges: usize = plans.iter().map(|plan| plan.bridges.len()).sum();
             let change = fleet.change(names, &rules)?;
