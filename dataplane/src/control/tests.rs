@@ -19,8 +19,12 @@ struct Bench {
 impl Bench {
     /// `fog/fog-1` with Redis on its node and Kafka on its layer.
     fn new() -> Self {
+        Self::with(|config| config)
+    }
+
+    fn with(change: impl FnOnce(ControlConfig) -> ControlConfig) -> Self {
         let now = Instant::now();
-        let config = ControlConfig {
+        let config = change(ControlConfig {
             me: "fog/fog-1".parse().unwrap(),
             kind: LayerKind::Fog,
             epoch: 1,
@@ -34,7 +38,7 @@ impl Bench {
             lease_stores: BTreeSet::from(LOCAL),
             rules: PlanRules::default(),
             access: AccessRules::default(),
-        };
+        });
         Self {
             core: ControlCore::new(config, now),
             now,
@@ -48,6 +52,24 @@ impl Bench {
             bench.core.restore_leases(bench.now, scope, &[]);
         }
         bench.step(0);
+        assert_eq!(bench.core.state(), FlowState::Ready);
+        bench
+    }
+
+    /// The same, on the inter scope as well.
+    fn inside() -> Self {
+        let mut bench = Self::with(|config| ControlConfig {
+            inter_scope: true,
+            gateway: AutoBool::Yes,
+            ..config
+        });
+        for scope in LOCAL {
+            bench.core.restore_leases(bench.now, scope, &[]);
+        }
+        // It listens for others, and nobody is there.
+        for _ in 0..50 {
+            bench.step(100);
+        }
         assert_eq!(bench.core.state(), FlowState::Ready);
         bench
     }

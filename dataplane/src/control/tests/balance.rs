@@ -43,7 +43,7 @@ struct Pair {
 impl Pair {
     fn new(load: Option<u64>, weights: [u64; 3]) -> Self {
         let mut pair = Self {
-            bench: Bench::ready(),
+            bench: Bench::inside(),
             load,
             weights,
             may_move: &TOPICS,
