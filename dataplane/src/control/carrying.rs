@@ -193,7 +193,7 @@ impl ControlCore {
 
     /// This flow carries the topic from now on. Returns where it begins.
     fn take(&mut self, now: Instant, topic: &TopicName, plan: &TopicPlan) -> Begin {
-        self.carriers.handed_over.remove(topic);
+        let left = self.carriers.handed_over.remove(topic);
         if let Some(giving) = self.carriers.giving_up.remove(topic) {
             self.balance.note_taken_back(now, topic);
             self.registry.set_hold(topic, Hold::Stays);
@@ -207,7 +207,13 @@ impl ControlCore {
         }
         let out = plan.bridges.iter().filter(|bridge| bridge.carries_out());
         let reliable = out.into_iter().any(|bridge| bridge.lane.reliable);
-        let begin = self.registry.begin_carrying(now, topic, reliable);
+        let begin = match (self.registry.begin_carrying(now, topic, reliable), left) {
+            // Nobody has begun where this flow stopped: the one that was to do it goes away itself.
+            (Begin::Now, Some((since, handover))) if now.saturating_duration_since(since) < LEGACY => {
+                Begin::At(handover.offsets)
+            }
+            (begin, _) => begin,
+        };
         self.carriers.taken_over += u64::from(begin != Begin::Now);
         begin
     }
