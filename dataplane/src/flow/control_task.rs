@@ -7,7 +7,8 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{
-    Broker, BrokerError, BrokerKind, Content, FlowSide, Publisher, PublisherOptions, Received, SubscribeOptions, Subscription,
+    Broker, BrokerError, BrokerKind, Content, FlowSide, Publisher, PublisherOptions, Received, SubscribeOptions,
+    Subscription,
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName, WriterId};
