@@ -53,7 +53,7 @@ pub(crate) fn told_inside(world: &World, topic: &TopicName) -> ScopeEntry {
         entries.extend(view.node_scope.then_some(&entry.node));
         // Flows that share a broker say the same of it.
         let says_something = entry.layer.advertise.is_some() || entry.layer.request.is_some();
-        if says_something && groups.insert(group) {
+        if view.layer_scope.is_some() && says_something && groups.insert(group) {
             entries.push(&entry.layer);
         }
     }
