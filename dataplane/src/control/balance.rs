@@ -189,10 +189,11 @@ impl ControlCore {
         if self.config.replicas != Some(LayerScope::Kafka) {
             return;
         }
-        let plans = &self.plans;
-        self.balance
-            .retain(now, |topic| plans.get(topic).is_some_and(TopicPlan::carries_out));
-        let carriers = &self.carriers;
+        let (plans, carriers) = (&self.plans, &self.carriers);
+        // What is being given up may be taken back.
+        let carries =
+            |topic: &TopicName| plans.get(topic).is_some_and(TopicPlan::carries_out) || carriers.gives_up(topic);
+        self.balance.retain(now, carries);
         let gift = self
             .balance
             .gift

@@ -65,7 +65,7 @@ impl LoadMeter {
         if self.weight > 0.0 { self.sum / self.weight } else { 0.0 }
     }
 
-    /// Whether it was measured for [`KNOWN_AFTER`] at least.
+    /// Whether it was measured for 5 s at least.
     #[must_use]
     pub fn is_known(&self) -> bool {
         // A little less, because samples are never exactly as far apart as they are meant to be.
@@ -81,7 +81,7 @@ pub struct TopicLoad {
     pub topic: TopicName,
     /// Payload bytes per second, one copy per lane.
     pub bytes_per_s: u64,
-    /// It could be given to another flow now: see [`TopicPath::may_move`].
+    /// It could be given to another flow now, and no message be lost or sent twice.
     pub may_move: bool,
 }
 

@@ -352,11 +352,14 @@ impl System {
         self.down.wait_fresh(now, "cloud to robot")
     }
 
+    /// What each flow carries, and the end of its log.
     fn tails(&self) -> String {
         let flows = self.clouds.iter().chain([&self.robot]);
-        flows
-            .map(|flow| format!("== {}\n{}\n", flow.spec.node, flow.tail()))
-            .collect()
+        let tail = |flow: &FlowProcess| {
+            let carries = flow.admin().json("/v1/bridges");
+            format!("== {} {carries:?}\n{}\n", flow.spec.node, flow.tail())
+        };
+        flows.map(tail).collect()
     }
 }
 
@@ -455,7 +458,7 @@ fn round(system: &mut System, end: End, victim: Victim) -> anyhow::Result<()> {
     system.carrier()?;
     for (name, way) in [(UP, &system.up), (DOWN, &system.down)] {
         let now = Instant::now();
-        way.wait_fresh(now, name)?;
+        way.wait_fresh(now, name).with_context(|| system.tails())?;
         let found = way.judge(back, now);
         println!(
             "  back: {name}: sent {} lost {} gap {:?}",
