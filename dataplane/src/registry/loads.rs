@@ -53,8 +53,11 @@ impl Registry {
     /// The other flows that could be given a topic now: they share the layer broker, live and have settled.
     pub fn settled_replicas(&self) -> impl Iterator<Item = &FlowId> {
         let others = self.world.flows.iter().filter(|(flow, _)| **flow != self.config.me);
-        let settled =
-            others.filter(|(_, view)| view.settled && view.state == FlowState::Ready && view.reach != Reach::Down);
+        // One that is not on the inter scope could not carry anything there.
+        let settled = others.filter(|(_, view)| {
+            let carries = view.state == FlowState::Ready && view.role.is_gateway();
+            view.settled && carries && view.reach != Reach::Down
+        });
         settled.map(|(flow, _)| flow).filter(|flow| self.shares_layer(flow))
     }
 

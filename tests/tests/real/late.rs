@@ -147,9 +147,14 @@ impl Listener {
     }
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn late_joiners_get_the_last_of_every_live_writer() -> anyhow::Result<()> {
+#[test]
+fn late_joiners_get_the_last_of_every_live_writer() -> anyhow::Result<()> {
     let _turn = turn();
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+    runtime.block_on(late_joiners())
+}
+
+async fn late_joiners() -> anyhow::Result<()> {
     let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
     let (lidar, camera) = (
         Mapper::start(&system, "lidar").await?,

@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use blaze_tests::flow::FlowProcess;
 use blaze_tests::long;
 use blaze_tests::network::Plan;
 use blaze_tests::scenario::{Broker, BrokerKind, Flow, Running, Scenario, Stream};
@@ -103,7 +104,7 @@ fn heard(running: &Running, of: &str, other: &str) -> Option<Instant> {
 
 /// Messages of a topic that the cloud has written to its Kafka.
 fn delivered(running: &Running, topic: &str) -> u64 {
-    let bridges = running.flow("cloud-1").map(|flow| flow.bridges()).unwrap_or_default();
+    let bridges = running.flow("cloud-1").map(FlowProcess::bridges).unwrap_or_default();
     let of_topic = bridges.iter().filter(|bridge| bridge["topic"] == topic);
     of_topic.filter_map(|bridge| bridge["out"]["messages"].as_u64()).sum()
 }

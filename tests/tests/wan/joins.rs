@@ -8,7 +8,7 @@ use blaze_tests::plain::{self, KafkaWriter};
 use blaze_tests::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer};
 use blaze_tests::stream::Stream;
 use blaze_tests::wait;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::support::turn;
 
@@ -43,7 +43,7 @@ fn delivered(flow: &FlowProcess) -> u64 {
 fn peers_up(flow: &FlowProcess) -> usize {
     let peers = flow.admin().json("/v1/peers").unwrap_or_default();
     let peers = peers["peers"].as_array().cloned().unwrap_or_default();
-    peers.iter().filter(|peer| peer["state"] == Value::from("up")).count()
+    peers.iter().filter(|peer| peer["state"] == "up").count()
 }
 
 #[test]

@@ -29,6 +29,10 @@ const GROWTH: Usage = Usage {
 };
 
 /// From the environment, or what the gate runs.
+#[allow(
+    clippy::disallowed_methods,
+    reason = "how long and with which faults a test runs is no configuration"
+)]
 fn setting(name: &str, otherwise: u64) -> anyhow::Result<u64> {
     match std::env::var(name) {
         Ok(text) => text.parse().with_context(|| format!("{name}={text} is no number")),
