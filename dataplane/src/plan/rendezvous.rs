@@ -2,8 +2,6 @@
 //!
 //! When a candidate goes, only its topics move; when one comes, it takes its share and nothing else moves.
 
-use std::cmp::Reverse;
-
 use blaze_domain::FlowId;
 
 /// The candidate with the largest weight for a key, which is the topic unless said otherwise; of equal weights the smaller name. `None` without candidates.
@@ -14,7 +12,7 @@ pub(crate) fn choose<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>
 /// The candidates with the largest weights for a key, at most so many, best first.
 pub(crate) fn best<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>, most: usize) -> Vec<&'a FlowId> {
     let mut ranked: Vec<&FlowId> = candidates.collect();
-    ranked.sort_by_cached_key(|flow| (Reverse(weight(key, flow)), *flow));
+    ranked.sort_by(|a, b| weight(key, b).cmp(&weight(key, a)).then_with(|| a.cmp(b)));
     ranked.truncate(most);
     ranked
 }
