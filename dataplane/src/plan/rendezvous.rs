@@ -11,10 +11,10 @@ pub(crate) fn choose<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>
 
 /// The candidates with the largest weights for a key, at most so many, best first.
 pub(crate) fn best<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>, most: usize) -> Vec<&'a FlowId> {
-    let mut ranked: Vec<&FlowId> = candidates.collect();
-    ranked.sort_by(|a, b| weight(key, b).cmp(&weight(key, a)).then_with(|| a.cmp(b)));
+    let mut ranked: Vec<(u64, &FlowId)> = candidates.map(|flow| (weight(key, flow), flow)).collect();
+    ranked.sort_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(b.1)));
     ranked.truncate(most);
-    ranked
+    ranked.into_iter().map(|(_, flow)| flow).collect()
 }
 
 /// FNV-1a (64 bits) over `topic 0xFF layer 0xFF node`, then the finaliser of SplitMix64, because FNV alone leaves the

@@ -99,7 +99,9 @@ fn signals_end_a_run_at_once_with_its_summary() {
             &set,
         ];
         let mut demo = Process::start("blaze", &arguments, None).unwrap();
-        demo.node_ready("fog-1", DEADLINE).unwrap();
+        // The first row comes when it has begun: before that there is nothing to sum up.
+        let begun = || demo.stdout().first().is_some_and(|line| line.contains("\"row\""));
+        blaze_tests::wait::until("the first row", DEADLINE, begun, || demo.tail()).unwrap();
         let begin = Instant::now();
         super::signals::send(&demo, signal);
         let code = demo.exit(DEADLINE).unwrap();

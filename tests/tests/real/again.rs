@@ -192,7 +192,7 @@ fn round(system: &mut System, victim: Victim) -> anyhow::Result<()> {
 fn whatever_comes_back_under_its_name_leaves_nothing_behind() -> anyhow::Result<()> {
     let _turn = turn();
     let mut system = System::start()?;
-    let rounds = if long() { 50 } else { 4 };
+    let rounds = if long() { 50 } else { 3 };
     let bridges = system.bridges();
     let mut warm = (Usage::default(), 0);
     for number in 1..=rounds {

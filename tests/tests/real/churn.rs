@@ -52,7 +52,7 @@ fn requests_that_come_and_go_leave_nothing_behind() -> anyhow::Result<()> {
         let message = json!({"op":op,"topic":topic(cycle),"service":"sink","reliability":"reliable","ttl_s":0});
         kafka.produce(&control, message.to_string().as_bytes())
     };
-    let cycles = if long() { 2_000 } else { 100 };
+    let cycles = if long() { 2_000 } else { 40 };
     let channels = || redis.cli(&["PUBSUB", "CHANNELS"]).map(|list| list.lines().count());
     let idle = channels()?;
     let (mut warm, mut came) = (usage(&system)?, 0);

@@ -107,10 +107,12 @@ async fn a_participant_that_dies_is_built_anew_and_goes_on() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_best_effort_writer_that_starts_later_is_heard() {
     let domain = Domain::start().await;
-    let (listener, speaker) = (domain.open().await, domain.open().await);
-    for round in 1..=8_u8 {
+    let listener = domain.open().await;
+    for round in 1..=6_u8 {
         let topic = format!("late/t{round}").parse().unwrap();
         let mut subscription = listener.subscribe(&topic, SubscribeOptions::default()).await.unwrap();
+        // Its writers are found while RustDDS is busy with a new participant.
+        let speaker = domain.open().await;
         let publisher = speaker.publisher(&topic, PublisherOptions::default()).unwrap();
         let mut sequence = 0;
         let hears = async {
@@ -124,5 +126,6 @@ async fn a_best_effort_writer_that_starts_later_is_heard() {
         };
         let heard = tokio::time::timeout(DEADLINE, hears).await;
         assert!(heard.is_ok(), "round {round}: nothing of {sequence} came");
+        speaker.close().await;
     }
 }

@@ -163,9 +163,9 @@ async fn a_killed_reader_holds_nobody_up() {
         let [victim, one, other] =
             [victim, "adapter witness", "plain witness"].map(|name| Peer::start(&domain, name, &topic, flags));
         let options = PublisherOptions { large, ..RELIABLE };
-        // A writer for large messages has a window of 64.
-        let bytes = if large { 4_000 } else { 200 };
-        let mut source = Source::new(&broker, &topic, 500.0, bytes, options);
+        // For large messages a writer has a window of 64, and a reader that is late keeps the last 32.
+        let (rate_hz, bytes) = if large { (200.0, 4_000) } else { (500.0, 200) };
+        let mut source = Source::new(&broker, &topic, rate_hz, bytes, options);
         source.meet(&[&victim, &one, &other]).await;
         source.run(Duration::from_secs(1)).await;
         let expelled = broker.counts().expelled;
