@@ -7,7 +7,7 @@ use blaze_brokers::{Broker as _, Health, Role};
 use super::{Flow, frame, health, open, publish, publisher, reader, start_server};
 
 /// In which the loss of the server must show.
-const SHOWS: Duration = Duration::from_secs(2);
+const SHOWS: Duration = Duration::from_secs(5);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn nothing_reliable_is_lost_or_repeated_by_a_killed_server() {
