@@ -28,10 +28,14 @@ const PERIOD: Duration = Duration::from_millis(20);
 const ON_THE_WAY: Duration = Duration::from_millis(300);
 /// The flows hear a control message at the same time, give or take this.
 const SECOND_ANSWER: Duration = Duration::from_millis(500);
-/// A replica that is killed may be missed for so long.
-const KILLED_GAP: Duration = Duration::from_secs(3);
-/// One that is stopped may be missed for so long.
-const STOPPED_GAP: Duration = Duration::from_millis(200);
+/// A replica that is stopped may be missed for so long, on a busy machine: a place that was not handed over would be missed for
+/// as long as one that was killed. 20 to 210 ms were seen.
+const STOPPED_GAP: Duration = Duration::from_secs(1);
+
+/// One that is killed may be missed for so long. 2.4 to 2.6 s were seen.
+fn killed_gap() -> Duration {
+    Duration::from_secs(if blaze_tests::long() { 3 } else { 5 })
+}
 
 /// Writer and sequence.
 type Identity = (String, u64);
@@ -441,7 +445,7 @@ fn round(system: &mut System, end: End, victim: Victim) -> anyhow::Result<()> {
         anyhow::ensure!(found.doubled == 0, "twice: {}", fault());
         match end {
             End::Killed => {
-                anyhow::ensure!(found.gap <= KILLED_GAP, "gap: {}", fault());
+                anyhow::ensure!(found.gap <= killed_gap(), "gap: {}", fault());
                 // What was sent to the flow that died is gone; what lay on Kafka is not.
                 anyhow::ensure!(name == UP || found.lost == 0, "lost: {}", fault());
             }
