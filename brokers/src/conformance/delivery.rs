@@ -9,9 +9,10 @@ use bytes::Bytes;
 
 use super::Fixture;
 use super::tools::{
-    DEADLINE, Outcome, Reader, channel, connected, describe, frame, numbered, open_publisher, pattern, publish, writer,
+    DEADLINE, Outcome, Reader, channel, connected, describe, frame, numbered, open_publisher, open_publisher_with,
+    pattern, publish, writer,
 };
-use crate::port::{Broker, Content, PublishOutcome, Publisher};
+use crate::port::{Broker, Content, PublishOutcome, Publisher, PublisherOptions};
 
 const SIZES: &[usize] = &[1, 2, 100, 1_023, 65_535, 65_536, 1_048_576, 8_000_000];
 
@@ -27,7 +28,12 @@ pub async fn order_per_writer(fixture: &dyn Fixture) -> Outcome {
     let mut reader = Reader::open(clients[0].as_ref(), &channel).await?;
     let mut threads = Vec::new();
     for number in 1..=WRITERS {
-        let publisher = open_publisher(clients[usize::from(number) % 2].as_ref(), &channel)?;
+        // Best effort may lose some of so many at once.
+        let reliable = PublisherOptions {
+            reliable: true,
+            ..PublisherOptions::default()
+        };
+        let publisher = open_publisher_with(clients[usize::from(number) % 2].as_ref(), &channel, reliable)?;
         reader.meet(fixture, publisher.as_ref(), false).await?;
         let channel = channel.clone();
         threads.push(std::thread::spawn(move || {

@@ -218,7 +218,6 @@ fn what_a_robot_kills_comes_back_over_the_layer() -> anyhow::Result<()> {
 }
 
 #[test]
-#[ignore = "passes alone, but in runs of the whole binary the flow does not answer the command line on DDS; not understood yet"]
 fn the_command_line_publishes_and_echoes_on_the_layer() -> anyhow::Result<()> {
     const COUNT: usize = 5;
     let _turn = turn();

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::names::ChannelName;
 use parking_lot::{Mutex, RwLock};
+use rustdds::Timestamp;
 use rustdds::no_key::SimpleDataReader;
-use rustdds::{DataReaderStatus, StatusEvented as _, Timestamp};
 use tokio::sync::oneshot;
 
 use super::deliver::{Kind, Progress, deliver};
@@ -41,47 +41,11 @@ pub(super) struct Readers {
     pub(super) reliable: Option<RawReader>,
     /// Where a best-effort writer is known: a reliable reader does not match it.
     pub(super) best_effort: Option<RawReader>,
-    pub(super) meeting: Meeting,
     /// What came before is not delivered: RustDDS keeps samples of a topic for readers to come.
     pub(super) opened: Option<Timestamp>,
     /// The last sequence number of each writer.
     pub(super) last: HashMap<EndpointId, i64>,
     pub(super) history: History,
-}
-
-/// How long a reader has to meet a writer that is known, at first and at most.
-const MEET: Duration = Duration::from_millis(300);
-const LONGEST_MEET: Duration = Duration::from_secs(10);
-
-/// Whether the best-effort reader has met the writer for which it was made.
-///
-/// RustDDS tells a new reader of the writers that are known once, and loses that where its event loop is about to take in the
-/// reader at the same moment. That is when a participant is discovered, which is when such readers are made.
-#[derive(Debug, Default)]
-pub(super) struct Meeting {
-    since: Option<Instant>,
-    attempts: u32,
-    met: bool,
-}
-
-impl Meeting {
-    /// A reader is made now.
-    pub(super) fn begin(&mut self, now: Instant) {
-        self.since = Some(now);
-        self.attempts = self.attempts.saturating_add(1);
-    }
-
-    /// Whether the reader is to be made anew, since it has met nobody for too long.
-    pub(super) fn has_failed(&mut self, reader: &RawReader, now: Instant) -> bool {
-        while let Some(status) = reader.try_recv_status() {
-            self.met |= matches!(status, DataReaderStatus::SubscriptionMatched { current, .. } if current.count() > 0);
-        }
-        let time = MEET.saturating_mul(1 << self.attempts.min(6)).min(LONGEST_MEET);
-        !self.met
-            && self
-                .since
-                .is_some_and(|since| now.saturating_duration_since(since) >= time)
-    }
 }
 
 /// A channel that is read.
@@ -155,7 +119,6 @@ impl Channel {
             opened,
             last,
             history,
-            ..
         } = &mut *readers;
         let mut progress = Progress {
             opened: opened.unwrap_or(Timestamp::ZERO),

@@ -219,7 +219,7 @@ fn make_missing(shared: &Arc<Shared>, generation: &Generation, now: Instant) -> 
     }
     for channel in shared.channels.list() {
         let best_effort = shared.best_effort.read().contains(&*channel.topic);
-        generation.open(&channel, best_effort, now)?;
+        generation.open(&channel, best_effort)?;
     }
     Ok(())
 }

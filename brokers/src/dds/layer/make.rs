@@ -11,7 +11,7 @@ use bytes::Bytes;
 use rustdds::Timestamp;
 use serde_json::{Value, json};
 
-use super::channel::{Channel, RawReader, Readers};
+use super::channel::{Channel, RawReader};
 use super::deliver::nanos;
 use super::farewell::Farewell;
 use super::names::ALIVE;
@@ -106,18 +106,9 @@ impl Generation {
         Ok(())
     }
 
-    /// Makes the readers of a channel that are missing, or have not met whom they should.
-    pub(super) fn open(&self, channel: &Channel, best_effort: bool, now: Instant) -> Result<(), DdsError> {
+    /// Makes the readers of a channel that are missing.
+    pub(super) fn open(&self, channel: &Channel, best_effort: bool) -> Result<(), DdsError> {
         let mut readers = channel.readers.lock();
-        let Readers {
-            best_effort: made,
-            meeting,
-            ..
-        } = &mut *readers;
-        if best_effort && made.as_ref().is_some_and(|reader| meeting.has_failed(reader, now)) {
-            tracing::debug!(topic = %channel.topic, "a best-effort reader has met nobody, making it anew");
-            *made = None;
-        }
         let is_new = readers.reliable.is_none();
         if is_new {
             // What is taken from now on is new, however long making the reader takes.
@@ -125,7 +116,6 @@ impl Generation {
             readers.reliable = Some(self.participant.raw_reader(&channel.topic, channel.profile(true))?);
         }
         if best_effort && readers.best_effort.is_none() {
-            readers.meeting.begin(now);
             readers.best_effort = Some(self.participant.raw_reader(&channel.topic, channel.profile(false))?);
         } else if !is_new {
             return Ok(());

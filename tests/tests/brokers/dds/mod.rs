@@ -1,6 +1,7 @@
 //! DDS as a broker: the rules for all adapters, and what is special to a network without a server.
 
 mod alone;
+mod crowd;
 mod gone;
 mod support;
 
