@@ -30,6 +30,9 @@ pub mod transport;
 mod wire;
 
 #[cfg(test)]
+#[path = "../../tests/support/flights.rs"]
+mod flights;
+#[cfg(test)]
 pub(crate) mod sim;
 #[cfg(test)]
 mod tests;

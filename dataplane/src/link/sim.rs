@@ -1,8 +1,7 @@
 //! A simulated network for tests: seeded, with its own time. [`Network`] carries datagrams for anybody; [`Sim`] drives
 //! engines over it and keeps account of their messages.
 
-use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::time::{Duration, Instant};
 
 use blaze_domain::{DropReason, FlowId, LayerKind, Origin, Priority, WriterId};
@@ -10,6 +9,7 @@ use blaze_proto::link::link_control::LayerScope;
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
 
+use super::flights::Flights;
 use super::transport::Endpoint;
 use super::{Engine, EngineConfig, LaneId, Limits, LinkEvent, StreamKey, Submit, Tally};
 
@@ -80,29 +80,6 @@ pub(crate) struct Arrival {
     pub datagram: Bytes,
 }
 
-struct Flight {
-    at: Instant,
-    number: u64,
-    arrival: Arrival,
-}
-
-impl PartialEq for Flight {
-    fn eq(&self, other: &Self) -> bool {
-        self.number == other.number
-    }
-}
-impl Eq for Flight {}
-impl PartialOrd for Flight {
-    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-impl Ord for Flight {
-    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
-        (self.at, self.number).cmp(&(other.at, other.number))
-    }
-}
-
 /// Decides about single datagrams: `true` = lose it.
 pub(crate) type Censor = Box<dyn FnMut(&Endpoint, &Endpoint, Priority, &Bytes) -> bool>;
 
@@ -112,8 +89,7 @@ pub(crate) struct Network {
     pub weather: Weather,
     paths: HashMap<(FlowId, FlowId), Weather>,
     cuts: HashSet<(FlowId, FlowId)>,
-    flights: BinaryHeap<Reverse<Flight>>,
-    sent: u64,
+    flights: Flights<Arrival>,
     pub censor: Option<Censor>,
 }
 
@@ -124,8 +100,7 @@ impl Network {
             weather,
             paths: HashMap::new(),
             cuts: HashSet::new(),
-            flights: BinaryHeap::new(),
-            sent: 0,
+            flights: Flights::default(),
             censor: None,
         }
     }
@@ -160,30 +135,24 @@ impl Network {
         }
         let copies = 1 + u32::from(self.random.chance(weather.duplicated));
         for _ in 0..copies {
-            self.sent += 1;
-            self.flights.push(Reverse(Flight {
-                at: now + weather.delay + self.random.duration(weather.jitter),
-                number: self.sent,
-                arrival: Arrival {
-                    to: to.clone(),
-                    class,
-                    datagram: datagram.clone(),
-                },
-            }));
+            let due = now + weather.delay + self.random.duration(weather.jitter);
+            let arrival = Arrival {
+                to: to.clone(),
+                class,
+                datagram: datagram.clone(),
+            };
+            self.flights.send(due, arrival);
         }
     }
 
     /// When the next datagram arrives.
     pub(crate) fn next_arrival(&self) -> Option<Instant> {
-        self.flights.peek().map(|flight| flight.0.at)
+        self.flights.next_due()
     }
 
     /// The next datagram that has arrived by `now`.
     pub(crate) fn arrival(&mut self, now: Instant) -> Option<Arrival> {
-        if self.next_arrival()? > now {
-            return None;
-        }
-        self.flights.pop().map(|flight| flight.0.arrival)
+        self.flights.arrived(now)
     }
 }
 

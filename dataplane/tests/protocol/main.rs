@@ -7,6 +7,8 @@
 
 #![allow(clippy::unwrap_used, reason = "the helpers of a test fail like the test")]
 
+#[path = "../support/flights.rs"]
+mod flights;
 mod world;
 
 use world::{Chaos, Simulation};

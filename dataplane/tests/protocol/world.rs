@@ -1,6 +1,6 @@
 //! The simulated system: flows, their scopes, services, and the network between them.
 
-use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -24,6 +24,8 @@ use parking_lot::Mutex;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use serde_json::json;
+
+use crate::flights::Flights;
 
 const STEP: Duration = Duration::from_millis(5);
 const TOPICS: [&str; 4] = ["imu/data", "odom", "camera/image", "cmd_vel"];
@@ -103,28 +105,9 @@ struct Flow {
 }
 
 struct Packet {
-    due: Instant,
-    order: u64,
     to: Endpoint,
     class: Priority,
     datagram: Bytes,
-}
-
-impl PartialEq for Packet {
-    fn eq(&self, other: &Self) -> bool {
-        (self.due, self.order) == (other.due, other.order)
-    }
-}
-impl Eq for Packet {}
-impl PartialOrd for Packet {
-    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-impl Ord for Packet {
-    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
-        (other.due, other.order).cmp(&(self.due, self.order))
-    }
 }
 
 pub(crate) struct Simulation<'a> {
@@ -135,8 +118,7 @@ pub(crate) struct Simulation<'a> {
     flows: Vec<Flow>,
     scopes: Vec<BTreeMap<Scope, ScopeBroker>>,
     services: Vec<Service>,
-    network: BinaryHeap<Packet>,
-    packets: u64,
+    network: Flights<Packet>,
     cut: HashSet<(usize, usize)>,
     calm: bool,
     one_way: Duration,
@@ -158,8 +140,7 @@ impl<'a> Simulation<'a> {
             flows: Vec::new(),
             scopes: Vec::new(),
             services: Vec::new(),
-            network: BinaryHeap::new(),
-            packets: 0,
+            network: Flights::default(),
             cut: HashSet::new(),
             calm: false,
             known: HashMap::new(),
@@ -468,8 +449,7 @@ impl<'a> Simulation<'a> {
     }
 
     fn arrive(&mut self) {
-        while self.network.peek().is_some_and(|packet| packet.due <= self.now) {
-            let Some(packet) = self.network.pop() else { break };
+        while let Some(packet) = self.network.arrived(self.now) {
             let reader = self
                 .flows
                 .iter_mut()
@@ -589,14 +569,12 @@ impl<'a> Simulation<'a> {
             };
             for _ in 0..copies {
                 let jitter = self.jitter.mul_f64(self.random.random());
-                self.packets += 1;
-                self.network.push(Packet {
-                    due: now + self.one_way + jitter,
-                    order: self.packets,
+                let packet = Packet {
                     to: transmit.to.clone(),
                     class: transmit.class,
                     datagram: transmit.datagram.clone(),
-                });
+                };
+                self.network.send(self.now + self.one_way + jitter, packet);
             }
         }
         let now = self.now;

@@ -7,6 +7,8 @@
 #![allow(clippy::unwrap_used, reason = "the helpers of a test fail like the test")]
 
 mod balance;
+#[path = "../support/flights.rs"]
+mod flights;
 mod gateways;
 mod parts;
 mod tasks;

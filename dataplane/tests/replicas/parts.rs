@@ -113,28 +113,9 @@ pub(crate) struct Stream {
 }
 
 pub(crate) struct Packet {
-    pub(crate) due: Instant,
-    pub(crate) order: u64,
     pub(crate) to: Endpoint,
     pub(crate) class: Priority,
     pub(crate) datagram: Bytes,
-}
-
-impl PartialEq for Packet {
-    fn eq(&self, other: &Self) -> bool {
-        (self.due, self.order) == (other.due, other.order)
-    }
-}
-impl Eq for Packet {}
-impl PartialOrd for Packet {
-    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-impl Ord for Packet {
-    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
-        (other.due, other.order).cmp(&(self.due, self.order))
-    }
 }
 
 /// The channel of a topic: each flow has a node scope of its own, and the replicas share Kafka.

@@ -286,14 +286,12 @@ impl World {
                 continue;
             }
             let jitter = Duration::from_micros(self.random.random_range(0..2_000));
-            self.packets += 1;
-            self.network.push(Packet {
-                due: now + self.one_way + jitter,
-                order: self.packets,
+            let packet = Packet {
                 to: transmit.to,
                 class: transmit.class,
                 datagram: transmit.datagram,
-            });
+            };
+            self.network.send(now + self.one_way + jitter, packet);
         }
         let flow = &mut self.flows[index];
         let mut news = Vec::new();

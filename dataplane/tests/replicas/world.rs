@@ -1,6 +1,6 @@
 //! The simulated system: brokers, wire and clock around the cores of production.
 
-use std::collections::{BTreeMap, BTreeSet, BinaryHeap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -23,6 +23,7 @@ use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use serde_json::json;
 
+use crate::flights::Flights;
 use crate::parts::{End, Flow, Found, Life, Log, Packet, Record, Stream, channel};
 
 const STEP: Duration = Duration::from_millis(5);
@@ -45,8 +46,7 @@ pub(crate) struct World {
     pub(crate) flows: Vec<Flow>,
     pub(crate) kafka: Log,
     pub(crate) redis: Log,
-    pub(crate) network: BinaryHeap<Packet>,
-    pub(crate) packets: u64,
+    pub(crate) network: Flights<Packet>,
     pub(crate) known: HashMap<(usize, usize), (u64, u64)>,
     pub(crate) one_way: Duration,
     pub(crate) kafka_delay: Duration,
@@ -104,8 +104,7 @@ impl World {
             flows: Vec::new(),
             kafka: Log::default(),
             redis: Log::default(),
-            network: BinaryHeap::new(),
-            packets: 0,
+            network: Flights::default(),
             known: HashMap::new(),
             publishing: false,
             next_publish: now,
@@ -299,8 +298,7 @@ impl World {
         *self.clock.lock() = self.now;
         self.publish();
         self.discover();
-        while self.network.peek().is_some_and(|packet| packet.due <= self.now) {
-            let Some(packet) = self.network.pop() else { break };
+        while let Some(packet) = self.network.arrived(self.now) {
             let reads = |flow: &&mut Flow| {
                 flow.life != Life::Dead && flow.id == packet.to.flow && flow.epoch == packet.to.epoch
             };

@@ -52,6 +52,15 @@ fn requests_that_come_and_go_leave_nothing_behind() -> anyhow::Result<()> {
         let message = json!({"op":op,"topic":topic(cycle),"service":"sink","reliability":"reliable","ttl_s":0});
         kafka.produce(&control, message.to_string().as_bytes())
     };
+    let on_both = |what: &str, expected: bool, cycle: usize| {
+        let (name, flows) = (topic(cycle), [&system.robot, &system.cloud]);
+        wait::until(
+            what,
+            SOON,
+            || flows.iter().all(|flow| bridged(flow, &name) == expected),
+            || format!("cycle {cycle}: {:?}", flows.map(FlowProcess::bridges_up)),
+        )
+    };
     let cycles = if long() { 2_000 } else { 40 };
     let channels = || redis.cli(&["PUBSUB", "CHANNELS"]).map(|list| list.lines().count());
     let idle = channels()?;
@@ -62,18 +71,7 @@ fn requests_that_come_and_go_leave_nothing_behind() -> anyhow::Result<()> {
         }
         let name = topic(cycle);
         tell("request", cycle)?;
-        wait::until(
-            "the request is served",
-            SOON,
-            || bridged(&system.robot, &name) && bridged(&system.cloud, &name),
-            || {
-                format!(
-                    "cycle {cycle}: {:?} {:?}",
-                    system.robot.bridges_up(),
-                    system.cloud.bridges_up()
-                )
-            },
-        )?;
+        on_both("the request is served", true, cycle)?;
         if cycle % 10 == 0 {
             // What is bridged carries.
             let sent = format!("{cycle}");
@@ -94,18 +92,7 @@ fn requests_that_come_and_go_leave_nothing_behind() -> anyhow::Result<()> {
             came = out(&system.cloud);
         }
         tell("withdraw", cycle)?;
-        wait::until(
-            "the bridge has gone",
-            SOON,
-            || !bridged(&system.robot, &name) && !bridged(&system.cloud, &name),
-            || {
-                format!(
-                    "cycle {cycle}: {:?} {:?}",
-                    system.robot.bridges_up(),
-                    system.cloud.bridges_up()
-                )
-            },
-        )?;
+        on_both("the bridge has gone", false, cycle)?;
     }
     wait::until(
         "the robot's subscriptions have gone",

@@ -5,12 +5,12 @@ use std::time::{Duration, Instant};
 use blaze_tests::flow::FlowProcess;
 use blaze_tests::long;
 use blaze_tests::network::Plan;
-use blaze_tests::scenario::{Broker, BrokerKind, Flow, Running, Scenario, Stream};
+use blaze_tests::scenario::{BrokerKind, Flow, Running, Scenario, Stream};
 use blaze_tests::wait;
 use blaze_tests::wan::{Shape, Ways};
 use serde_json::Value;
 
-use super::layers::{IMU, service, stream};
+use super::layers::{IMU, broker, flow, service, stream};
 use super::support::turn;
 
 const EVENTS: &str = "robot/events";
@@ -51,15 +51,8 @@ fn streams() -> Vec<Stream> {
 
 fn scenario() -> Scenario {
     let flow = |layer, node, broker, peers: &[&'static str]| Flow {
-        layer,
-        kind: "",
-        node,
-        host: node,
-        brokers: vec![broker],
-        layer_domain: None,
-        peers: peers.to_vec(),
         limit_mbps: LIMIT_MBPS,
-        extra: "",
+        ..flow(layer, node, broker, None, peers)
     };
     Scenario {
         name: "a link that is cut",
@@ -67,16 +60,8 @@ fn scenario() -> Scenario {
             .with_hosts(&["robot-1", "cloud-1"])
             .with_link("robot-1", "cloud-1", Shape::to_cloud()),
         brokers: vec![
-            Broker {
-                name: "redis",
-                host: "robot-1",
-                kind: BrokerKind::Redis,
-            },
-            Broker {
-                name: "kafka",
-                host: "cloud-1",
-                kind: BrokerKind::Kafka,
-            },
+            broker("redis", "robot-1", BrokerKind::Redis),
+            broker("kafka", "cloud-1", BrokerKind::Kafka),
         ],
         flows: vec![
             flow("edge", "robot-1", "redis", &["cloud-1"]),

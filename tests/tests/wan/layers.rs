@@ -39,7 +39,7 @@ pub(super) fn camera(hz: f64) -> Stream {
     }
 }
 
-fn flow(
+pub(super) fn flow(
     layer: &'static str,
     node: &'static str,
     broker: &'static str,
@@ -68,10 +68,13 @@ pub(super) fn service(name: &'static str, flow: &'static str, broker: &'static s
     }
 }
 
+pub(super) fn broker(name: &'static str, host: &'static str, kind: BrokerKind) -> Broker {
+    Broker { name, host, kind }
+}
+
 /// Robots with a Redis each meet over DDS in the edge; fog and cloud have a Kafka each, the fog two flows over it.
 pub(super) fn three_layers(image_hz: f64) -> Scenario {
     let shape = Shape::to_cloud();
-    let broker = |name, host, kind| Broker { name, host, kind };
     let (imu, odometry) = (stream(IMU, 50.0, 320), stream(ODOMETRY, 50.0, 700));
     let (commands, map) = (stream(COMMANDS, 10.0, 100), stream(MAP, 5.0, 4_000));
     Scenario {

@@ -4,29 +4,14 @@ use std::time::Duration;
 
 use blaze_tests::long;
 use blaze_tests::network::Plan;
-use blaze_tests::scenario::{Broker, BrokerKind, Expect, Fault, Flow, Scenario, Service, Stream, run};
+use blaze_tests::scenario::{BrokerKind, Expect, Fault, Scenario, run};
 use blaze_tests::wan::{Change, Shape, Ways};
 
+use super::layers::{COMMANDS, IMU, broker, flow, service, stream};
 use super::support::turn;
-
-const IMU: &str = "imu/data";
-const COMMANDS: &str = "fleet/commands";
 
 /// A robot with Redis behind the router of its edge, a cloud with Kafka, and the link of the paper's testbed between them.
 fn robot_and_cloud() -> Scenario {
-    let stream = |topic, hz, bytes| Stream {
-        topic,
-        reliable: true,
-        hz,
-        bytes,
-        lifespan: Duration::ZERO,
-    };
-    let service = |name, flow, broker, stream| Service {
-        name,
-        flow,
-        broker,
-        streams: vec![stream],
-    };
     Scenario {
         name: "robot to cloud over 25 ± 5 ms, 0.01 % loss, 160 Mbit/s",
         network: Plan::new()
@@ -34,48 +19,20 @@ fn robot_and_cloud() -> Scenario {
             .with_lan(&["robot-1", "router"])
             .with_link("router", "cloud-1", Shape::to_cloud()),
         brokers: vec![
-            Broker {
-                name: "redis",
-                host: "robot-1",
-                kind: BrokerKind::Redis,
-            },
-            Broker {
-                name: "kafka",
-                host: "cloud-1",
-                kind: BrokerKind::Kafka,
-            },
+            broker("redis", "robot-1", BrokerKind::Redis),
+            broker("kafka", "cloud-1", BrokerKind::Kafka),
         ],
         flows: vec![
-            Flow {
-                layer: "edge",
-                kind: "",
-                node: "robot-1",
-                host: "robot-1",
-                brokers: vec!["redis"],
-                layer_domain: None,
-                peers: vec!["cloud-1"],
-                limit_mbps: 100.0,
-                extra: "",
-            },
-            Flow {
-                layer: "cloud",
-                kind: "",
-                node: "cloud-1",
-                host: "cloud-1",
-                brokers: vec!["kafka"],
-                layer_domain: None,
-                peers: vec![],
-                limit_mbps: 100.0,
-                extra: "",
-            },
+            flow("edge", "robot-1", "redis", None, &["cloud-1"]),
+            flow("cloud", "cloud-1", "kafka", None, &[]),
         ],
         publishers: vec![
-            service("imu-driver", "robot-1", "redis", stream(IMU, 50.0, 320)),
-            service("planner", "cloud-1", "kafka", stream(COMMANDS, 10.0, 100)),
+            service("imu-driver", "robot-1", "redis", vec![stream(IMU, 50.0, 320)]),
+            service("planner", "cloud-1", "kafka", vec![stream(COMMANDS, 10.0, 100)]),
         ],
         consumers: vec![
-            service("recorder", "cloud-1", "kafka", stream(IMU, 50.0, 320)),
-            service("driver", "robot-1", "redis", stream(COMMANDS, 10.0, 100)),
+            service("recorder", "cloud-1", "kafka", vec![stream(IMU, 50.0, 320)]),
+            service("driver", "robot-1", "redis", vec![stream(COMMANDS, 10.0, 100)]),
         ],
         faults: vec![],
         duration: Duration::from_secs(if long() { 60 } else { 8 }),

@@ -1,6 +1,7 @@
 //! A writer among readers that do not suit it.
 
 use std::net::Ipv4Addr;
+use std::sync::mpsc::sync_channel;
 
 use blaze_brokers::dds::{Participant, ParticipantConfig, Profile};
 use bytes::Bytes;
@@ -24,10 +25,12 @@ async fn a_writer_finds_its_reader_behind_a_crowd_of_others() {
         here.writer("crowd", best_effort).unwrap(),
         here.writer("crowd", best_effort).unwrap(),
     );
-    let (arrived, arrivals) = std::sync::mpsc::channel();
+    let (arrived, arrivals) = sync_channel(64);
     let reader = |profile| {
         let arrived = arrived.clone();
-        let sink = move |_, octets: Bytes| arrived.send(octets).unwrap_or_default();
+        let sink = move |_, octets: Bytes| {
+            let _ = arrived.try_send(octets);
+        };
         there.reader("crowd", profile, Box::new(sink)).unwrap()
     };
     let others: Vec<_> = (0..OTHERS).map(|_| reader(reliable)).collect();
