@@ -13,6 +13,8 @@ mod balance;
 mod carrying;
 mod gateways;
 mod info;
+mod output;
+mod planning;
 mod replicas;
 mod routes;
 mod scopes;
@@ -22,25 +24,23 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::control::EventKind;
 use blaze_domain::names::ChannelName;
-use blaze_domain::node_file::{AccessRules, AutoBool};
-use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
-use blaze_proto::link::link_control::{Body, LayerScope};
+use blaze_domain::node_file::AccessRules;
+use blaze_domain::{FlowId, Scope, TopicName};
 use bytes::Bytes;
 
-use crate::lane::path::TopicInfo;
 use crate::link::LinkEvent;
-use crate::plan::{PlanRules, Survey, TopicPlan, plan_within};
-use crate::registry::{EventDraft, LayerNames, MAX_ROUTES, Registry, RegistryConfig, UnsavedLease, carrying_states};
-use crate::world::{FlowState, LayerScopeId, OriginFilter, Reach, World};
+use crate::plan::{PlanRules, TopicPlan};
+use crate::registry::{EventDraft, Registry, RegistryConfig};
+use crate::world::{FlowState, OriginFilter, Reach, World};
 use balance::Balance;
 pub use balance::{LastMove, MoveReason, Moves, STAY};
 use carrying::Carriers;
 pub use carrying::Duty;
 use gateways::Gateways;
 pub use gateways::Stage;
-use info::{durable_sources, local_info};
+pub use output::{ControlConfig, Output};
+use planning::Dirty;
 use replicas::Replicas;
-use routes::route_states;
 pub use scopes::ScopeHealth;
 use scopes::{LOCAL, Scopes};
 
@@ -52,141 +52,6 @@ pub const LATEST: Duration = Duration::from_millis(250);
 pub const LISTEN: Duration = Duration::from_millis(1500);
 /// All topics are planned anew that often, changed or not.
 pub const RECONCILE: Duration = Duration::from_secs(5);
-
-/// What the control core wants done.
-#[derive(Debug)]
-pub enum Output {
-    /// Put JSON on a reserved channel of a scope.
-    Publish {
-        /// Node or layer.
-        scope: Scope,
-        /// The channel.
-        channel: ChannelName,
-        /// The JSON.
-        body: Bytes,
-    },
-    /// Send a registry message to a flow.
-    Link {
-        /// The flow.
-        to: FlowId,
-        /// The message.
-        body: Box<Body>,
-    },
-    /// Make the bridges of a topic equal to this plan.
-    Plan {
-        /// The topic.
-        topic: TopicName,
-        /// Its bridges.
-        plan: TopicPlan,
-        /// What local advertisements say.
-        info: Box<TopicInfo>,
-        /// What changes of who carries it out of the layer. After [`Duty::GivesUp`] call [`ControlCore::given_up`] at once, and
-        /// then look at [`ControlCore::emptying`].
-        duty: Duty,
-    },
-    /// Put a message on the channel that flows share on the layer broker.
-    Replicas {
-        /// The message.
-        body: Bytes,
-        /// It is of no use later.
-        deadline: Option<Instant>,
-    },
-    /// Say this version and digest in Hello.
-    Announce {
-        /// Version of the registry.
-        version: u64,
-        /// Its digest.
-        digest: u64,
-    },
-    /// Say this state in Hello on the inter scope.
-    State(FlowState),
-    /// Join the inter scope, and call [`ControlCore::joined`], or leave it, once what is on its way has left, and call
-    /// [`ControlCore::left`].
-    Inter {
-        /// Join it.
-        join: bool,
-    },
-    /// Say in Hello that the layer broker is there for this flow, or is not.
-    LayerScope {
-        /// It is.
-        shared: bool,
-    },
-    /// Let the broker of a scope keep or forget a lease.
-    SaveLease(UnsavedLease),
-    /// Forget what is kept of writers for late joiners: their service no longer advertises the topic.
-    ForgetWriters {
-        /// The topic.
-        topic: TopicName,
-        /// Whose.
-        of: OriginFilter,
-    },
-    /// Let the broker of a scope make a channel.
-    Prepare {
-        /// Node or layer.
-        scope: Scope,
-        /// The channel.
-        channel: ChannelName,
-        /// Samples that it keeps per writer for late joiners; 0 = none.
-        depth: u32,
-    },
-    /// Tell the broker of a scope that nobody uses a channel any more.
-    Release {
-        /// Node or layer.
-        scope: Scope,
-        /// The channel.
-        channel: ChannelName,
-    },
-}
-
-/// What a control core is told at its start.
-#[derive(Debug, Clone)]
-pub struct ControlConfig {
-    /// The flow.
-    pub me: FlowId,
-    /// Kind of its layer.
-    pub kind: LayerKind,
-    /// Its epoch.
-    pub epoch: u64,
-    /// Whether it has a node scope.
-    pub node_scope: bool,
-    /// Its layer broker.
-    pub layer_scope: Option<LayerScopeId>,
-    /// Flows that share the layer broker have a channel of their own there, on a broker of this kind.
-    pub replicas: Option<LayerScope>,
-    /// What the node file says of this flow as a gateway.
-    pub gateway: AutoBool,
-    /// Whether it has an inter scope, so that it must listen for peers before it is ready.
-    pub inter_scope: bool,
-    /// Answers on the layer scope share one channel (Kafka, DDS).
-    pub layer_answers_need_id: bool,
-    /// What the layer broker makes of topic names.
-    pub layer_names: LayerNames,
-    /// Scopes whose broker keeps leases; the flow is not ready before they were read.
-    pub lease_stores: BTreeSet<Scope>,
-    /// Rules of the node file.
-    pub rules: PlanRules,
-    /// Who may advertise and request what.
-    pub access: AccessRules,
-}
-
-/// From so many topics at once on it pays to look first who has to do with which.
-const MANY: usize = 16;
-
-/// A new plan that has had no consequence yet.
-struct Draft {
-    plan: TopicPlan,
-    /// Who advertises the topic as transient_local.
-    durable: BTreeSet<OriginFilter>,
-    /// Some flow announces something of the topic.
-    is_known: bool,
-}
-
-struct Dirty {
-    first: Instant,
-    last: Instant,
-    /// It is planned with the next tick.
-    urgent: bool,
-}
 
 /// Leases, other flows, plans.
 pub struct ControlCore {
@@ -326,10 +191,7 @@ impl ControlCore {
     /// Takes in nothing more: every bridge drains.
     pub fn start_draining(&mut self, now: Instant, wall_ms: u64) {
         self.set_state(now, FlowState::Draining);
-        for dirty in self.dirty.values_mut() {
-            dirty.urgent = true;
-        }
-        self.plan_due(now, wall_ms);
+        self.plan_changed(now, wall_ms);
         self.hand_over_all(now, wall_ms);
     }
 
@@ -444,150 +306,6 @@ impl ControlCore {
         self.hello_now();
         self.touch(now, changed);
         self.touch_all(now);
-    }
-
-    fn touch(&mut self, now: Instant, topics: BTreeSet<TopicName>) {
-        self.registry.tell_anew(now, &topics);
-        for topic in topics {
-            self.dirty
-                .entry(topic)
-                .and_modify(|dirty| dirty.last = now)
-                .or_insert(Dirty {
-                    first: now,
-                    last: now,
-                    urgent: false,
-                });
-        }
-    }
-
-    /// A topic is planned with the next tick.
-    fn touch_urgent(&mut self, now: Instant, topic: &TopicName) {
-        self.touch(now, BTreeSet::from([topic.clone()]));
-        if let Some(dirty) = self.dirty.get_mut(topic) {
-            dirty.urgent = true;
-        }
-    }
-
-    fn touch_all(&mut self, now: Instant) {
-        let mut topics = self.registry.all_topics();
-        topics.extend(self.plans.keys().cloned());
-        self.touch(now, topics);
-    }
-
-    fn plan_due(&mut self, now: Instant, wall_ms: u64) {
-        let due = |dirty: &Dirty| {
-            dirty.urgent
-                || now.saturating_duration_since(dirty.last) >= QUIET
-                || now.saturating_duration_since(dirty.first) >= LATEST
-        };
-        let topics: Vec<TopicName> = self
-            .dirty
-            .iter()
-            .filter(|(topic, dirty)| due(dirty) && !self.carriers.awaits_places(topic))
-            .map(|(topic, _)| topic.clone())
-            .collect();
-        for topic in &topics {
-            self.dirty.remove(topic);
-        }
-        for (topic, draft) in topics.iter().zip(self.draft(&topics)) {
-            self.carry_out(now, topic, draft, wall_ms);
-        }
-    }
-
-    /// Plans topics, without any consequence yet: that of one is nothing to the plan of another.
-    fn draft(&self, topics: &[TopicName]) -> Vec<Draft> {
-        let world = self.registry.world();
-        let survey = if topics.len() < MANY {
-            Survey::new(world)
-        } else {
-            Survey::of_all(world)
-        };
-        let draft = |topic| {
-            let holders = survey.holders(topic);
-            Draft {
-                plan: plan_within(&survey, topic, &self.config.rules, self.plans.get(topic)),
-                durable: durable_sources(&holders, topic),
-                is_known: holders.iter().any(|(_, flow)| flow.topics.contains_key(topic)),
-            }
-        };
-        topics.iter().map(draft).collect()
-    }
-
-    fn carry_out(&mut self, now: Instant, topic: &TopicName, draft: Draft, wall_ms: u64) {
-        let previous = self.plans.get(topic);
-        let Draft {
-            mut plan,
-            durable,
-            is_known,
-        } = draft;
-        if is_known && previous == Some(&plan) && plan.bridges.is_empty() && self.is_idle(topic, &durable) {
-            return;
-        }
-        let had_route = previous.is_some_and(|plan| !plan.bridges.is_empty());
-        let carried = previous.is_some_and(TopicPlan::carries_out);
-        let fault = if plan.uses_layer() {
-            self.registry.put_on_layer(topic).err()
-        } else {
-            None
-        };
-        if let Some(fault) = &fault {
-            plan.block_layer(&self.config.me, fault.code(), &format!("{topic} {fault}"));
-        }
-        if !plan.uses_layer() {
-            self.registry.take_off_layer(topic);
-        }
-        self.forget_writers(topic, durable);
-        let has_route = !plan.bridges.is_empty();
-        let duty = self.duty(now, topic, carried, &plan);
-        let info = Box::new(local_info(&self.registry, topic));
-        if plan.bridges.is_empty() && !is_known {
-            self.plans.remove(topic);
-        } else {
-            self.plans.insert(topic.clone(), plan.clone());
-        }
-        let carrying = self.carrying(now, topic, &plan);
-        let mut routes = carrying_states(&self.config.me, &carrying);
-        routes.extend(route_states(&self.config.me, &plan, |scope| self.scopes.health(scope)));
-        routes.truncate(MAX_ROUTES);
-        self.registry.set_route_state(now, topic, routes);
-        self.update_channels(topic);
-        self.outputs.push_back(Output::Plan {
-            topic: topic.clone(),
-            plan,
-            info,
-            duty,
-        });
-        if had_route != has_route {
-            let kind = if has_route {
-                EventKind::RouteUp
-            } else {
-                EventKind::RouteDown
-            };
-            self.tell(&event(kind, Some(topic.clone())), wall_ms);
-        }
-    }
-
-    /// Whether a topic without bridges concerns nobody here: no lease, nothing that is kept, told or handed over. That is most
-    /// of a large fleet's topics, and they are looked at again every few seconds.
-    fn is_idle(&self, topic: &TopicName, durable: &BTreeSet<OriginFilter>) -> bool {
-        self.registry.leases_of(topic).next().is_none()
-            && self.durable.get(topic).is_none_or(|before| before == durable)
-            && !self.registry.has_route_state(topic)
-            && !self.carriers.knows(topic)
-    }
-
-    /// Notes who advertises a topic as transient_local; what is kept of those who no longer do is to be forgotten.
-    fn forget_writers(&mut self, topic: &TopicName, durable: BTreeSet<OriginFilter>) {
-        let before = self.durable.remove(topic).unwrap_or_default();
-        for gone in before.difference(&durable) {
-            self.outputs.push_back(Output::ForgetWriters {
-                topic: topic.clone(),
-                of: gone.clone(),
-            });
-        }
-        if !durable.is_empty() {
-            self.durable.insert(topic.clone(), durable);
-        }
     }
 
     fn tell(&mut self, event: &EventDraft, wall_ms: u64) {

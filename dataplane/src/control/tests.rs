@@ -3,12 +3,15 @@
 mod balance;
 
 use blaze_domain::LayerKind;
-use blaze_domain::node_file::AccessRules;
+use blaze_domain::node_file::{AccessRules, AutoBool};
+use blaze_proto::link::link_control::{Body, LayerScope};
 use serde_json::{Value, json};
 
+use super::routes::route_states;
 use super::*;
 use crate::plan::Bridge;
-use crate::registry::LapseReason;
+use crate::registry::{LapseReason, LayerNames};
+use crate::world::LayerScopeId;
 
 struct Bench {
     core: ControlCore,

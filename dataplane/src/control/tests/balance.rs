@@ -7,7 +7,7 @@ use prost::Message as _;
 
 use super::*;
 use crate::lane::load::{Loads, TopicLoad};
-use crate::registry::entry_hash;
+use crate::registry::{carrying_states, entry_hash};
 use crate::world::{Carrying, Handover};
 
 const TOPICS: [&str; 3] = ["t0", "t1", "t2"];
