@@ -6,6 +6,8 @@
 //!     └───────────┴──────────────────── member ◄────────────────────────┘
 //! ```
 //!
+//! A gateway whose inter scope stops working joins anew, and meanwhile is none.
+//!
 //! A flow that joins says so when it knows what is outside. One that leaves says so first: the others carry for it while what it
 //! sends itself still arrives, so nothing is missed, and repeats have the same identity.
 
@@ -27,6 +29,8 @@ const WELCOME_FOR: Duration = Duration::from_secs(60);
 const UNNEEDED_FOR: Duration = Duration::from_secs(5);
 /// A flow that cannot join within this time says that it cannot, and another one does.
 const CANNOT: Duration = Duration::from_secs(15);
+/// Whoever leaves the inter scope has heard of the flows there from the gateways within this time.
+const HEARD_OF: Duration = Duration::from_secs(30);
 /// One that leaves sends and takes what it did before for this long; its peers are told half way.
 const LEAVE: Duration = Duration::from_secs(2);
 
@@ -76,9 +80,11 @@ pub(super) struct Gateways {
     stage: Stage,
     /// Since when the channel of the layer broker is heard.
     heard_since: Option<Instant>,
+    /// When it last left the inter scope.
+    left: Option<Instant>,
     /// What was chosen last, and since when.
     choice: Option<(Choice, Instant)>,
-    /// It did not come to the inter scope in time.
+    /// It did not come to the inter scope in time, or has lost it.
     cannot: bool,
     /// What Hello on the inter scope says.
     shown: FlowState,
@@ -103,6 +109,7 @@ impl Gateways {
         Self {
             stage,
             heard_since: None,
+            left: None,
             choice: None,
             cannot: false,
             shown: FlowState::Starting,
@@ -129,6 +136,11 @@ impl Gateways {
         } else {
             config.gateway
         }
+    }
+
+    /// Whether flows elsewhere that are unknown now may become known another way in a moment.
+    pub(super) fn has_just_left(&self, now: Instant) -> bool {
+        self.left.is_some_and(|at| now.saturating_duration_since(at) < HEARD_OF)
     }
 
     fn heard_for(&self, now: Instant) -> Duration {
@@ -161,11 +173,25 @@ impl ControlCore {
         }
     }
 
+    /// The inter scope does not work here, and has not for a while: others are to be on it for the group.
+    pub fn lost(&mut self, now: Instant) {
+        let is_one_of_many = self.config.replicas.is_some();
+        if is_one_of_many && matches!(self.gateways.stage, Stage::Gateway | Stage::Joining { .. }) {
+            self.gateways.cannot = true;
+            let stage = Stage::Joining {
+                since: now,
+                there: None,
+            };
+            self.enter(now, stage);
+        }
+    }
+
     /// The flow is not on the inter scope any more.
     pub fn left(&mut self, now: Instant) {
         if self.gateways.stage == Stage::Closing {
             self.enter(now, Stage::Member);
         }
+        self.gateways.left = Some(now);
         let changed = self.registry.leave_link(now);
         self.touch(now, changed);
     }
@@ -184,6 +210,8 @@ impl ControlCore {
     /// Whether it has listened for as long as it takes to know who is there.
     pub(super) fn has_listened(&self, now: Instant) -> bool {
         match self.gateways.stage {
+            // Without the inter scope it is still of use within its layer.
+            Stage::Joining { .. } if self.gateways.cannot => self.gateways.heard_for(now) >= LISTEN,
             Stage::Listening | Stage::Joining { .. } if self.state == FlowState::Starting => false,
             Stage::Member if self.config.inter_scope => self.gateways.heard_for(now) >= LISTEN,
             _ => !self.config.inter_scope || now.saturating_duration_since(self.started) >= LISTEN,

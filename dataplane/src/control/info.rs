@@ -34,10 +34,18 @@ pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
     }
 }
 
+/// Who advertises a topic as transient_local.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(super) struct Sources {
+    pub(super) known: BTreeSet<OriginFilter>,
+    /// There are more, which nobody named.
+    pub(super) more: bool,
+}
+
 /// Who advertises a topic as transient_local, of flows that hold it and are not forgotten. One that is down is still one of
 /// them: its services may well live.
-pub(super) fn durable_sources(holders: &[(&FlowId, &FlowView)], topic: &TopicName) -> BTreeSet<OriginFilter> {
-    let mut found = BTreeSet::new();
+pub(super) fn durable_sources(holders: &[(&FlowId, &FlowView)], topic: &TopicName) -> Sources {
+    let mut found = Sources::default();
     for (flow, view) in holders {
         let Some(entry) = view.topics.get(topic) else {
             continue;
@@ -49,7 +57,8 @@ pub(super) fn durable_sources(holders: &[(&FlowId, &FlowView)], topic: &TopicNam
             .into_iter()
             .filter_map(|(layer, scope)| Some((layer, scope.advertise.as_ref()?)));
         for (layer, offer) in offers.filter(|(_, offer)| offer.durability == Durability::TransientLocal) {
-            found.extend(offer.sources.iter().map(|source| OriginFilter {
+            found.more |= offer.more_sources;
+            found.known.extend(offer.sources.iter().map(|source| OriginFilter {
                 layer: layer.clone(),
                 node: Some(source.node.clone()),
                 service: Some(source.service.clone()),

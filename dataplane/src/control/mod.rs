@@ -99,7 +99,7 @@ impl ControlCore {
             started: now,
         });
         let gateways = Gateways::new(&config);
-        registry.set_role(config.gateway, gateways.role());
+        registry.set_role(gateways.setting(&config), gateways.role());
         Self {
             replicas: Replicas::new(config.epoch),
             gateways,

@@ -83,6 +83,8 @@ pub enum Output {
         topic: TopicName,
         /// Whose.
         of: OriginFilter,
+        /// Who advertises it still.
+        but: BTreeSet<OriginFilter>,
     },
     /// Let the broker of a scope make a channel.
     Prepare {

@@ -6,7 +6,7 @@ use std::time::Instant;
 use blaze_domain::TopicName;
 use blaze_domain::control::EventKind;
 
-use super::info::{durable_sources, local_info};
+use super::info::{Sources, durable_sources, local_info};
 use super::routes::route_states;
 use super::{ControlCore, LATEST, Output, QUIET, event};
 use crate::plan::{Survey, TopicPlan, plan_within};
@@ -16,11 +16,14 @@ use crate::world::OriginFilter;
 /// From so many topics at once on it pays to look first who has to do with which.
 const MANY: usize = 16;
 
+/// Sources of one topic that are remembered while nobody can tell whether they are gone.
+const MAX_UNNAMED: usize = 1024;
+
 /// A new plan that has had no consequence yet.
 struct Draft {
     plan: TopicPlan,
     /// Who advertises the topic as transient_local.
-    durable: BTreeSet<OriginFilter>,
+    durable: Sources,
     /// Some flow announces something of the topic.
     is_known: bool,
 }
@@ -115,7 +118,7 @@ impl ControlCore {
             durable,
             is_known,
         } = draft;
-        if is_known && previous == Some(&plan) && plan.bridges.is_empty() && self.is_idle(topic, &durable) {
+        if is_known && previous == Some(&plan) && plan.bridges.is_empty() && self.is_idle(topic, &durable.known) {
             return;
         }
         let had_route = previous.is_some_and(|plan| !plan.bridges.is_empty());
@@ -131,7 +134,7 @@ impl ControlCore {
         if !plan.uses_layer() {
             self.registry.take_off_layer(topic);
         }
-        self.forget_writers(topic, durable);
+        self.forget_writers(now, topic, durable);
         let has_route = !plan.bridges.is_empty();
         let duty = self.duty(now, topic, carried, &plan);
         let info = Box::new(local_info(&self.registry, topic));
@@ -171,17 +174,25 @@ impl ControlCore {
             && !self.carriers.knows(topic)
     }
 
-    /// Notes who advertises a topic as transient_local; what is kept of those who no longer do is to be forgotten.
-    fn forget_writers(&mut self, topic: &TopicName, durable: BTreeSet<OriginFilter>) {
+    /// Notes who advertises a topic as transient_local; what is kept of those who no longer do is to be forgotten. Whoever is
+    /// only not named any more is not gone.
+    fn forget_writers(&mut self, now: Instant, topic: &TopicName, durable: Sources) {
         let before = self.durable.remove(topic).unwrap_or_default();
-        for gone in before.difference(&durable) {
-            self.outputs.push_back(Output::ForgetWriters {
-                topic: topic.clone(),
-                of: gone.clone(),
-            });
+        let Sources { mut known, more } = durable;
+        let gone: Vec<OriginFilter> = before.difference(&known).cloned().collect();
+        if (more || self.gateways.has_just_left(now)) && known.len() + gone.len() <= MAX_UNNAMED {
+            known.extend(gone);
+        } else {
+            for of in gone {
+                self.outputs.push_back(Output::ForgetWriters {
+                    topic: topic.clone(),
+                    of,
+                    but: known.clone(),
+                });
+            }
         }
-        if !durable.is_empty() {
-            self.durable.insert(topic.clone(), durable);
+        if !known.is_empty() {
+            self.durable.insert(topic.clone(), known);
         }
     }
 }

@@ -1,6 +1,7 @@
 //! The control core as a flow with real brokers drives it.
 
 mod balance;
+mod gateways;
 
 use blaze_domain::LayerKind;
 use blaze_domain::node_file::{AccessRules, AutoBool};

@@ -113,7 +113,8 @@ impl ControlTask {
             }
         }
         self.shared.control.lock().say_goodbye();
-        self.work();
+        // A Hello after it would make the flow live again for the others.
+        self.carry_out_all(Instant::now());
     }
 
     fn take_control(&self, scope: Scope, batch: &mut Vec<Received>) {
@@ -147,6 +148,7 @@ impl ControlTask {
                         control.set_epoch(epoch);
                     }
                     News::Joined => control.joined(now),
+                    News::Lost => control.lost(now),
                     News::Left => control.left(now),
                     News::Discovered(_) => {}
                 }
@@ -276,10 +278,10 @@ impl ControlTask {
                     }
                 }
             }
-            Output::ForgetWriters { topic, of } => {
+            Output::ForgetWriters { topic, of, but } => {
                 let writers = plane.with(|state| {
                     let id = state.core.find(topic.as_str())?;
-                    Some(state.core.forget_writers(id, &of))
+                    Some(state.core.forget_writers(id, &of, &but))
                 });
                 for writer in writers.into_iter().flatten() {
                     self.forget_writer(&topic, writer);

@@ -27,6 +27,10 @@ const RETRY: Duration = Duration::from_secs(1);
 const DRAIN: Duration = Duration::from_millis(600);
 /// … and how long the good-bye may take.
 const GOODBYE: Duration = Duration::from_millis(100);
+/// How often it is looked whether the transport works.
+const WATCH: Duration = Duration::from_millis(100);
+/// One that has not worked for this long is lost: RustDDS is built anew much faster.
+const LOST: Duration = Duration::from_secs(5);
 /// How often it is looked whether what is queued has left.
 const LOOK: Duration = Duration::from_millis(10);
 
@@ -50,6 +54,29 @@ pub(crate) struct InterScope {
 struct Wish {
     joined: bool,
     stop: bool,
+}
+
+/// Whether the inter scope works, as others were told.
+#[derive(Debug, Default)]
+struct Health {
+    works: bool,
+    failing_since: Option<Instant>,
+}
+
+impl Health {
+    /// What is new, if anything is.
+    fn look(&mut self, now: Instant, is_ready: bool) -> Option<News> {
+        if is_ready {
+            self.failing_since = None;
+            return (!std::mem::replace(&mut self.works, true)).then_some(News::Joined);
+        }
+        let since = *self.failing_since.get_or_insert(now);
+        let is_lost = self.works && now.saturating_duration_since(since) >= LOST;
+        if is_lost {
+            self.works = false;
+        }
+        is_lost.then_some(News::Lost)
+    }
 }
 
 impl InterScope {
@@ -120,35 +147,43 @@ impl InterScope {
 
     /// The thread: joins and leaves as is wanted, until it is stopped.
     pub(super) fn run(&self) {
+        // Who is on it from the start counts on it.
+        let mut health = Health {
+            works: self.is_joined(),
+            ..Health::default()
+        };
         let mut pause = None;
-        while let Some(join) = self.next(pause.take()) {
+        while let Some(join) = self.next(pause.take(), &mut health) {
+            health = Health::default();
             if !join {
                 self.leave();
                 self.plane.push(News::Left);
                 continue;
             }
-            match self.join() {
-                Ok(()) => self.plane.push(News::Joined),
-                Err(error) => {
-                    let text = format!("{error:#}");
-                    if std::mem::replace(&mut *self.trouble.lock(), text.clone()) != text {
-                        tracing::warn!(error = text, "cannot join the inter scope, trying on");
-                    }
-                    pause = Some(RETRY);
+            if let Err(error) = self.join() {
+                let text = format!("{error:#}");
+                if std::mem::replace(&mut *self.trouble.lock(), text.clone()) != text {
+                    tracing::warn!(error = text, "cannot join the inter scope, trying on");
                 }
+                pause = Some(RETRY);
             }
         }
     }
 
-    /// Waits for something to do: to join, or to leave. `None`: nothing any more.
-    fn next(&self, pause: Option<Duration>) -> Option<bool> {
-        let joined = || self.transport.lock().is_some();
+    /// Waits for something to do: to join, or to leave. `None`: nothing any more. Meanwhile it is watched whether it works.
+    fn next(&self, pause: Option<Duration>, health: &mut Health) -> Option<bool> {
         let mut wish = self.wish.lock();
         if let Some(pause) = pause {
             self.changed.wait_for(&mut wish, pause);
         }
-        while !wish.stop && wish.joined == joined() {
-            self.changed.wait(&mut wish);
+        while !wish.stop && wish.joined == self.is_joined() {
+            if let Some(status) = self.status() {
+                let news = health.look(Instant::now(), status.ready);
+                news.into_iter().for_each(|news| self.plane.push(news));
+                self.changed.wait_for(&mut wish, WATCH);
+            } else {
+                self.changed.wait(&mut wish);
+            }
         }
         (!wish.stop).then_some(wish.joined)
     }
@@ -167,8 +202,9 @@ impl InterScope {
         self.plane
             .with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
         std::thread::sleep(GOODBYE);
-        // The pacer may still hold it for the datagram that it sends.
-        drop(self.transport.lock().take());
+        // The pacer may still hold it for the datagram that it sends. Its end takes a while, in which nobody is to wait for it.
+        let gone = self.transport.lock().take();
+        drop(gone);
         self.plane.drop_peers();
     }
 
@@ -201,7 +237,7 @@ impl InterScope {
         let event = match news {
             News::Discovered(found) => return self.connect(found),
             News::Link(event) => event.as_ref(),
-            News::Rebuilt(_) | News::Joined | News::Left => return,
+            News::Rebuilt(_) | News::Joined | News::Lost | News::Left => return,
         };
         match event {
             LinkEvent::PeerUp { flow, epoch } => self.connect(&endpoint(flow, *epoch)),
@@ -267,5 +303,25 @@ impl Transport for InterScope {
     fn max_datagram_bytes(&self) -> usize {
         let (mtu, chunking, listen) = self.sizes();
         dds::max_datagram_bytes(mtu, chunking, listen)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_works_when_it_is_ready_and_is_lost_after_a_while() {
+        let start = Instant::now();
+        let mut health = Health::default();
+        let mut look = |ms: u64, is_ready: bool| health.look(start + Duration::from_millis(ms), is_ready);
+        assert!(look(0, false).is_none() && look(10_000, false).is_none());
+        assert!(matches!(look(10_100, true), Some(News::Joined)));
+        // Built anew.
+        assert!(look(10_200, false).is_none() && look(12_000, false).is_none() && look(12_100, true).is_none());
+        assert!(look(13_000, false).is_none() && look(17_900, false).is_none());
+        assert!(matches!(look(18_000, false), Some(News::Lost)));
+        assert!(look(30_000, false).is_none());
+        assert!(matches!(look(30_100, true), Some(News::Joined)));
     }
 }

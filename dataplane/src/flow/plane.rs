@@ -32,8 +32,10 @@ pub enum News {
     Discovered(Endpoint),
     /// The transport was built anew: the flow has this new epoch on the link.
     Rebuilt(u64),
-    /// The inter scope was joined.
+    /// The inter scope was joined, and works.
     Joined,
+    /// The inter scope has not worked for a while.
+    Lost,
     /// The inter scope was left.
     Left,
 }

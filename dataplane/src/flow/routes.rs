@@ -227,7 +227,7 @@ impl Routes {
             drop(sources);
             if let Some(source) = held {
                 source.task.stop();
-                self.plane.read(|state| state.core.reads_no_more(id));
+                self.plane.read(|state| state.core.reads_no_more(id, scope));
             }
             return;
         }

@@ -3,7 +3,7 @@
 //! A broker keeps them for those who subscribe to it; a bridge that begins while the topic is being read already gets them
 //! from here, and so does a flow that comes back.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
 use std::num::NonZeroUsize;
 use std::time::Instant;
 
@@ -165,10 +165,13 @@ impl KeptMessages {
     }
 
     /// Forgets writers of a topic. Returns which.
-    pub(super) fn forget(&mut self, topic: TopicId, of: &OriginFilter) -> Vec<WriterId> {
+    pub(super) fn forget(&mut self, topic: TopicId, of: &OriginFilter, but: &BTreeSet<OriginFilter>) -> Vec<WriterId> {
         let is_of = |kept: &Kept| {
             let frame = &kept.frame;
-            of.matches(frame.origin_layer(), frame.origin_node(), frame.origin_service())
+            let matches = |filter: &OriginFilter| {
+                filter.matches(frame.origin_layer(), frame.origin_node(), frame.origin_service())
+            };
+            matches(of) && !but.iter().any(matches)
         };
         let fits = |writer: &Writer| writer.messages.back().is_some_and(is_of);
         self.remove(|(of, _), writer| *of == topic && fits(writer))
@@ -259,7 +262,9 @@ mod tests {
             service: Some("b".into()),
             ..OriginFilter::default()
         };
-        assert_eq!(kept.forget(TOPIC, &of), [WriterId([2; 16])]);
+        let any = BTreeSet::from([OriginFilter::default()]);
+        assert_eq!(kept.forget(TOPIC, &of, &any), [], "somebody says that it is there");
+        assert_eq!(kept.forget(TOPIC, &of, &BTreeSet::new()), [WriterId([2; 16])]);
         assert_eq!(sequences(&kept, now), [(3, 1)]);
         kept.forget_topics(|_| true);
         assert_eq!((kept.bytes, kept.writers.len()), (0, 0));

@@ -1,6 +1,6 @@
 //! Topics and bridges come, go and are forgotten: which has which place in the message path.
 
-use std::collections::HashSet;
+use std::collections::{BTreeSet, HashSet};
 use std::time::Instant;
 
 use blaze_domain::{TopicName, WriterId};
@@ -124,9 +124,10 @@ impl DataCore {
         }
     }
 
-    /// A writer's lease is over: what is kept of it goes. Returns which writers that were.
-    pub fn forget_writers(&mut self, topic: TopicId, of: &OriginFilter) -> Vec<WriterId> {
-        self.kept.forget(topic, of)
+    /// A writer's lease is over: what is kept of it goes, unless one of `but` says that it is still there. Returns which writers
+    /// that were.
+    pub fn forget_writers(&mut self, topic: TopicId, of: &OriginFilter, but: &BTreeSet<OriginFilter>) -> Vec<WriterId> {
+        self.kept.forget(topic, of, but)
     }
 
     /// Writers of earlier lives of their services, since the last call: what brokers keep of them goes, too.

@@ -7,6 +7,7 @@
 use std::sync::Arc;
 
 use blaze_brokers::{Begin, Place};
+use blaze_domain::Scope;
 
 use super::core::DataCore;
 use super::path::TopicId;
@@ -128,9 +129,11 @@ impl DataCore {
         self.path(topic).places.stopped_at()
     }
 
-    /// Nothing of the layer scope is read of a topic any more.
-    pub fn reads_no_more(&mut self, topic: TopicId) {
-        self.path_mut(topic).places = Places::default();
+    /// Nothing of a scope is read of a topic any more. Only the layer scope has places.
+    pub fn reads_no_more(&mut self, topic: TopicId, scope: Scope) {
+        if scope == Scope::Layer {
+            self.path_mut(topic).places = Places::default();
+        }
     }
 }
 

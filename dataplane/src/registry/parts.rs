@@ -178,9 +178,9 @@ impl Registry {
             Carrying::HandedOver(handover) => {
                 if moves {
                     self.note_move(now, &me, &handover);
+                    // Should the next one fail before it begins, this flow knows where.
+                    self.leave_behind(now, topic, Begin::At(handover.offsets));
                 }
-                // Should the next one fail before it begins, this flow knows where.
-                self.leave_behind(now, topic, Begin::At(handover.offsets));
             }
             Carrying::No => {}
         }

@@ -205,7 +205,7 @@ impl World {
             let key = (topic.clone(), scope);
             if !flow.plane.core.path(id).reads(scope) {
                 if flow.reads.remove(&key).is_some() {
-                    flow.plane.core.reads_no_more(id);
+                    flow.plane.core.reads_no_more(id, scope);
                 }
                 continue;
             }

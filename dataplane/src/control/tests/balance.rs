@@ -214,7 +214,7 @@ impl Pair {
     }
 }
 
-fn said_by(flow: &FlowId, kind: Kind) -> Hello {
+pub(super) fn said_by(flow: &FlowId, kind: Kind) -> Hello {
     let layer_scope_id = if kind == Kind::Fog {
         LayerScopeId::kafka("").0
     } else {

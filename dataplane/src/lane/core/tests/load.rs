@@ -159,7 +159,10 @@ fn what_was_read_after_the_last_bridge_is_read_again() {
     bench.apply(vec![bridge(Scope::Inter, Target::Layer)], TopicInfo::default());
     let stopped = bench.core.stopped_at(bench.topic);
     bench.publish_on_layer(5..8);
-    bench.core.reads_no_more(bench.topic);
+    // The node's source ends, too: it has no places.
+    bench.core.reads_no_more(bench.topic, Scope::Node);
+    assert_eq!(bench.core.stopped_at(bench.topic), [8]);
+    bench.core.reads_no_more(bench.topic, Scope::Layer);
     assert_eq!(bench.link.submitted.len(), 5);
     bench.apply(vec![bridge(Scope::Layer, to_cloud())], TopicInfo::default());
     let begin = Begin::At(stopped.into());

@@ -1,0 +1,188 @@
+//! A flow that is to be on the inter scope and cannot, and what stays of services that are only not named any more.
+
+use blaze_proto::link::link_control::{Advertise, Delta, Entry, Kind, Source};
+
+use super::balance::said_by;
+use super::*;
+use crate::world::Role;
+
+const TOPIC: &str = "map";
+
+/// A flow that has read its leases and hears the channel of the layer broker.
+fn alone() -> Bench {
+    let mut bench = Bench::with(|config| ControlConfig {
+        inter_scope: true,
+        ..config
+    });
+    for scope in LOCAL {
+        bench.core.restore_leases(bench.now, scope, &[]);
+    }
+    bench.core.hears_replicas(bench.now);
+    bench
+}
+
+impl Bench {
+    fn wait(&mut self, ms: u64) {
+        for _ in 0..ms / 100 {
+            self.step(100);
+        }
+    }
+
+    /// What is asked of the inter scope, since the last call.
+    fn wishes(&mut self) -> Vec<bool> {
+        let outputs = std::mem::take(&mut self.outputs);
+        let wish = |output| match output {
+            Output::Inter { join } => Some(join),
+            _ => None,
+        };
+        outputs.into_iter().filter_map(wish).collect()
+    }
+
+    /// Whose kept messages are to be forgotten, and but for whom, since the last call.
+    fn forgotten(&mut self) -> Vec<(OriginFilter, BTreeSet<OriginFilter>)> {
+        let outputs = std::mem::take(&mut self.outputs);
+        let forgets = |output| match output {
+            Output::ForgetWriters { of, but, .. } => Some((of, but)),
+            _ => None,
+        };
+        outputs.into_iter().filter_map(forgets).collect()
+    }
+
+    fn own(&self) -> (AutoBool, Role) {
+        let own = self.core.world().own().unwrap();
+        (own.gateway, own.role)
+    }
+
+    /// A robot's flow announces these services on its node as those that advertise the topic.
+    fn robot_announces(&mut self, version: u64, services: &[&str], more_sources: bool) {
+        let robot: FlowId = "edge/robot-1".parse().unwrap();
+        let source = |service: &&str| Source {
+            node: "robot-1".into(),
+            service: (*service).into(),
+        };
+        let advertise = Advertise {
+            transient_local: true,
+            sources: services.iter().map(source).collect(),
+            more_sources,
+            ..Advertise::default()
+        };
+        let entry = Entry {
+            topic: TOPIC.into(),
+            node_advertise: Some(advertise),
+            ..Entry::default()
+        };
+        let (hello, delta) = (
+            Box::new(said_by(&robot, Kind::Edge)),
+            Delta {
+                from_version: version - 1,
+                to_version: version,
+                part: 0,
+                parts: 1,
+                entries: vec![entry],
+            },
+        );
+        let from = robot.clone();
+        self.core.link_event(self.now, LinkEvent::Hello { from, hello });
+        let body = Body::Delta(delta);
+        self.core.link_event(self.now, LinkEvent::Control { from: robot, body });
+    }
+}
+
+fn of(layer: Option<&str>, service: &str) -> OriginFilter {
+    OriginFilter {
+        layer: layer.map(str::to_owned),
+        node: Some("robot-1".to_owned()),
+        service: Some(service.to_owned()),
+    }
+}
+
+#[test]
+fn a_flow_that_cannot_join_is_of_use_in_its_layer_and_tries_on() {
+    let mut bench = alone();
+    bench.wait(2_000);
+    assert_eq!(bench.wishes(), [true]);
+    bench.wait(10_000);
+    assert_eq!(bench.core.state(), FlowState::Starting);
+    bench.wait(10_000);
+    assert_eq!(bench.core.state(), FlowState::Ready);
+    assert_eq!(bench.own(), (AutoBool::No, Role::Member));
+    bench.core.joined(bench.now);
+    bench.wait(5_000);
+    assert_eq!(bench.core.stage(), Stage::Gateway);
+    assert_eq!(bench.own(), (AutoBool::Auto, Role::Gateway));
+}
+
+#[test]
+fn a_gateway_that_loses_the_inter_scope_is_none_until_it_works() {
+    for setting in [AutoBool::Auto, AutoBool::Yes] {
+        let mut bench = alone();
+        bench.core.config.gateway = setting;
+        bench.wait(2_000);
+        bench.core.joined(bench.now);
+        bench.wait(5_000);
+        assert_eq!(bench.own().1, Role::Gateway);
+        bench.core.lost(bench.now);
+        assert_eq!(bench.own(), (AutoBool::No, Role::Member));
+        bench.wait(60_000);
+        assert_eq!(bench.core.state(), FlowState::Ready);
+        assert_eq!(bench.own().1, Role::Member);
+        bench.core.joined(bench.now);
+        bench.wait(5_000);
+        assert_eq!(bench.own(), (setting, Role::Gateway));
+    }
+}
+
+/// Alone in its scope nobody else could be on the inter scope for it.
+#[test]
+fn a_flow_without_a_group_stays_on_the_inter_scope() {
+    let mut bench = Bench::with(|config| ControlConfig {
+        inter_scope: true,
+        replicas: None,
+        ..config
+    });
+    bench.core.lost(bench.now);
+    assert_eq!(bench.core.stage(), Stage::Gateway);
+}
+
+#[test]
+fn what_is_kept_goes_with_the_service_that_wrote_it() {
+    let mut bench = Bench::inside();
+    bench.send(Scope::Node, &lease("request", TOPIC));
+    bench.robot_announces(1, &["mapper", "planner"], false);
+    bench.wait(400);
+    assert_eq!(bench.forgotten(), []);
+    bench.robot_announces(2, &["mapper"], false);
+    bench.wait(400);
+    let mapper = BTreeSet::from([of(Some("edge"), "mapper")]);
+    assert_eq!(bench.forgotten(), [(of(Some("edge"), "planner"), mapper)]);
+}
+
+/// Of more services than are named, one may be missing from the list at any time.
+#[test]
+fn what_is_kept_stays_while_not_all_services_are_named() {
+    let mut bench = Bench::inside();
+    bench.send(Scope::Node, &lease("request", TOPIC));
+    bench.robot_announces(1, &["mapper", "planner"], false);
+    bench.wait(400);
+    bench.robot_announces(2, &["mapper"], true);
+    bench.wait(10_000);
+    assert_eq!(bench.forgotten(), []);
+    bench.robot_announces(3, &["mapper"], false);
+    bench.wait(400);
+    assert_eq!(bench.forgotten().len(), 1);
+}
+
+/// Whoever leaves the inter scope hears of the robots from the gateways then.
+#[test]
+fn what_is_kept_stays_when_its_flow_is_heard_another_way() {
+    let mut bench = Bench::inside();
+    bench.send(Scope::Node, &lease("request", TOPIC));
+    bench.robot_announces(1, &["mapper"], false);
+    bench.wait(400);
+    bench.core.left(bench.now);
+    bench.wait(20_000);
+    assert_eq!(bench.forgotten(), []);
+    // No gateway names it.
+    bench.wait(20_000);
+    assert_eq!(bench.forgotten(), [(of(Some("edge"), "mapper"), BTreeSet::new())]);
+}
