@@ -12,10 +12,12 @@
 //! participant as failed, and the owner builds a new one.
 
 mod announcement;
+mod farewell;
 #[cfg(feature = "fault-injection")]
 mod fault;
 mod filter;
 pub mod layer;
+mod nudge;
 mod participant;
 mod pulse;
 mod reader;

@@ -225,6 +225,11 @@ impl Participant {
         self.port
     }
 
+    /// Address of its interface.
+    pub(super) fn address(&self) -> Ipv4Addr {
+        self.config.address
+    }
+
     /// Why hostile datagrams may reach RustDDS, or harmless ones may not; `None` when all is well.
     #[must_use]
     pub fn filter_weakness(&self) -> Option<String> {

@@ -9,8 +9,9 @@ use std::time::{Duration, Instant, SystemTime};
 use bytes::Bytes;
 use rustdds::no_key::SimpleDataReader;
 
+use super::nudge::Nudge;
 use super::sample::{Octets, OctetsAdapter};
-use super::{DdsError, Participant, Profile, Writer};
+use super::{DdsError, Participant, Profile, Writer, create_error};
 
 /// Time between two beats.
 const BEAT: Duration = Duration::from_millis(400);
@@ -37,10 +38,11 @@ pub enum Illness {
 }
 
 /// Feels whether a participant lives: it writes to a reader of the same participant, whose waker the event loop then
-/// calls. Nothing of this depends on the network.
+/// calls. Nothing of this depends on the network. Each look also lets it read announcements on.
 pub struct Pulse {
     writer: Writer,
     reader: SimpleDataReader<Octets, OctetsAdapter>,
+    nudge: Nudge,
     answers: Arc<AtomicU64>,
     seen: u64,
     last_beat: Option<Instant>,
@@ -72,6 +74,7 @@ impl Pulse {
         Ok(Self {
             reader: participant.raw_reader(&topic, profile)?,
             writer: participant.writer(&topic, profile)?,
+            nudge: Nudge::new(participant).map_err(create_error("socket"))?,
             answers: Arc::default(),
             seen: 0,
             last_beat: None,
@@ -94,6 +97,7 @@ impl Pulse {
             return Err(Illness::ThreadEnded);
         }
         self.check_clock(passed)?;
+        self.nudge.give();
         let answers = self.answers.load(Ordering::Relaxed);
         if answers != self.seen || (passed > STALL && self.last_answer.is_some()) {
             self.seen = answers;

@@ -13,12 +13,12 @@ use serde_json::{Value, json};
 
 use super::channel::{Channel, RawReader};
 use super::deliver::nanos;
-use super::farewell::Farewell;
 use super::names::ALIVE;
 use super::presence::Presence;
 use super::probe::Probe;
 use super::shared::{Shared, WriterFacts};
 use super::slot::Slot;
+use crate::dds::farewell::Farewell;
 use crate::dds::participant::prefix_of;
 use crate::dds::{
     DdsError, EndpointWatch, Endpoints, GuidPrefix, Illness, Participant, ParticipantConfig, Profile, Pulse, Writer,

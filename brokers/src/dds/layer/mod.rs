@@ -13,7 +13,6 @@
 
 mod channel;
 mod deliver;
-mod farewell;
 mod kept;
 mod life;
 mod make;

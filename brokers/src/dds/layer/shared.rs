@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::thread::Thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use parking_lot::{Mutex, RwLock};
 use tokio::sync::watch;
@@ -22,6 +22,9 @@ use crate::port::{BrokerStatus, Health};
 
 /// Most bytes that wait for the network, of one publisher and of all together.
 pub const MAX_QUEUE_BYTES: usize = 64 * 1024 * 1024;
+
+/// A participant that died is built anew in less.
+const REBUILD: Duration = Duration::from_secs(5);
 
 const LIMITS: OutboxLimits = OutboxLimits {
     lane_messages: 16_384,
@@ -63,6 +66,7 @@ pub(super) struct Shared {
     pub(super) domain: u16,
     pub(super) address: Ipv4Addr,
     pub(super) status: watch::Sender<BrokerStatus>,
+    was_up: AtomicBool,
     pub(super) outbox: Arc<Outbox<Target>>,
     /// Messages that the sender holds, because their writer cannot take them now.
     pub(super) held: AtomicUsize,
@@ -94,6 +98,7 @@ impl Shared {
             domain,
             address,
             status: watch::Sender::new(status),
+            was_up: AtomicBool::new(false),
             outbox: Outbox::new(LIMITS),
             held: AtomicUsize::new(0),
             slots: Slots::default(),
@@ -125,6 +130,9 @@ impl Shared {
                 if status.health != health {
                     status.since = Instant::now();
                 }
+                if health == Health::Up {
+                    self.was_up.store(true, Ordering::Relaxed);
+                }
                 status.health = health;
                 detail.clone_into(&mut status.detail);
             }
@@ -136,9 +144,14 @@ impl Shared {
         self.status.borrow().health == Health::Up
     }
 
-    /// Whether what is published is dropped at once. While it starts for the first time, messages wait.
+    /// Whether what is published is dropped at once. While it starts for the first time or is built anew, messages wait.
     pub(super) fn is_down(&self) -> bool {
-        matches!(self.status.borrow().health, Health::Down | Health::Closed)
+        let status = self.status.borrow();
+        match status.health {
+            Health::Closed => true,
+            Health::Down => !self.was_up.load(Ordering::Relaxed) || status.since.elapsed() > REBUILD,
+            Health::Connecting | Health::Up | Health::InUse => false,
+        }
     }
 
     /// Whether nothing waits to be written.

@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use blaze_brokers::dds::Fault;
 use blaze_brokers::dds::layer::DdsBroker;
-use blaze_brokers::{Broker, BrokerError, Content, Health, PublishOutcome, PublisherOptions, SubscribeOptions};
+use blaze_brokers::{
+    Broker, BrokerError, Content, Health, PublishOutcome, PublisherOptions, Received, SubscribeOptions,
+};
 use blaze_domain::node_file::DdsLayerBroker as Section;
 
 use super::support::{DEADLINE, Domain, eventually, frame, wait_for};
@@ -128,4 +130,37 @@ async fn a_best_effort_writer_that_starts_later_is_heard() {
         assert!(heard.is_ok(), "round {round}: nothing of {sequence} came");
         speaker.close().await;
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_published_while_it_is_built_anew_arrives() {
+    const MESSAGES: u64 = 200;
+    let domain = Domain::start().await;
+    let (mortal, other) = (domain.open().await, domain.open().await);
+    let topic = "meanwhile".parse().unwrap();
+    let mut there = other.subscribe(&topic, SubscribeOptions::default()).await.unwrap();
+    let options = PublisherOptions {
+        reliable: true,
+        ..PublisherOptions::default()
+    };
+    let publisher = mortal.publisher(&topic, options).unwrap();
+    mortal.inject(Fault::Panic);
+    wait_for(&mortal, Health::Down).await;
+    for sequence in 1..=MESSAGES {
+        assert_eq!(
+            publisher.publish(&frame(&topic, 1, sequence, 1), None),
+            PublishOutcome::Taken
+        );
+    }
+    let mut batch = Vec::new();
+    while batch.len() < MESSAGES as usize {
+        let received = tokio::time::timeout(DEADLINE, there.receive(&mut batch, 64)).await;
+        assert!(received.is_ok_and(|count| count > 0), "{} have come", batch.len());
+    }
+    let sequence = |received: Received| match received.content {
+        Content::Frame(frame) => frame.sequence(),
+        other => panic!("{other:?}"),
+    };
+    let found: Vec<u64> = batch.into_iter().map(sequence).collect();
+    assert_eq!(found, (1..=MESSAGES).collect::<Vec<u64>>());
 }

@@ -9,7 +9,7 @@ use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 
 use bytes::BufMut;
 
-use crate::dds::GuidPrefix;
+use super::GuidPrefix;
 
 /// RTPS 2.4, and RustDDS' vendor id.
 const HEADER: [u8; 8] = *b"RTPS\x02\x04\x01\x12";
@@ -32,7 +32,7 @@ const PARTICIPANT_GUID: [u8; 4] = [0x50, 0x00, 0x10, 0x00];
 const FIRST_NUMBER: u32 = 0x4000_0000;
 
 /// Says good-bye for others to one participant of this host.
-pub(super) struct Farewell {
+pub(in crate::dds) struct Farewell {
     socket: UdpSocket,
     /// Where the own participant takes announcements.
     to: SocketAddrV4,
@@ -40,7 +40,7 @@ pub(super) struct Farewell {
 }
 
 impl Farewell {
-    pub(super) fn new(address: Ipv4Addr, port: u16) -> io::Result<Self> {
+    pub(in crate::dds) fn new(address: Ipv4Addr, port: u16) -> io::Result<Self> {
         Ok(Self {
             socket: UdpSocket::bind((address, 0))?,
             to: SocketAddrV4::new(address, port),
@@ -48,14 +48,14 @@ impl Farewell {
         })
     }
 
-    pub(super) fn say(&mut self, whose: GuidPrefix) -> io::Result<()> {
+    pub(in crate::dds) fn say(&mut self, whose: GuidPrefix) -> io::Result<()> {
         // A number that was seen is passed over.
         self.number = self.number.wrapping_add(1);
         self.socket.send_to(&datagram(whose, self.number), self.to).map(|_| ())
     }
 }
 
-fn datagram(whose: GuidPrefix, number: u32) -> Vec<u8> {
+pub(super) fn datagram(whose: GuidPrefix, number: u32) -> Vec<u8> {
     let mut body = Vec::with_capacity(64);
     body.put_u16_le(0);
     body.put_u16_le(TO_PARAMETERS);
