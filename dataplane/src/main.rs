@@ -113,8 +113,10 @@ async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
     };
     let (flow, log) = flow;
     let flow = Arc::new(flow);
+    let started = loaded.value.clone();
     let reloads = watch(&supervisor, sources, schema(), loaded, WatchSettings::default());
-    supervisor.spawn("reload", TaskPolicy::Essential, follow(Arc::clone(&flow), reloads, log));
+    let follow = follow(Arc::clone(&flow), started, reloads, log);
+    supervisor.spawn("reload", TaskPolicy::Essential, follow);
     let announced = Arc::clone(&flow);
     let stopping = supervisor.stopping_token();
     supervisor.spawn("ready line", TaskPolicy::MayEnd, async move {
@@ -205,8 +207,26 @@ fn this_host() -> String {
     format!("{}|{}", boot.trim(), namespace.display())
 }
 
+/// What is said of a file that was reloaded in part.
+const WAITS: &str = "the node file has changes that need a restart";
+
+/// Whether a file differs from the one of the start in more than what changes while the process runs.
+fn needs_restart(started: &NodeFile, file: &NodeFile) -> bool {
+    let mut same = started.clone();
+    same.flow.bandwidth = file.flow.bandwidth.clone();
+    same.flow.topics.clone_from(&file.flow.topics);
+    same.flow.access.clone_from(&file.flow.access);
+    same.log.level.clone_from(&file.log.level);
+    same != *file
+}
+
 /// Takes over what may change while the process runs; a faulty file changes nothing and shows on `/readyz`.
-async fn follow(flow: Arc<RunningFlow>, mut reloads: tokio::sync::watch::Receiver<Current<NodeFile>>, log: LogHandle) {
+async fn follow(
+    flow: Arc<RunningFlow>,
+    started: NodeFile,
+    mut reloads: tokio::sync::watch::Receiver<Current<NodeFile>>,
+    log: LogHandle,
+) {
     while reloads.changed().await.is_ok() {
         let current = reloads.borrow_and_update().clone();
         match &current.faults {
@@ -223,9 +243,44 @@ async fn follow(flow: Arc<RunningFlow>, mut reloads: tokio::sync::watch::Receive
                 if let Err(error) = log.set_level(file.log.level.as_str()) {
                     tracing::error!(%error, "log.level");
                 }
-                flow.readiness().set("config", CheckStatus::Ok, "");
+                let waits = needs_restart(&started, file);
+                if waits {
+                    tracing::warn!("{WAITS}");
+                }
+                flow.readiness()
+                    .set("config", CheckStatus::Ok, if waits { WAITS } else { "" });
                 tracing::info!(limit_mbps = file.flow.bandwidth.limit_mbps, "configuration reloaded");
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn file(rest: serde_json::Value) -> NodeFile {
+        let mut tree = json!({
+            "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "a"}, "brokers": {"layer": "memory"}
+        });
+        let serde_json::Value::Object(rest) = rest else {
+            unreachable!("an object")
+        };
+        tree.as_object_mut().unwrap().extend(rest);
+        NodeFile::read(&tree).unwrap().0
+    }
+
+    #[test]
+    fn only_what_changes_while_it_runs_needs_no_restart() {
+        let started = file(json!({}));
+        let live = json!({"flow": {"bandwidth": {"limit_mbps": 7}}, "log": {"level": "debug"}});
+        assert!(!needs_restart(&started, &file(live)));
+        for other in [
+            json!({"admin": {"flow": "127.0.0.1:9999"}}),
+            json!({"flow": {"gateway": true}}),
+        ] {
+            assert!(needs_restart(&started, &file(other.clone())), "{other}");
         }
     }
 }

@@ -80,6 +80,8 @@ word_enum!(
         NameCollision = "name_collision",
         /// Not allowed to advertise or request it.
         AccessDenied = "access_denied",
+        /// The flow holds as many leases as it can.
+        TooManyLeases = "too_many_leases",
         /// The budget leaves it no rate.
         BudgetStarved = "budget_starved",
         /// The budget leaves it less than its rate.

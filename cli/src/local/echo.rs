@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
+use blaze_domain::Reliability;
 use blaze_sdk::{Message, Request, SubscribeOptions};
 use clap::Args;
 use serde_json::{Value, json};
@@ -27,6 +28,9 @@ pub struct EchoOptions {
     /// End after this many messages
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
+    /// Ask for every message: what is lost on the way is sent again
+    #[arg(long)]
+    pub reliable: bool,
     /// Messages per second at most
     #[arg(long, value_name = "HZ")]
     pub max_rate: Option<f64>,
@@ -67,6 +71,11 @@ async fn print_all(service: &LocalService, options: &EchoOptions, format: Format
         .map_err(|error| CliError::Failed(format!("subscribe {topic}: {error}")))?;
     let request = Request {
         max_rate_hz: options.max_rate,
+        reliability: if options.reliable {
+            Reliability::Reliable
+        } else {
+            Reliability::BestEffort
+        },
         ..Request::new(topic.clone())
     };
     let lease = service

@@ -376,7 +376,10 @@ fn leases_that_new_rules_do_not_allow_end() {
     bench.step(300);
     assert_eq!(bench.bridges("cmd/vel"), [""; 0]);
     assert_eq!(bench.core.registry().lease_count(), 1);
+    let refused = |bench: &Bench| bench.core.registry().lapsed(&"cmd/vel".parse().unwrap()).count();
+    assert_eq!(refused(&bench), 1);
     bench.core.set_access(bench.now, 0, AccessRules::default());
+    assert_eq!(refused(&bench), 0, "it is allowed now and only has to ask");
     bench.send(Scope::Layer, &lease("request", "cmd/vel"));
     bench.step(300);
     assert_eq!(bench.bridges("cmd/vel"), ["node>Layer"]);

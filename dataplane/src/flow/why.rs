@@ -178,6 +178,7 @@ fn lease_hints(shared: &Shared, control: &ControlCore, topic: &TopicName) -> Vec
         code: match lapsed.reason {
             LapseReason::Expired => WhyCode::LeaseExpired,
             LapseReason::Denied => WhyCode::AccessDenied,
+            LapseReason::TooMany => WhyCode::TooManyLeases,
         },
     };
     lapsed.map(hint).collect()

@@ -87,7 +87,7 @@ impl LeaseTable {
         if self.get(&entry.0, &entry.1).is_some() || self.ended.contains(&entry) {
             return Taken::Newer;
         }
-        match self.grant(topic, entry.1.clone(), lease, "") {
+        match self.grant(topic, entry.1.clone(), lease, now, "") {
             Ok(_) => {
                 // It is there as it was written.
                 self.unsaved.remove(&entry);

@@ -157,9 +157,11 @@ pub enum LapseReason {
     Expired,
     /// The rules of `flow.access` do not allow it.
     Denied,
+    /// The flow holds as many as it can.
+    TooMany,
 }
 
-/// A lease that was not renewed, or that the rules do not allow.
+/// A lease that was not renewed, or that was refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LapsedLease {
     /// The topic.
@@ -254,7 +256,7 @@ impl LeaseTable {
         }
         let (topic, key, lease) = lease_of(now, scope, me, message, pointer)?;
         let lease_s = lease.ttl_s;
-        let changed = self.grant(topic, key, lease, pointer)?;
+        let changed = self.grant(topic, key, lease, now, pointer)?;
         Ok(Applied { lease_s, changed })
     }
 
@@ -263,6 +265,7 @@ impl LeaseTable {
         topic: &TopicName,
         key: LeaseKey,
         lease: Lease,
+        now: Instant,
         pointer: &str,
     ) -> Result<bool, ControlError> {
         let held = self.topics.get(topic).and_then(|leases| leases.get(&key));
@@ -278,6 +281,12 @@ impl LeaseTable {
                 held.terms != lease.terms
             }
             None if self.count >= self.limit => {
+                self.remember(LapsedLease {
+                    topic: topic.clone(),
+                    key,
+                    at: now,
+                    reason: LapseReason::TooMany,
+                });
                 return Err(ControlError::new(
                     ErrorCode::TooManyLeases,
                     pointer,
@@ -391,6 +400,9 @@ impl LeaseTable {
                 reason: LapseReason::Denied,
             }));
         }
+        // Who is allowed now only has to ask again.
+        self.lapsed
+            .retain(|lease| lease.reason != LapseReason::Denied || !lease.key.may(&rules.of(&lease.topic)));
         for lease in &denied {
             self.remove(&lease.topic, &lease.key);
             self.note_end(&lease.topic, &lease.key);

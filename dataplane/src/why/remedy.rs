@@ -40,7 +40,12 @@ pub(super) fn remedy(code: WhyCode) -> &'static str {
         WhyCode::NameCollision => {
             "Rename one of the two topics, which the step names: the broker has one name for both."
         }
-        WhyCode::AccessDenied => "Let the operator allow this service to use the topic.",
+        WhyCode::AccessDenied => {
+            "Let the operator allow this service to use the topic; a service that was allowed since must ask again, as the SDK does by itself."
+        }
+        WhyCode::TooManyLeases => {
+            "Find the service that makes up names (`blaze topics`) and let it withdraw them; then this one is taken when it asks again."
+        }
         WhyCode::BudgetStarved => {
             "Raise `flow.bandwidth.limit_mbps`, or lower the rate or size of the topics that use it up (`/v1/allocation`)."
         }

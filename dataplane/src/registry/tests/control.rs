@@ -200,6 +200,11 @@ fn leases_are_bounded() {
         refusal(&mut registry, now, Scope::Node, object("d")),
         refused("too_many_leases", "")
     );
+    let lapsed: Vec<LapseReason> = registry
+        .lapsed(&"d".parse().unwrap())
+        .map(|lease| lease.reason)
+        .collect();
+    assert_eq!(lapsed, [LapseReason::TooMany], "people who ask are told");
     assert_eq!(answer(&mut registry, now, Scope::Node, object("a"))["ok"], true);
     let array = json!([object("d"), {"op": "withdraw", "topic": "a", "service": "a"}, object("d")]);
     let outcome = send(&mut registry, now, Scope::Node, &array);
