@@ -3,6 +3,7 @@
 pub mod admin;
 pub mod flow;
 mod guard;
+pub mod ledger;
 pub mod network;
 #[cfg(feature = "kafka")]
 pub mod plain;

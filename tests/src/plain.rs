@@ -15,6 +15,7 @@ use rdkafka::topic_partition_list::{Offset, TopicPartitionList};
 use rdkafka::types::RDKafkaErrorCode;
 use rdkafka::{ClientConfig, ClientContext};
 use redis::{IntoConnectionInfo as _, ProtocolVersion, PushKind};
+use serde_json::Value;
 
 /// A record as a plain consumer sees it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -120,6 +121,28 @@ pub fn connect(url: &str) -> anyhow::Result<redis::Connection> {
 pub fn publish(url: &str, channel: &str, payload: &[u8]) -> anyhow::Result<i64> {
     let mut command = redis::cmd("PUBLISH");
     Ok(command.arg(channel).arg(payload).query(&mut connect(url)?)?)
+}
+
+/// A control message to the flow on a node's Redis.
+///
+/// # Errors
+/// As [`publish`], and when others than the flow alone hear it.
+pub fn tell_redis(url: &str, prefix: &str, message: &Value) -> anyhow::Result<()> {
+    let heard = publish(
+        url,
+        &format!("{prefix}blaze/flow/control"),
+        message.to_string().as_bytes(),
+    )?;
+    anyhow::ensure!(heard == 1, "{heard} heard a control message instead of the flow alone");
+    Ok(())
+}
+
+/// A control message to the flows on a layer's Kafka.
+///
+/// # Errors
+/// As [`KafkaWriter::produce`].
+pub fn tell_kafka(writer: &KafkaWriter, prefix: &str, message: &Value) -> anyhow::Result<()> {
+    writer.produce(&format!("{prefix}blaze.flow.control"), message.to_string().as_bytes())
 }
 
 /// A subscriber of one Redis channel that knows nothing of frames.

@@ -9,14 +9,15 @@ use std::time::{Duration, Instant};
 
 use blaze_proto::Frame;
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
-use blaze_tests::plain::{KafkaReader, KafkaWriter, RedisReader};
+use blaze_tests::ledger::{Fate, Ledger};
+use blaze_tests::plain::{self, KafkaReader, KafkaWriter, RedisReader};
 use blaze_tests::servers::{shared_kafka, shared_redis, unique_name};
 use blaze_tests::wait;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use serde_json::{Value, json};
 
-use crate::support::{SOON, connect, turn};
+use crate::support::{SOON, turn};
 
 /// Bytes of a message and messages per second: 20 to 160 KiB/s, 600 KiB/s in all.
 const STREAMS: [(usize, u32); 8] = [
@@ -34,42 +35,9 @@ const EVEN_WITHIN: Duration = Duration::from_secs(120);
 /// So long nothing moves any more.
 const QUIET: Duration = Duration::from_secs(20);
 
-/// What came of one stream, in the order of its coming.
-#[derive(Default)]
-struct Log {
-    published: u64,
-    numbers: Vec<u64>,
-    identities: BTreeSet<(String, u64)>,
-    /// Messages whose identity had come before.
-    repeats: u64,
-}
-
-impl Log {
-    fn take(&mut self, payload: Vec<u8>) -> Option<()> {
-        let frame = Frame::parse(Bytes::from(payload)).ok()?;
-        let text = String::from_utf8_lossy(frame.payload());
-        let number = text.split(' ').next()?.parse().ok()?;
-        if self.identities.insert((frame.writer().to_string(), frame.sequence())) {
-            self.numbers.push(number);
-        } else {
-            self.repeats += 1;
-        }
-        Some(())
-    }
-}
-
-#[derive(Debug, Default, PartialEq)]
-struct Became {
-    sent: u64,
-    lost: u64,
-    twice: usize,
-    reordered: usize,
-    repeats: u64,
-}
-
 /// A thread that publishes all streams, and one for each that listens.
 struct Streams {
-    logs: Vec<Arc<Mutex<Log>>>,
+    logs: Vec<Arc<Mutex<Ledger>>>,
     publishing: Arc<AtomicBool>,
     listening: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
@@ -77,7 +45,7 @@ struct Streams {
 
 impl Streams {
     fn start(kafka: &str, kafka_prefix: &str, redis: &str, redis_prefix: &str) -> anyhow::Result<Self> {
-        let logs: Vec<Arc<Mutex<Log>>> = STREAMS.iter().map(|_| Arc::default()).collect();
+        let logs: Vec<Arc<Mutex<Ledger>>> = STREAMS.iter().map(|_| Arc::default()).collect();
         let (publishing, listening) = (Arc::new(AtomicBool::new(true)), Arc::new(AtomicBool::new(true)));
         let mut threads = Vec::new();
         for (number, log) in logs.iter().enumerate() {
@@ -85,8 +53,11 @@ impl Streams {
             let (log, listening) = (Arc::clone(log), Arc::clone(&listening));
             threads.push(std::thread::spawn(move || {
                 while listening.load(Ordering::Relaxed) {
-                    if let Ok(Some(payload)) = reader.poll() {
-                        log.lock().take(payload);
+                    if let Ok(Some(payload)) = reader.poll()
+                        && let Ok(frame) = Frame::parse(Bytes::from(payload))
+                    {
+                        let identity = (frame.writer().to_string(), frame.sequence());
+                        log.lock().take(identity, frame.payload(), Instant::now());
                     }
                 }
             }));
@@ -106,12 +77,13 @@ impl Streams {
                 for ((name, log), (bytes, hz)) in names.iter().zip(&sinks).zip(STREAMS) {
                     let due = (begin.elapsed().as_secs_f64() * f64::from(hz)) as u64;
                     let mut log = log.lock();
-                    while log.published < due {
-                        let payload = format!("{} {}", log.published + 1, ".".repeat(bytes));
+                    while log.last_published().unwrap_or(0) < due {
+                        let number = log.last_published().unwrap_or(0) + 1;
+                        let payload = format!("{number} {}", ".".repeat(bytes));
                         if writer.produce_later(name, payload.as_bytes()).is_err() {
                             break;
                         }
-                        log.published += 1;
+                        log.publish(number, Instant::now());
                     }
                 }
                 std::thread::sleep(Duration::from_millis(5));
@@ -127,11 +99,12 @@ impl Streams {
 
     /// Waits until what was published up to now has come on every stream.
     fn wait_fresh(&self) -> anyhow::Result<()> {
-        let wanted: Vec<u64> = self.logs.iter().map(|log| log.lock().published + 1).collect();
+        let wanted: Vec<Option<u64>> = self.logs.iter().map(|log| log.lock().last_published()).collect();
         let behind = || {
-            let of =
-                |(log, wanted): (&Arc<Mutex<Log>>, &u64)| log.lock().numbers.last().is_none_or(|last| last < wanted);
-            self.logs.iter().zip(&wanted).filter(|pair| of(*pair)).count()
+            let pairs = self.logs.iter().zip(&wanted);
+            pairs
+                .filter(|(log, wanted)| log.lock().last_arrived() <= **wanted)
+                .count()
         };
         wait::until(
             "all streams arrive",
@@ -143,36 +116,27 @@ impl Streams {
     }
 
     /// Stops publishing, waits for the last message, and counts from each stream's first on.
-    fn finish(&self) -> anyhow::Result<Became> {
+    fn finish(&self) -> anyhow::Result<Vec<Fate>> {
         self.publishing.store(false, Ordering::Relaxed);
-        let whole = |log: &Arc<Mutex<Log>>| {
-            let log = log.lock();
-            log.numbers.last() == Some(&log.published)
+        let ends = || -> Vec<(Option<u64>, Option<u64>)> {
+            let of = |log: &Arc<Mutex<Ledger>>| {
+                let log = log.lock();
+                (log.last_published(), log.last_arrived())
+            };
+            self.logs.iter().map(of).collect()
         };
         wait::until(
             "the last messages arrive",
             SOON,
-            || self.logs.iter().all(whole),
-            || {
-                let ends = self
-                    .logs
-                    .iter()
-                    .map(|log| (log.lock().published, log.lock().numbers.last().copied()));
-                format!("{:?}", ends.collect::<Vec<_>>())
-            },
+            || ends().iter().all(|(published, arrived)| published == arrived),
+            || format!("{:?}", ends()),
         )?;
-        let mut became = Became::default();
-        for log in &self.logs {
+        let fate = |log: &Arc<Mutex<Ledger>>| {
             let log = log.lock();
-            let first = log.numbers.first().copied().unwrap_or(1);
-            let distinct: BTreeSet<u64> = log.numbers.iter().copied().collect();
-            became.sent += log.published + 1 - first;
-            became.lost += log.published + 1 - first - distinct.len() as u64;
-            became.twice += log.numbers.len() - distinct.len();
-            became.reordered += log.numbers.windows(2).filter(|pair| pair[1] < pair[0]).count();
-            became.repeats += log.repeats;
-        }
-        Ok(became)
+            let first = log.arrived().first().map_or(1, |(number, _)| *number);
+            log.fate(|number, _| number >= first)
+        };
+        Ok(self.logs.iter().map(fate).collect())
     }
 }
 
@@ -239,19 +203,11 @@ fn a_second_flow_gets_its_share_of_the_load() -> anyhow::Result<()> {
     let (mut robot, mut first) = (FlowProcess::launch(robot)?, FlowProcess::launch(cloud("cloud-1"))?);
     robot.wait_ready()?;
     first.wait_ready()?;
-    let lease = |op: &str, number: usize| {
-        json!({"op":op,"topic":topic(number),"service":"test","reliability":"reliable","ttl_s":0}).to_string()
-    };
-    let mut connection = connect(&redis)?;
+    let lease = |op: &str, number: usize| json!({"op":op,"topic":topic(number),"service":"test","reliability":"reliable","ttl_s":0});
     let writer = KafkaWriter::new(&kafka)?;
     for number in 0..STREAMS.len() {
-        let control = format!("{redis_prefix}blaze/flow/control");
-        redis::cmd("PUBLISH")
-            .arg(control)
-            .arg(lease("request", number))
-            .exec(&mut connection)?;
-        let control = format!("{kafka_prefix}blaze.flow.control");
-        writer.produce(&control, lease("advertise", number).as_bytes())?;
+        plain::tell_redis(&redis, &redis_prefix, &lease("request", number))?;
+        plain::tell_kafka(&writer, &kafka_prefix, &lease("advertise", number))?;
     }
     wait::until(
         "one flow carries all",
@@ -316,12 +272,19 @@ fn a_second_flow_gets_its_share_of_the_load() -> anyhow::Result<()> {
         (&json!("cloud/cloud-2"), &json!("load")),
         "{last}"
     );
-    let became = streams.finish()?;
-    println!("{became:?}");
-    let nothing = Became {
-        sent: became.sent,
-        ..Became::default()
-    };
-    assert_eq!(became, nothing, "{}", state());
+    let fates = streams.finish()?;
+    println!("{fates:?}");
+    for fate in fates {
+        let sent = fate.sent;
+        assert_eq!(
+            fate,
+            Fate {
+                sent,
+                ..Fate::default()
+            },
+            "{}",
+            state()
+        );
+    }
     Ok(())
 }

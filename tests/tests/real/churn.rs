@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use blaze_tests::flow::FlowProcess;
 use blaze_tests::long;
-use blaze_tests::plain::KafkaWriter;
+use blaze_tests::plain::{self, KafkaWriter};
 use blaze_tests::process::Usage;
 use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer, shared_kafka};
 use blaze_tests::wait;
@@ -47,10 +47,10 @@ fn requests_that_come_and_go_leave_nothing_behind() -> anyhow::Result<()> {
             "reliability":"reliable","ttl_s":0}),
         )?;
     }
-    let (kafka, control) = (KafkaWriter::new(&system.kafka)?, system.topic("blaze/flow/control"));
+    let kafka = KafkaWriter::new(&system.kafka)?;
     let tell = |op: &str, cycle: usize| {
         let message = json!({"op":op,"topic":topic(cycle),"service":"sink","reliability":"reliable","ttl_s":0});
-        kafka.produce(&control, message.to_string().as_bytes())
+        plain::tell_kafka(&kafka, &system.kafka_prefix, &message)
     };
     let on_both = |what: &str, expected: bool, cycle: usize| {
         let (name, flows) = (topic(cycle), [&system.robot, &system.cloud]);

@@ -5,7 +5,7 @@ use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
-use blaze_tests::plain::KafkaWriter;
+use blaze_tests::plain::{self, KafkaWriter};
 use blaze_tests::process::Signal;
 use blaze_tests::servers::{
     KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis, unique_name,
@@ -13,7 +13,7 @@ use blaze_tests::servers::{
 use blaze_tests::wait;
 use serde_json::{Value, json};
 
-use crate::support::{SOON, connect, turn};
+use crate::support::{SOON, turn};
 use blaze_tests::stream::{Arrival, Stream};
 
 const TOPIC: &str = "imu/data";
@@ -112,15 +112,9 @@ impl Rig {
 fn connect_stream(redis: &str, redis_prefix: &str, topic: &str, kafka: &str, kafka_prefix: &str) -> anyhow::Result<()> {
     let advertise = json!({"op":"advertise","topic":topic,"service":"source","rate_hz":50,"lifespan_ms":LIFESPAN.as_millis() as u64,
         "reliability":"reliable","ttl_s":0});
-    redis::cmd("PUBLISH")
-        .arg(format!("{redis_prefix}blaze/flow/control"))
-        .arg(advertise.to_string())
-        .exec(&mut connect(redis)?)?;
+    plain::tell_redis(redis, redis_prefix, &advertise)?;
     let request = json!({"op":"request","topic":topic,"service":"sink","reliability":"reliable","ttl_s":0});
-    KafkaWriter::new(kafka)?.produce(
-        &format!("{kafka_prefix}blaze.flow.control"),
-        request.to_string().as_bytes(),
-    )
+    plain::tell_kafka(&KafkaWriter::new(kafka)?, kafka_prefix, &request)
 }
 
 fn period() -> Duration {

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use blaze_proto::Frame;
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
+use blaze_tests::plain;
 use blaze_tests::servers::{shared_kafka, shared_redis, unique_name};
 use blaze_tests::wait;
 use bytes::Bytes;
@@ -32,13 +33,9 @@ struct Way {
 impl Way {
     /// Leases on both sides.
     fn new(redis: &str, topic: &str, from: &str, to: &str) -> anyhow::Result<Self> {
-        let mut connection = connect(redis)?;
         for (prefix, op) in [(from, "advertise"), (to, "request")] {
             let lease = json!({"op":op,"topic":topic,"service":"test","reliability":"reliable","ttl_s":0});
-            redis::cmd("PUBLISH")
-                .arg(format!("{prefix}blaze/flow/control"))
-                .arg(lease.to_string())
-                .exec(&mut connection)?;
+            plain::tell_redis(redis, prefix, &lease)?;
         }
         Ok(Self {
             redis: redis.to_owned(),

@@ -10,7 +10,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use blaze_proto::Frame;
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
-use blaze_tests::plain::{KafkaReader, KafkaWriter, RedisReader};
+use blaze_tests::ledger::{Fate, Identity, Ledger};
+use blaze_tests::plain::{self, KafkaReader, KafkaWriter, RedisReader};
 use blaze_tests::servers::{shared_kafka, shared_redis, unique_name};
 use blaze_tests::wait;
 use bytes::Bytes;
@@ -37,38 +38,9 @@ fn killed_gap() -> Duration {
     Duration::from_secs(if blaze_tests::long() { 3 } else { 5 })
 }
 
-/// Writer and sequence.
-type Identity = (String, u64);
-
-/// What came out at one end.
-#[derive(Default)]
-struct Log {
-    /// When each number was published.
-    published: Vec<(u64, Instant)>,
-    /// When each number came for the first time, dropped by identity like the SDK does.
-    arrived: Vec<(u64, Instant)>,
-    identities: BTreeSet<Identity>,
-    /// Messages whose identity had come before.
-    repeats: u64,
-}
-
-impl Log {
-    fn take(&mut self, identity: Identity, payload: &[u8], at: Instant) {
-        let text = String::from_utf8_lossy(payload);
-        let Some(number) = text.split(' ').next().and_then(|word| word.parse().ok()) else {
-            return;
-        };
-        if self.identities.insert(identity) {
-            self.arrived.push((number, at));
-        } else {
-            self.repeats += 1;
-        }
-    }
-}
-
 /// One direction: a thread that publishes and one that listens.
 struct Flow50 {
-    log: Arc<Mutex<Log>>,
+    log: Arc<Mutex<Ledger>>,
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
 }
@@ -78,7 +50,7 @@ impl Flow50 {
         mut publish: impl FnMut(&[u8]) -> bool + Send + 'static,
         mut listen: impl FnMut() -> Option<(Identity, Vec<u8>)> + Send + 'static,
     ) -> Self {
-        let (log, stop) = (Arc::<Mutex<Log>>::default(), Arc::<AtomicBool>::default());
+        let (log, stop) = (Arc::<Mutex<Ledger>>::default(), Arc::<AtomicBool>::default());
         let sink = {
             let (log, stop) = (Arc::clone(&log), Arc::clone(&stop));
             move || {
@@ -100,7 +72,7 @@ impl Flow50 {
                     let payload = format!("{number} {}", ".".repeat(250));
                     let at = Instant::now();
                     if publish(payload.as_bytes()) {
-                        log.lock().published.push((number, at));
+                        log.lock().publish(number, at);
                     }
                     let next = begin + PERIOD * u32::try_from(number).unwrap_or(u32::MAX);
                     std::thread::sleep(next.saturating_duration_since(Instant::now()));
@@ -121,18 +93,13 @@ impl Flow50 {
             SOON,
             || {
                 let log = self.log.lock();
-                let first = log
-                    .published
-                    .iter()
-                    .find(|(_, at)| *at > after)
-                    .map(|(number, _)| *number);
-                let last = log.arrived.last().map(|(number, _)| *number);
-                first.is_some() && last >= first
+                let first = log.published().iter().find(|(_, at)| *at > after);
+                first.is_some_and(|(first, _)| log.last_arrived() >= Some(*first))
             },
             || {
                 format!(
                     "last arrivals {:?}",
-                    self.log.lock().arrived.iter().rev().take(3).collect::<Vec<_>>()
+                    self.log.lock().arrived().iter().rev().take(3).collect::<Vec<_>>()
                 )
             },
         )?;
@@ -140,34 +107,9 @@ impl Flow50 {
     }
 
     /// What happened to the messages that were published between two moments, or were on their way at the first.
-    fn judge(&self, from: Instant, to: Instant) -> Judgement {
+    fn judge(&self, from: Instant, to: Instant) -> (Fate, Duration) {
         let log = self.log.lock();
-        let within = |at: &Instant| *at + ON_THE_WAY >= from && *at < to;
-        let sent: BTreeSet<u64> = log
-            .published
-            .iter()
-            .filter(|(_, at)| within(at))
-            .map(|(n, _)| *n)
-            .collect();
-        let mut times: BTreeMap<u64, u64> = BTreeMap::new();
-        for (number, _) in &log.arrived {
-            *times.entry(*number).or_default() += 1;
-        }
-        let arrivals: Vec<&(u64, Instant)> = log.arrived.iter().filter(|(n, _)| sent.contains(n)).collect();
-        Judgement {
-            sent: sent.len(),
-            lost: sent.iter().filter(|number| !times.contains_key(number)).count(),
-            doubled: times.values().filter(|count| **count > 1).count(),
-            reordered: arrivals.windows(2).filter(|pair| pair[1].0 < pair[0].0).count(),
-            repeats: log.repeats,
-            gap: log
-                .arrived
-                .windows(2)
-                .filter(|pair| pair[1].1 > from && pair[0].1 < to)
-                .map(|pair| pair[1].1.saturating_duration_since(pair[0].1))
-                .max()
-                .unwrap_or(Duration::MAX),
-        }
+        (log.fate(|_, at| at + ON_THE_WAY >= from && at < to), log.gap(from, to))
     }
 }
 
@@ -178,19 +120,6 @@ impl Drop for Flow50 {
             let _ = thread.join();
         }
     }
-}
-
-#[derive(Debug, Clone, Copy)]
-struct Judgement {
-    sent: usize,
-    lost: usize,
-    /// Came twice under different identities.
-    doubled: usize,
-    reordered: usize,
-    /// Repeats that a consumer drops by identity, since the start.
-    repeats: u64,
-    /// The longest time between two arrivals.
-    gap: Duration,
 }
 
 struct System {
@@ -226,19 +155,15 @@ impl System {
             flow.wait_ready()?;
         }
         let topic = |name: &str| format!("{kafka_prefix}{}", name.replace('/', "."));
-        let lease = |op: &str, topic: &str| {
-            json!({"op":op,"topic":topic,"service":"test","reliability":"reliable","ttl_s":0}).to_string()
-        };
+        let lease =
+            |op: &str, topic: &str| json!({"op":op,"topic":topic,"service":"test","reliability":"reliable","ttl_s":0});
         let mut connection = connect(&redis)?;
         for message in [lease("advertise", UP), lease("request", DOWN)] {
-            redis::cmd("PUBLISH")
-                .arg(format!("{redis_prefix}blaze/flow/control"))
-                .arg(message)
-                .exec(&mut connection)?;
+            plain::tell_redis(&redis, &redis_prefix, &message)?;
         }
         let writer = KafkaWriter::new(&kafka)?;
         for message in [lease("request", UP), lease("advertise", DOWN)] {
-            writer.produce(&topic("blaze/flow/control"), message.as_bytes())?;
+            plain::tell_kafka(&writer, &kafka_prefix, &message)?;
         }
         let up = {
             let (reader, channel) = (
@@ -379,7 +304,7 @@ fn answers_come_once(system: &System) -> anyhow::Result<()> {
     for number in 0..MESSAGES {
         let message = json!({"op":"request","topic":"some/thing","service":format!("s{number}"),"id":number.to_string(),
             "reply_to":"blaze/reply/test-0"});
-        writer.produce(&topic("flow.control"), message.to_string().as_bytes())?;
+        plain::tell_kafka(&writer, &system.kafka_prefix, &message)?;
     }
     let mut by: BTreeMap<String, Vec<String>> = BTreeMap::new();
     let until = Instant::now() + SOON;
@@ -418,7 +343,7 @@ fn round(system: &mut System, end: End, victim: Victim) -> anyhow::Result<()> {
         Victim::Receiver => system.receiver()?,
     };
     let node = system.clouds[at].spec.node.clone();
-    let repeats = [&system.up, &system.down].map(|way| way.log.lock().repeats);
+    let repeats = [&system.up, &system.down].map(|way| way.log.lock().repeats());
     let from = Instant::now();
     match end {
         End::Killed => system.clouds[at].kill()?,
@@ -435,23 +360,23 @@ fn round(system: &mut System, end: End, victim: Victim) -> anyhow::Result<()> {
     system.down.wait_fresh(to, "cloud to robot")?;
     let ways = [(UP, &system.up, repeats[0]), (DOWN, &system.down, repeats[1])];
     for (name, way, repeats) in ways {
-        let found = way.judge(from, to);
+        let (found, gap) = way.judge(from, to);
         let again = found.repeats - repeats;
         println!(
             "{end:?} {victim:?} {node}: {name}: sent {} lost {} repeats {again} doubled {} reordered {} gap {:?}",
-            found.sent, found.lost, found.doubled, found.reordered, found.gap
+            found.sent, found.lost, found.twice, found.reordered, gap
         );
         let fault = || format!("{end:?} {victim:?} {name}: {found:?}\n{}", system.tails());
-        anyhow::ensure!(found.doubled == 0, "twice: {}", fault());
+        anyhow::ensure!(found.twice == 0, "twice: {}", fault());
         match end {
             End::Killed => {
-                anyhow::ensure!(found.gap <= killed_gap(), "gap: {}", fault());
+                anyhow::ensure!(gap <= killed_gap(), "gap: {}", fault());
                 // What was sent to the flow that died is gone; what lay on Kafka is not.
                 anyhow::ensure!(name == UP || found.lost == 0, "lost: {}", fault());
             }
             End::Stopped => {
                 anyhow::ensure!(found.lost == 0 && again == 0, "lost or repeated: {}", fault());
-                anyhow::ensure!(found.gap < STOPPED_GAP, "gap: {}", fault());
+                anyhow::ensure!(gap < STOPPED_GAP, "gap: {}", fault());
             }
         }
     }
@@ -466,13 +391,10 @@ fn round(system: &mut System, end: End, victim: Victim) -> anyhow::Result<()> {
     for (name, way) in [(UP, &system.up), (DOWN, &system.down)] {
         let now = Instant::now();
         way.wait_fresh(now, name).with_context(|| system.tails())?;
-        let found = way.judge(back, now);
-        println!(
-            "  back: {name}: sent {} lost {} gap {:?}",
-            found.sent, found.lost, found.gap
-        );
+        let (found, gap) = way.judge(back, now);
+        println!("  back: {name}: sent {} lost {} gap {:?}", found.sent, found.lost, gap);
         let fault = || format!("{node} came back: {name}: {found:?}\n{}", system.tails());
-        anyhow::ensure!(found.lost == 0 && found.doubled == 0, "{}", fault());
+        anyhow::ensure!(found.lost == 0 && found.twice == 0, "{}", fault());
     }
     who_carries_is_told(system)
 }

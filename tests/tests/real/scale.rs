@@ -25,12 +25,7 @@ fn tell(url: &str, prefix: &str, op: &str, topics: std::ops::Range<usize>) -> an
         let messages: Vec<Value> = (first..topics.end.min(first + BATCH))
             .map(|number| json!({"op":op,"topic":format!("scale/t{number}"),"service":"s","rate_hz":1,"max_bytes":100,"ttl_s":0}))
             .collect();
-        let heard = plain::publish(
-            url,
-            &format!("{prefix}blaze/flow/control"),
-            Value::from(messages).to_string().as_bytes(),
-        )?;
-        anyhow::ensure!(heard == 1, "{heard} heard a control message");
+        plain::tell_redis(url, prefix, &Value::from(messages))?;
     }
     Ok(())
 }

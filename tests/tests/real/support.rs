@@ -70,13 +70,11 @@ impl RobotAndCloud {
 
     /// A control message on the robot's Redis.
     pub(crate) fn tell_robot(&self, message: &serde_json::Value) -> anyhow::Result<()> {
-        let heard = self.publish("blaze/flow/control", message.to_string().as_bytes())?;
-        anyhow::ensure!(heard == 1, "{heard} heard a control message instead of the flow alone");
-        Ok(())
+        plain::tell_redis(&self.redis, &self.redis_prefix, message)
     }
 
     /// A control message on the cloud's Kafka.
     pub(crate) fn tell_cloud(&self, message: &serde_json::Value) -> anyhow::Result<()> {
-        KafkaWriter::new(&self.kafka)?.produce(&self.topic("blaze/flow/control"), message.to_string().as_bytes())
+        plain::tell_kafka(&KafkaWriter::new(&self.kafka)?, &self.kafka_prefix, message)
     }
 }

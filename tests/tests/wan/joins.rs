@@ -8,7 +8,7 @@ use blaze_tests::plain::{self, KafkaWriter};
 use blaze_tests::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer};
 use blaze_tests::stream::Stream;
 use blaze_tests::wait;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::support::turn;
 
@@ -29,8 +29,8 @@ fn redis(host: &Host) -> anyhow::Result<RedisServer> {
     RedisServer::start(RedisKind::Redis, options)
 }
 
-fn lease(op: &str) -> String {
-    json!({"op":op,"topic":TOPIC,"service":"test","reliability":"reliable","lifespan_ms":1000,"ttl_s":0}).to_string()
+fn lease(op: &str) -> Value {
+    json!({"op":op,"topic":TOPIC,"service":"test","reliability":"reliable","lifespan_ms":1000,"ttl_s":0})
 }
 
 /// Messages that a node's flow has written to its Redis.
@@ -66,16 +66,12 @@ fn nodes_that_join_at_once_disturb_nobody() -> anyhow::Result<()> {
     let mut cloud = FlowProcess::launch(spec("cloud", cloud_host).on_kafka(&kafka.bootstrap(), ""))?;
     robot.wait_ready()?;
     cloud.wait_ready()?;
-    let tell = |host: &Host, redis: &RedisServer, message: String| {
-        inside(&host.namespace, || {
-            let heard = plain::publish(&redis.url(), "blaze/flow/control", message.as_bytes())?;
-            anyhow::ensure!(heard == 1, "{heard} heard a control message");
-            Ok(())
-        })
+    let tell = |host: &Host, redis: &RedisServer, message: Value| {
+        inside(&host.namespace, || plain::tell_redis(&redis.url(), "", &message))
     };
     tell(robot_host, &robot_redis, lease("advertise"))?;
     inside(&cloud_host.namespace, || {
-        KafkaWriter::new(&kafka.bootstrap())?.produce("blaze.flow.control", lease("request").as_bytes())
+        plain::tell_kafka(&KafkaWriter::new(&kafka.bootstrap())?, "", &lease("request"))
     })?;
     cloud.wait_bridge(TOPIC, SOON)?;
     robot.wait_bridge(TOPIC, SOON)?;
