@@ -1,6 +1,7 @@
 //! The control core as a flow with real brokers drives it.
 
 mod balance;
+mod replicas;
 
 use blaze_domain::LayerKind;
 use blaze_domain::node_file::{AccessRules, AutoBool};
@@ -11,7 +12,7 @@ use super::routes::route_states;
 use super::*;
 use crate::plan::Bridge;
 use crate::registry::{LapseReason, LayerNames};
-use crate::world::LayerScopeId;
+use crate::world::{LayerScopeId, SETTLED_AFTER};
 
 struct Bench {
     core: ControlCore,
