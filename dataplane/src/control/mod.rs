@@ -41,6 +41,7 @@ pub use gateways::Stage;
 pub use output::{ControlConfig, Output};
 use planning::Dirty;
 use replicas::Replicas;
+pub use replicas::read_replica_message;
 pub use scopes::ScopeHealth;
 use scopes::{LOCAL, Scopes};
 

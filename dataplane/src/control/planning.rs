@@ -13,9 +13,6 @@ use crate::plan::{Survey, TopicPlan, plan_within};
 use crate::registry::{MAX_ROUTES, carrying_states};
 use crate::world::OriginFilter;
 
-/// From so many topics at once on it pays to look first who has to do with which.
-const MANY: usize = 16;
-
 /// Sources of one topic that are remembered while nobody can tell whether they are gone.
 const MAX_UNNAMED: usize = 1024;
 
@@ -36,8 +33,8 @@ pub(super) struct Dirty {
 }
 
 impl ControlCore {
+    /// Topics are planned when nothing more has changed for a while.
     pub(super) fn touch(&mut self, now: Instant, topics: BTreeSet<TopicName>) {
-        self.registry.tell_anew(now, &topics);
         for topic in topics {
             self.dirty
                 .entry(topic)
@@ -95,11 +92,7 @@ impl ControlCore {
     /// Plans topics, without any consequence yet: that of one is nothing to the plan of another.
     fn draft(&self, topics: &[TopicName]) -> Vec<Draft> {
         let world = self.registry.world();
-        let survey = if topics.len() < MANY {
-            Survey::new(world)
-        } else {
-            Survey::of_all(world)
-        };
+        let survey = Survey::of(world, topics.len());
         let draft = |topic| {
             let holders = survey.holders(topic);
             Draft {

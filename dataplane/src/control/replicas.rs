@@ -26,6 +26,13 @@ pub(super) const KNOW_OTHERS: Duration = Duration::from_secs(2);
 /// Largest message that is looked at, in bytes: those of flows have at most 1,200, and the names of sender and addressee.
 const MAX_MESSAGE: usize = 4096;
 
+/// What another flow said on the channel of the layer broker; `None` where it cannot be read.
+#[must_use]
+pub fn read_replica_message(payload: &[u8]) -> Option<LinkControl> {
+    let fits = payload.len() <= MAX_MESSAGE;
+    fits.then(|| LinkControl::decode(payload).ok()).flatten()
+}
+
 /// What the core remembers of the channel.
 #[derive(Debug, Default)]
 pub(super) struct Replicas {
@@ -35,6 +42,8 @@ pub(super) struct Replicas {
     began: u64,
     /// Messages that could not be read.
     refused: u64,
+    /// Messages that came faster than they could be read.
+    overrun: u64,
 }
 
 impl Replicas {
@@ -47,24 +56,24 @@ impl Replicas {
 }
 
 impl ControlCore {
-    /// Takes what another flow said on the channel of the layer broker; the server took it at `appended_ms` of its clock.
-    pub fn replica_message(&mut self, now: Instant, payload: &[u8], appended_ms: Option<i64>) {
-        let message = (payload.len() <= MAX_MESSAGE).then(|| LinkControl::decode(payload));
-        let Some(Ok(message)) = message else {
+    /// Takes what another flow said on the channel of the layer broker, as [`read_replica_message`] gives it; the server took it at
+    /// `appended_ms` of its clock. Whether a topic changed by it: nothing else is in a hurry, the next tick is soon enough.
+    pub fn replica_message(&mut self, now: Instant, message: Option<LinkControl>, appended_ms: Option<i64>) -> bool {
+        let Some(message) = message else {
             self.replicas.refused += 1;
-            return;
+            return false;
         };
         let (Some(channel), Some(body)) = (message.channel, message.body) else {
-            return;
+            return false;
         };
         let Ok(from) = channel.from.parse::<FlowId>() else {
             self.replicas.refused += 1;
-            return;
+            return false;
         };
         let me = &self.config.me;
         let for_me = channel.to.is_empty() || channel.to == me.to_string();
         if !for_me || from == *me || from.layer != me.layer {
-            return;
+            return false;
         }
         let changed = match body {
             Body::Hello(hello) => self
@@ -72,8 +81,10 @@ impl ControlCore {
                 .on_layer_hello(now, &from, &hello, channel.began, appended_ms),
             body => self.registry.on_layer_control(now, &from, channel.epoch, body),
         };
+        let any = !changed.is_empty();
         self.touch(now, changed);
         self.hurry(now);
+        any
     }
 
     /// The layer broker is away: that nothing is heard says nothing of who lives.
@@ -85,6 +96,17 @@ impl ControlCore {
     #[must_use]
     pub fn refused_replica_messages(&self) -> u64 {
         self.replicas.refused
+    }
+
+    /// Messages on that channel came faster than they could be read.
+    pub fn count_replica_overrun(&mut self, messages: u64) {
+        self.replicas.overrun += messages;
+    }
+
+    /// Messages on the channel of the layer broker that came faster than they could be read.
+    #[must_use]
+    pub fn replica_overrun(&self) -> u64 {
+        self.replicas.overrun
     }
 
     /// Says on the channel of the layer broker that this flow goes.

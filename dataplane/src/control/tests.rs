@@ -2,6 +2,7 @@
 
 mod balance;
 mod gateways;
+mod replicas;
 
 use blaze_domain::LayerKind;
 use blaze_domain::node_file::{AccessRules, AutoBool};
@@ -12,7 +13,7 @@ use super::routes::route_states;
 use super::*;
 use crate::plan::Bridge;
 use crate::registry::{LapseReason, LayerNames};
-use crate::world::LayerScopeId;
+use crate::world::{LayerScopeId, SETTLED_AFTER};
 
 struct Bench {
     core: ControlCore,

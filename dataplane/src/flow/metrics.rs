@@ -368,6 +368,8 @@ impl Page {
             ("topic_handed_over", handed_over),
             ("topic_taken_over", taken_over),
             ("replica_message_refused", control.refused_replica_messages()),
+            ("replica_message_overrun", control.replica_overrun()),
+            ("topic_not_announced", control.registry().faults().left_out_topics),
         ] {
             self.link.with_label_values(&[event]).inc_by(count as f64);
         }

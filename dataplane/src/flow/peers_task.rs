@@ -2,7 +2,7 @@
 //! layers never use one; on DDS frames of another layer are told apart.
 //!
 //! ```text
-//! control core: Hello, Delta, … ─► blaze/flow/peers ─┬─► Hellos of other layers ─► Claims ─► stand back, or not
+//! control core: Hello, Delta, … ─► blaze/flow/peers ─┬─► Hellos of other layers ─► Claims ─► stand back, or not (Kafka)
 //!                                                    └─► what the own layer says ─► control core
 //! ```
 //!
@@ -18,12 +18,11 @@ use blaze_domain::FlowId;
 use blaze_domain::names::ChannelName;
 use blaze_proto::link::LinkControl;
 use blaze_proto::link::link_control::Body;
-use prost::Message as _;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use super::Shared;
-use crate::control::LISTEN;
+use crate::control::{ControlCore, LISTEN, read_replica_message};
 
 /// How often it is looked at who has gone silent.
 const LOOK: Duration = Duration::from_millis(250);
@@ -34,22 +33,11 @@ const MAX_FLOWS: usize = 1024;
 /// Messages that are taken at once.
 const BATCH: usize = 64;
 
-/// Who else says Hello on the layer broker.
+/// Flows of other layers that say Hello on the layer broker, and should not be there.
 pub(super) struct Claims {
     me: FlowId,
     epoch: u64,
     others: BTreeMap<FlowId, (u64, Instant)>,
-}
-
-/// Whose a Hello is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Heard {
-    /// Of this flow, or no Hello at all.
-    Nobody,
-    /// Of another flow of the own layer, which shares the broker.
-    Replica,
-    /// Of another layer's flow, which should not be there.
-    Stranger,
 }
 
 impl Claims {
@@ -62,37 +50,21 @@ impl Claims {
     }
 
     /// Takes what came on the channel.
-    pub(super) fn hear(&mut self, now: Instant, payload: &[u8]) {
-        let Ok(LinkControl {
-            body: Some(Body::Hello(hello)),
-            channel,
-        }) = LinkControl::decode(payload)
-        else {
+    pub(super) fn hear(&mut self, now: Instant, message: &LinkControl) {
+        let Some(Body::Hello(hello)) = &message.body else {
             return;
         };
         // The life on the link may have begun later than the process.
-        let began = channel.map_or(hello.epoch, |channel| channel.began);
+        let began = message.channel.as_ref().map_or(hello.epoch, |channel| channel.began);
+        if hello.layer == self.me.layer.as_str() {
+            // Replicas share the broker on purpose.
+            return;
+        }
         let Ok(flow) = format!("{}/{}", hello.layer, hello.node).parse::<FlowId>() else {
             return;
         };
-        match self.whose(&flow) {
-            // Replicas share the broker on purpose.
-            Heard::Nobody | Heard::Replica => {}
-            Heard::Stranger => {
-                if self.others.len() < MAX_FLOWS || self.others.contains_key(&flow) {
-                    self.others.insert(flow, (began, now));
-                }
-            }
-        }
-    }
-
-    fn whose(&self, flow: &FlowId) -> Heard {
-        if *flow == self.me {
-            Heard::Nobody
-        } else if flow.layer == self.me.layer {
-            Heard::Replica
-        } else {
-            Heard::Stranger
+        if self.others.len() < MAX_FLOWS || self.others.contains_key(&flow) {
+            self.others.insert(flow, (began, now));
         }
     }
 
@@ -129,7 +101,9 @@ pub(super) struct PeersTask {
 
 impl PeersTask {
     pub(super) async fn run(self) {
-        let mut claims = Claims::new(self.shared.me.clone(), self.began);
+        let claims = || Claims::new(self.shared.me.clone(), self.began);
+        // Elsewhere frames of other layers are told apart, and nobody has to stand back.
+        let mut claims = self.side.as_ref().map(|_| claims());
         let mut subscription: Option<Subscription> = None;
         let mut since = Instant::now();
         let mut standing_back = false;
@@ -154,8 +128,9 @@ impl PeersTask {
                 ended = receive(&mut subscription, &mut batch) => ended,
             };
             let now = Instant::now();
-            self.hear(now, &mut claims, &mut batch);
-            let first = claims.first(now);
+            self.count_overrun(subscription.as_ref().map_or(0, Subscription::take_dropped));
+            self.hear(now, claims.as_mut(), &mut batch);
+            let first = claims.as_mut().and_then(|claims| claims.first(now));
             if let Some(side) = &self.side
                 && first.is_some() != standing_back
             {
@@ -176,29 +151,58 @@ impl PeersTask {
         }
     }
 
-    fn hear(&self, now: Instant, claims: &mut Claims, batch: &mut Vec<Received>) {
+    fn count_overrun(&self, overrun: u64) {
+        if overrun > 0 {
+            tracing::warn!(overrun, "other flows' messages came faster than they could be read");
+            self.shared.control.lock().count_replica_overrun(overrun);
+        }
+    }
+
+    fn hear(&self, now: Instant, mut claims: Option<&mut Claims>, batch: &mut Vec<Received>) {
         let health = self.broker.status().borrow().health;
         let away = !matches!(health, Health::Up | Health::InUse);
-        if away {
+        if let Some(claims) = claims.as_mut().filter(|_| away) {
             claims.excuse(now);
         }
         if batch.is_empty() && !away {
             return;
         }
-        let mut control = self.shared.control.lock();
-        if away {
-            control.excuse_replicas(now);
+        let messages = read(batch);
+        if let Some(claims) = claims {
+            let read = messages.iter().filter_map(|(message, _)| message.as_ref());
+            read.for_each(|message| claims.hear(now, message));
         }
-        for received in batch.drain(..) {
-            if let Content::Bare { payload, .. } = &received.content {
-                claims.hear(now, payload);
-                let appended_ms = received.place.and_then(|place| place.appended_ms);
-                control.replica_message(now, payload, appended_ms);
-            }
+        if take(&mut self.shared.control.lock(), now, away, messages) {
+            self.shared.plane.nudge();
         }
-        drop(control);
-        self.shared.plane.nudge();
     }
+}
+
+/// A message of another flow, if it can be read, and when the server took it, by its own clock.
+type Message = (Option<LinkControl>, Option<i64>);
+
+/// Reads what came, each message once. Others than bare ones are nobody's.
+fn read(batch: &mut Vec<Received>) -> Vec<Message> {
+    let read = |received: Received| match &received.content {
+        Content::Bare { payload, .. } => {
+            let appended_ms = received.place.and_then(|place| place.appended_ms);
+            Some((read_replica_message(payload), appended_ms))
+        }
+        Content::Frame(_) | Content::Malformed { .. } => None,
+    };
+    batch.drain(..).filter_map(read).collect()
+}
+
+/// Tells the control core. Whether it is to work at once: a sign of life alone changes nothing, and comes a thousand times a second.
+fn take(control: &mut ControlCore, now: Instant, away: bool, messages: Vec<Message>) -> bool {
+    if away {
+        control.excuse_replicas(now);
+    }
+    let mut changed = false;
+    for (message, appended_ms) in messages {
+        changed |= control.replica_message(now, message, appended_ms);
+    }
+    changed
 }
 
 /// Waits for Hellos; true when the subscription has ended. Never returns without one.
@@ -215,7 +219,7 @@ mod tests {
 
     use super::*;
 
-    fn hello(flow: &str, epoch: u64) -> Vec<u8> {
+    fn hello(flow: &str, epoch: u64) -> LinkControl {
         let (layer, node) = flow.split_once('/').unwrap();
         let hello = Hello {
             layer: layer.to_owned(),
@@ -223,7 +227,7 @@ mod tests {
             epoch,
             ..Hello::default()
         };
-        LinkControl::from(Body::Hello(hello)).encode_to_vec()
+        LinkControl::from(Body::Hello(hello))
     }
 
     /// Who is first after these Hellos, seen by `cloud/b` with epoch 10.
@@ -275,9 +279,7 @@ mod tests {
     fn garbage_and_crowds_do_no_harm() {
         let now = Instant::now();
         let mut claims = Claims::new("cloud/b".parse().unwrap(), 10);
-        for payload in [&b""[..], b"\xff\xff\xff", b"{}"] {
-            claims.hear(now, payload);
-        }
+        claims.hear(now, &LinkControl::default());
         claims.hear(now, &hello("Fog/A", 1));
         for n in 0..2 * MAX_FLOWS {
             claims.hear(now, &hello(&format!("fog/n{n}"), 20));

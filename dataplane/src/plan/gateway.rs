@@ -80,6 +80,11 @@ pub fn members(world: &World) -> impl Iterator<Item = &FlowId> {
     living(world).filter(carries).map(|(id, _)| id)
 }
 
+/// Whether the own flow speaks for flows that are not on the inter scope.
+pub(crate) fn speaks_for_others(world: &World) -> bool {
+    world.own().is_some_and(|own| own.role.is_gateway()) && members(world).next().is_some()
+}
+
 /// Flows of the own group that live and are not going away.
 fn living(world: &World) -> impl Iterator<Item = (&FlowId, &FlowView)> {
     let own = world.flows.get_key_value(&world.me);

@@ -11,6 +11,9 @@ pub(crate) fn choose<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>
 
 /// The candidates with the largest weights for a key, at most so many, best first.
 pub(crate) fn best<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>, most: usize) -> Vec<&'a FlowId> {
+    if most == 0 {
+        return Vec::new();
+    }
     let mut ranked: Vec<(u64, &FlowId)> = candidates.map(|flow| (weight(key, flow), flow)).collect();
     ranked.sort_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(b.1)));
     ranked.truncate(most);

@@ -6,8 +6,11 @@ use std::sync::Arc;
 
 use blaze_domain::{FlowId, TopicName};
 
-use super::gateway;
-use crate::world::{FlowView, World};
+use super::{Group, gateway};
+use crate::world::{FlowState, FlowView, Reach, Role, TopicEntry, World};
+
+/// From so many topics at once on it pays to look first who has to do with which.
+const MANY: usize = 16;
 
 /// A world, and who in it has to do with which topic.
 pub struct Survey<'w> {
@@ -16,7 +19,16 @@ pub struct Survey<'w> {
     pub(super) gateways: Arc<[&'w FlowId]>,
     /// Flows of the own group that are not.
     pub(super) members: Arc<BTreeSet<&'w FlowId>>,
-    by_topic: Option<HashMap<&'w TopicName, Vec<(&'w FlowId, &'w FlowView)>>>,
+    by_topic: Option<HashMap<&'w TopicName, Vec<Holder<'w>>>>,
+}
+
+/// A flow that has to do with a topic.
+#[derive(Clone, Copy)]
+pub(super) struct Holder<'w> {
+    pub(super) id: &'w FlowId,
+    pub(super) flow: &'w FlowView,
+    /// What it announced of it.
+    pub(super) entry: Option<&'w TopicEntry>,
 }
 
 impl<'w> Survey<'w> {
@@ -31,14 +43,25 @@ impl<'w> Survey<'w> {
         }
     }
 
+    /// For so many topics.
+    #[must_use]
+    pub fn of(world: &'w World, topics: usize) -> Self {
+        if topics < MANY {
+            Self::new(world)
+        } else {
+            Self::of_all(world)
+        }
+    }
+
     /// For many topics.
     #[must_use]
     pub fn of_all(world: &'w World) -> Self {
-        let mut by_topic: HashMap<&TopicName, Vec<(&FlowId, &FlowView)>> = HashMap::new();
+        let mut by_topic: HashMap<&TopicName, Vec<Holder<'_>>> = HashMap::new();
         for (id, flow) in &world.flows {
+            let entries = flow.topics.iter().map(|(topic, entry)| (topic, Some(entry)));
             let only_parts = flow.parts.keys().filter(|topic| !flow.topics.contains_key(*topic));
-            for topic in flow.topics.keys().chain(only_parts) {
-                by_topic.entry(topic).or_default().push((id, flow));
+            for (topic, entry) in entries.chain(only_parts.map(|topic| (topic, None))) {
+                by_topic.entry(topic).or_default().push(Holder { id, flow, entry });
             }
         }
         Self {
@@ -50,14 +73,68 @@ impl<'w> Survey<'w> {
     /// Flows, by name, that announced something of a topic or have a part in it.
     #[must_use]
     pub fn holders(&self, topic: &TopicName) -> Vec<(&'w FlowId, &'w FlowView)> {
+        let holders = self.find(topic).into_iter();
+        holders.map(|holder| (holder.id, holder.flow)).collect()
+    }
+
+    /// The same, with what they announced.
+    pub(super) fn find(&self, topic: &TopicName) -> Vec<Holder<'w>> {
+        let holder = |(id, flow): (&'w FlowId, &'w FlowView)| {
+            let entry = flow.topics.get(topic);
+            let holds = entry.is_some() || flow.parts.contains_key(topic);
+            holds.then_some(Holder { id, flow, entry })
+        };
         match &self.by_topic {
             Some(by_topic) => by_topic.get(topic).cloned().unwrap_or_default(),
-            None => {
-                let holds = |flow: &FlowView| flow.topics.contains_key(topic) || flow.parts.contains_key(topic);
-                self.world.flows.iter().filter(|(_, flow)| holds(flow)).collect()
-            }
+            None => self.world.flows.iter().filter_map(holder).collect(),
         }
     }
+
+    /// Such flows, by name, as announced something of a topic, and what.
+    pub(super) fn entries<'s>(
+        &'s self,
+        topic: &'s TopicName,
+        is_such: impl Fn(&FlowId, &FlowView) -> bool + 's,
+    ) -> impl Iterator<Item = (&'w FlowId, &'w FlowView, &'w TopicEntry)> + 's {
+        let known = self.by_topic.as_ref().map(|by_topic| by_topic.get(topic));
+        // Without an index every flow may be one, and looking into its topics is what takes time.
+        let all = self
+            .world
+            .flows
+            .iter()
+            .filter(move |_| known.is_none())
+            .map(|(id, flow)| {
+                let entry = None;
+                Holder { id, flow, entry }
+            });
+        let holders = known.flatten().into_iter().flatten().copied();
+        let such = all.chain(holders).filter(move |holder| is_such(holder.id, holder.flow));
+        such.filter_map(move |Holder { id, flow, entry }| {
+            let looked_up = || known.is_none().then(|| flow.topics.get(topic)).flatten();
+            Some((id, flow, entry.or_else(looked_up)?))
+        })
+    }
+
+    /// Whether the own flow speaks for flows that are not on the inter scope.
+    pub(crate) fn speaks_for_others(&self) -> bool {
+        !self.members.is_empty() && self.world.own().is_some_and(|own| own.role.is_gateway())
+    }
+
+    /// Whether a flow is one of those, where the own flow speaks for any.
+    pub(super) fn is_behind(&self, id: &FlowId, flow: &FlowView) -> bool {
+        flow.role == Role::Member && carries(flow) && Some(Group::of(id, flow)) == self.group()
+    }
+
+    /// The own group.
+    pub(super) fn group(&self) -> Option<Group<'w>> {
+        let own = self.world.flows.get_key_value(&self.world.me);
+        own.map(|(id, view)| Group::of(id, view))
+    }
+}
+
+/// Whether a flow carries topics.
+pub(super) fn carries(view: &FlowView) -> bool {
+    view.state == FlowState::Ready && view.reach != Reach::Down
 }
 
 #[cfg(test)]
@@ -89,6 +166,10 @@ mod tests {
             };
             assert_eq!(names(&one), names(&all));
             assert_eq!(names(&all).len(), count, "{topic}");
+            let entries = |survey: &Survey<'_>| -> Vec<FlowId> {
+                survey.entries(topic, |_, _| true).map(|(id, ..)| id.clone()).collect()
+            };
+            assert_eq!(entries(&one), entries(&all));
         }
     }
 }

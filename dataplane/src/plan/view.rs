@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use blaze_domain::{FlowId, LayerName, Scope, TopicName, WhyCode};
 
+use super::survey::Holder;
 use super::{Blocked, Destination, Survey, rendezvous};
 use crate::world::{
     Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, Role, TopicEntry, World,
@@ -128,7 +129,7 @@ pub(crate) struct TopicView<'w> {
     /// Flows of the own group that are not.
     members: Arc<BTreeSet<&'w FlowId>>,
     /// Flows that have to do with the topic.
-    holders: Vec<(&'w FlowId, &'w FlowView)>,
+    holders: Vec<Holder<'w>>,
 }
 
 impl<'w> TopicView<'w> {
@@ -152,11 +153,11 @@ impl<'w> TopicView<'w> {
             role: own.role,
             gateways: Arc::clone(&survey.gateways),
             members: Arc::clone(&survey.members),
-            holders: survey.holders(topic),
+            holders: survey.find(topic),
         };
         for at in 0..view.holders.len() {
-            let (id, flow) = view.holders[at];
-            if let Some(entry) = flow.topics.get(topic) {
+            let Holder { id, flow, entry } = view.holders[at];
+            if let Some(entry) = entry {
                 view.add(id, flow, entry);
             }
         }
@@ -251,10 +252,12 @@ impl<'w> TopicView<'w> {
     /// Publishers on nodes of flows that are not on the inter scope, or were not until a moment ago: what they write to the
     /// layer scope is carried out of it.
     pub(crate) fn relayed_publishers(&self) -> impl Iterator<Item = &Publisher<'w>> {
+        // Of a thousand publishers hardly any is of the own group, so that is asked first.
         let relayed = |publisher: &&Publisher<'w>| {
-            let view = self.world.flows.get(publisher.flow);
-            let apart = view.is_some_and(|view| view.role != Role::Gateway);
-            publisher.group == self.group && publisher.scope == Scope::Node && apart
+            let view = || self.world.flows.get(publisher.flow);
+            publisher.scope == Scope::Node
+                && publisher.group == self.group
+                && view().is_some_and(|view| view.role != Role::Gateway)
         };
         self.publishers.iter().filter(relayed)
     }
@@ -345,10 +348,14 @@ impl<'w> TopicView<'w> {
 
     /// Whether this flow may get what a publisher outside sends: its sender says so, or would choose it.
     pub(crate) fn may_receive(&self, publisher: &Publisher<'w>) -> bool {
-        let part = self.part_of(publisher.flow);
-        part.is_some_and(|part| part.receivers.contains(self.me))
-            && self.candidates(publisher, self.group).any(|flow| flow == self.me)
-            || self.receiver(publisher, self.group, &[]) == Some(self.me)
+        if !self.candidates(publisher, self.group).any(|flow| flow == self.me) {
+            return false;
+        }
+        let says_so = || {
+            let part = self.part_of(publisher.flow);
+            part.is_some_and(|part| part.receivers.contains(self.me))
+        };
+        self.receiver(publisher, self.group, &[]) == Some(self.me) || says_so()
     }
 
     fn part_of(&self, flow: &FlowId) -> Option<&'w Part> {
@@ -399,14 +406,14 @@ impl<'w> TopicView<'w> {
 
     /// A flow of a group that is going away, or is no gateway any more, and has not said yet where the next one begins.
     fn leaving_carrier(&self, group: Group<'w>) -> Option<&'w FlowId> {
-        let leaving = |(id, flow): &(&'w FlowId, &'w FlowView)| {
+        let leaving = |Holder { id, flow, .. }: &&Holder<'w>| {
             (flow.state == FlowState::Draining || !flow.role.is_gateway())
                 && flow.reach != Reach::Down
                 && *id != self.me
                 && Group::of(id, flow) == group
         };
-        let mut flows = self.holders.iter().copied().filter(leaving);
-        flows.find(|(id, _)| self.carries_out(id)).map(|(id, _)| id)
+        let mut flows = self.holders.iter().filter(leaving).map(|holder| holder.id);
+        flows.find(|id| self.carries_out(id))
     }
 
     /// The other flow of the own group that carries what is published on the layer scope to other groups, or is to; where

@@ -4,6 +4,9 @@
 //! mark ─(quiet for 10 ms)─► announce: version + 1, digest, Delta to every flow
 //! SnapshotRequest ─► request: parts of one version, which is kept until it is no longer asked for
 //! ```
+//!
+//! Others follow no more than [`MAX_ENTRIES`] topics of a flow, so no more are announced: what does not fit waits until something
+//! goes. What is announced stays, unless something of a higher [`Rank`] needs its place.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
@@ -20,11 +23,11 @@ const DEBOUNCE: Duration = Duration::from_millis(10);
 const MAX_DELTA_PARTS: usize = 8;
 /// Versions that a Delta may reach back, so that one lost Delta is repaired by the next.
 const REACH_BACK: usize = 8;
-/// Most leases of a flow, hence most topics that it announces because of them.
+/// Most leases of a flow, hence most topics that it announces because of its own services.
 pub(super) const MAX_LEASED_ENTRIES: usize = 10_000;
 /// Most topics that it announces only to tell of their routes.
 const MAX_ROUTE_ENTRIES: usize = 2_000;
-/// Most topics that any flow announces.
+/// Most topics that any flow announces; what those leave a gateway has for the topics of others that it speaks for.
 pub(super) const MAX_ENTRIES: usize = MAX_LEASED_ENTRIES + MAX_ROUTE_ENTRIES;
 /// Parts of a snapshot that may be asked for at a time.
 pub(super) const MAX_ASKED_PARTS: usize = 8;
@@ -35,8 +38,38 @@ const SNAPSHOT_FRESH: Duration = Duration::from_millis(500);
 /// Snapshots of different versions kept at a time; the one unused for longest gives way.
 const MAX_SNAPSHOTS: usize = 8;
 
+/// What a topic is announced for. Where there are too many, the first of these have precedence.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Rank {
+    /// Services here lease it.
+    Leased,
+    /// This flow has routes of it.
+    Carried,
+    /// Others do that this flow speaks for.
+    Merged,
+}
+
+impl Rank {
+    const ALL: [Self; 3] = [Self::Leased, Self::Carried, Self::Merged];
+}
+
+/// What is to be told of a topic.
+pub(super) struct Told {
+    pub(super) entry: wire::Entry,
+    pub(super) rank: Rank,
+}
+
+/// How often something was not announced, because there is too much.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct LeftOut {
+    /// Topics beyond [`MAX_ENTRIES`].
+    pub(super) topics: u64,
+    /// Topics beyond those of which only routes are told.
+    pub(super) routes: u64,
+}
+
 struct Announced {
-    entry: wire::Entry,
+    told: Told,
     hash: u64,
 }
 
@@ -58,14 +91,33 @@ pub(super) struct Announcer {
     recent: VecDeque<(u64, BTreeSet<TopicName>)>,
     snapshots: Vec<HeldSnapshot>,
     route_entries: usize,
-    /// Route states that were not announced, because there are too many.
-    pub(super) left_out: u64,
+    /// Announced topics that give way to those of a higher rank; the last first.
+    yielding: BTreeSet<(Rank, TopicName)>,
+    /// Topics that wait for others to go; the first first.
+    waiting: BTreeSet<(Rank, TopicName)>,
+    /// Topics of which there are only routes, that wait for others like them to go.
+    waiting_routes: BTreeSet<TopicName>,
+    left_out: LeftOut,
 }
 
 impl Announcer {
     /// Version and digest of what is announced.
     pub(super) fn announced(&self) -> (u64, u64) {
         (self.version, self.digest)
+    }
+
+    /// How often something was not announced.
+    pub(super) fn left_out(&self) -> LeftOut {
+        self.left_out
+    }
+
+    /// How many topics [`Announcer::announce`] would look at now.
+    pub(super) fn count_due(&self, now: Instant) -> usize {
+        if self.due.is_some_and(|due| due <= now) {
+            self.dirty.len()
+        } else {
+            0
+        }
     }
 
     /// A topic may have changed.
@@ -79,21 +131,25 @@ impl Announcer {
         self.due
     }
 
-    /// Takes the changes into the announced state; the parts of the Delta to send, if any. `current` gives the entry of
+    /// Takes the changes into the announced state; the parts of the Delta to send, if any. `current` gives what is to be told of
     /// a topic, `None` where nothing is left of it.
-    pub(super) fn announce(
-        &mut self,
-        now: Instant,
-        current: impl Fn(&TopicName) -> Option<wire::Entry>,
-    ) -> Vec<wire::Delta> {
+    pub(super) fn announce(&mut self, now: Instant, current: impl Fn(&TopicName) -> Option<Told>) -> Vec<wire::Delta> {
         if self.due.is_none_or(|due| due > now) {
             return Vec::new();
         }
         self.due = None;
         let mut changed = BTreeSet::new();
         for topic in std::mem::take(&mut self.dirty) {
-            if self.take(&topic, current(&topic)) {
-                changed.insert(topic);
+            self.take(&topic, current(&topic), &mut changed);
+        }
+        // One that is looked at again is announced, gone, or waits for what there is no room for: that comes to an end.
+        loop {
+            let next = self.have_room();
+            if next.is_empty() {
+                break;
+            }
+            for topic in next {
+                self.take(&topic, current(&topic), &mut changed);
             }
         }
         if changed.is_empty() {
@@ -107,26 +163,80 @@ impl Announcer {
         self.delta()
     }
 
-    fn take(&mut self, topic: &TopicName, entry: Option<wire::Entry>) -> bool {
-        let old = self.entries.remove(topic);
-        if let Some(old) = &old {
-            self.digest = self.digest.wrapping_sub(old.hash);
-            self.route_entries -= usize::from(only_routes(&old.entry));
+    /// Takes what is told of one topic now; what others are to hear of because of it goes to `changed`.
+    fn take(&mut self, topic: &TopicName, told: Option<Told>, changed: &mut BTreeSet<TopicName>) {
+        let old = self.remove(topic);
+        let waited = self.stop_waiting(topic);
+        let told = told.filter(|told| self.makes_room(topic, told, waited, changed));
+        if old.as_ref().map(|old| &old.entry) != told.as_ref().map(|told| &told.entry) {
+            changed.insert(topic.clone());
         }
-        let fits = |entry: &wire::Entry| self.route_entries < MAX_ROUTE_ENTRIES || !only_routes(entry);
-        let Some(entry) = entry else {
-            return old.is_some();
-        };
-        if !fits(&entry) {
-            self.left_out += 1;
-            return old.is_some();
+        if let Some(told) = told {
+            self.put(topic, told);
         }
-        let changed = old.as_ref().is_none_or(|old| old.entry != entry);
-        let hash = entry_hash(&entry);
+    }
+
+    fn remove(&mut self, topic: &TopicName) -> Option<Told> {
+        let Announced { told, hash } = self.entries.remove(topic)?;
+        self.digest = self.digest.wrapping_sub(hash);
+        self.route_entries -= usize::from(only_routes(&told.entry));
+        self.yielding.remove(&(told.rank, topic.clone()));
+        Some(told)
+    }
+
+    fn put(&mut self, topic: &TopicName, told: Told) {
+        let hash = entry_hash(&told.entry);
         self.digest = self.digest.wrapping_add(hash);
-        self.route_entries += usize::from(only_routes(&entry));
-        self.entries.insert(topic.clone(), Announced { entry, hash });
-        changed
+        self.route_entries += usize::from(only_routes(&told.entry));
+        if told.rank != Rank::Leased {
+            self.yielding.insert((told.rank, topic.clone()));
+        }
+        self.entries.insert(topic.clone(), Announced { told, hash });
+    }
+
+    /// Whether the topic waited.
+    fn stop_waiting(&mut self, topic: &TopicName) -> bool {
+        let mut waited = self.waiting_routes.remove(topic);
+        if !self.waiting.is_empty() {
+            for rank in Rank::ALL {
+                waited |= self.waiting.remove(&(rank, topic.clone()));
+            }
+        }
+        waited
+    }
+
+    /// Whether there is room for a topic, or another one gave way; else it waits, and is counted unless it `waited` before.
+    fn makes_room(&mut self, topic: &TopicName, told: &Told, waited: bool, changed: &mut BTreeSet<TopicName>) -> bool {
+        if only_routes(&told.entry) && self.route_entries >= MAX_ROUTE_ENTRIES {
+            self.waiting_routes.insert(topic.clone());
+            self.left_out.routes += u64::from(!waited);
+            return false;
+        }
+        if self.entries.len() < MAX_ENTRIES {
+            return true;
+        }
+        let lowest = self.yielding.last().filter(|(rank, _)| *rank > told.rank).cloned();
+        if let Some((rank, other)) = lowest {
+            self.remove(&other);
+            self.waiting.insert((rank, other.clone()));
+            self.left_out.topics += 1;
+            changed.insert(other);
+            return true;
+        }
+        self.waiting.insert((told.rank, topic.clone()));
+        self.left_out.topics += u64::from(!waited);
+        false
+    }
+
+    /// Topics that waited for room that there is now.
+    fn have_room(&self) -> Vec<TopicName> {
+        let room = MAX_ENTRIES.saturating_sub(self.entries.len());
+        let routes = MAX_ROUTE_ENTRIES.saturating_sub(self.route_entries).min(room);
+        let waiting = self.waiting.iter().take(room).map(|(_, topic)| topic);
+        waiting
+            .chain(self.waiting_routes.iter().take(routes))
+            .cloned()
+            .collect()
     }
 
     /// The Delta to the newest version, from as far back as costs no further datagram.
@@ -159,7 +269,7 @@ impl Announcer {
 
     fn pieces_of(&self, topic: &TopicName) -> Vec<wire::Entry> {
         match self.entries.get(topic) {
-            Some(announced) => pieces(announced.entry.clone()),
+            Some(announced) => pieces(announced.told.entry.clone()),
             None => vec![removed(topic)],
         }
     }
@@ -218,7 +328,7 @@ impl Announcer {
             parts: pack(
                 self.entries
                     .values()
-                    .flat_map(|announced| pieces(announced.entry.clone())),
+                    .flat_map(|announced| pieces(announced.told.entry.clone())),
             ),
             made: now,
             used: now,

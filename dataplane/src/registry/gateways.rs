@@ -15,10 +15,12 @@ use blaze_domain::node_file::AutoBool;
 use blaze_domain::{FlowId, TopicName};
 use blaze_proto::link::link_control::{Delta, Gateway, Hello};
 
+use super::announce::{Rank, Told};
 use super::pieces::text_hash;
 use super::remote::Remote;
 use super::{Registry, wire};
-use crate::plan::told;
+use crate::plan::gateway::speaks_for_others;
+use crate::plan::{Survey, told};
 use crate::world::{FlowState, Role, TopicEntry};
 
 /// Of so many milliseconds per flow that is known a flow waits a part before it asks …
@@ -30,6 +32,15 @@ const SAID: Duration = Duration::from_millis(100);
 
 /// What a flow wrote to its layer scope before it became a gateway is carried out for it this long.
 pub(crate) const GRACE: Duration = Duration::from_secs(2);
+
+/// How long a flow waits before it asks for what one of so many others has announced on the channel of the layer broker: of many
+/// that miss the same, one asks, and all hear the answer.
+pub(super) fn patience(me: &FlowId, others: usize, with: &FlowId) -> Duration {
+    let others = u64::try_from(others).unwrap_or(u64::MAX);
+    let longest = others.saturating_mul(PATIENCE_MS).min(MAX_PATIENCE_MS);
+    let hash = text_hash(format!("{me}|{with}").as_bytes());
+    Duration::from_millis(hash % (longest + 1))
+}
 
 impl Registry {
     /// What the node file says of this flow as a gateway, and what it is. Returns the topics to plan anew.
@@ -50,7 +61,7 @@ impl Registry {
             .cloned()
             .partition(|flow| self.is_heard_on_layer(flow));
         for flow in gone {
-            changed.extend(self.forget(&flow));
+            changed.extend(self.forget(now, &flow));
         }
         for flow in here {
             if let Some(remote) = self.remotes.get_mut(&flow) {
@@ -67,18 +78,31 @@ impl Registry {
         self.layer_announcer.announced()
     }
 
-    /// What is known of these topics has changed: what a gateway tells of others may have, too.
-    pub fn tell_anew(&mut self, now: Instant, topics: &BTreeSet<TopicName>) {
-        let speaks = told::speaks_for_others(&self.world);
-        if speaks == self.spoke_for_others {
-            if speaks {
-                topics.iter().for_each(|topic| self.mark(now, topic));
-            }
-            return;
+    /// Another flow said something else of these topics: what a gateway tells of them may be different, too.
+    pub(super) fn tell_anew(&mut self, now: Instant, topics: &BTreeSet<TopicName>) {
+        if self.speaks_for_others {
+            topics.iter().for_each(|topic| self.mark(now, topic));
         }
-        self.spoke_for_others = speaks;
-        for topic in self.all_topics() {
-            self.mark(now, &topic);
+    }
+
+    /// Another flow has come, changed, or is about to be forgotten: the same of all that it announced.
+    pub(super) fn tell_of(&mut self, now: Instant, flow: &FlowId) {
+        if self.speaks_for_others
+            && let Some(view) = self.world.flows.get(flow)
+        {
+            let topics = view.topics.keys().cloned().collect();
+            self.tell_anew(now, &topics);
+        }
+    }
+
+    /// Where this flow begins or ends to speak for others, all topics are to be told anew.
+    pub(super) fn see_whom_it_speaks_for(&mut self, now: Instant) {
+        let speaks = speaks_for_others(&self.world);
+        if speaks != self.speaks_for_others {
+            self.speaks_for_others = speaks;
+            for topic in self.all_topics() {
+                self.mark(now, &topic);
+            }
         }
     }
 
@@ -92,24 +116,36 @@ impl Registry {
 
     /// What is due to be told on the inter scope, and on the channel of the layer broker.
     pub(super) fn announce(&mut self, now: Instant) -> (Vec<Delta>, Vec<Delta>) {
-        let (world, routes) = (&self.world, &self.routes);
-        let entry_of = |topic: &TopicName, entry: Option<TopicEntry>| {
-            let routes = routes.get(topic).map(Vec::as_slice);
-            let said = entry.is_some() || routes.is_some();
-            said.then(|| wire::to_wire(topic, &entry.unwrap_or_default(), routes.unwrap_or_default()))
-        };
         self.announcer.tidy(now);
         self.layer_announcer.tidy(now);
+        let topics = self.announcer.count_due(now).max(self.layer_announcer.count_due(now));
+        if topics == 0 {
+            return (Vec::new(), Vec::new());
+        }
+        // Of others it is only asked where this flow speaks for them.
+        let asked = if self.speaks_for_others { topics } else { 0 };
+        let (survey, routes) = (Survey::of(&self.world, asked), &self.routes);
+        let own = |topic: &TopicName| self.world.own().and_then(|own| own.topics.get(topic));
+        let told_of = |topic: &TopicName, entry: Option<TopicEntry>| {
+            let routes = routes.get(topic).map(Vec::as_slice);
+            let rank = match (own(topic), routes, &entry) {
+                (Some(_), ..) => Rank::Leased,
+                (None, Some(_), _) => Rank::Carried,
+                (None, None, Some(_)) => Rank::Merged,
+                (None, None, None) => return None,
+            };
+            let entry = wire::to_wire(topic, &entry.unwrap_or_default(), routes.unwrap_or_default());
+            Some(Told { entry, rank })
+        };
         let deltas = self
             .announcer
-            .announce(now, |topic| entry_of(topic, told::told_outside(world, topic)));
+            .announce(now, |topic| told_of(topic, told::told_outside(&survey, topic)));
         let layer_deltas = self.layer_announcer.announce(now, |topic| {
-            let own = world.own().and_then(|own| own.topics.get(topic));
             let told = TopicEntry {
-                outside: told::told_inside(world, topic),
-                ..own.cloned().unwrap_or_default()
+                outside: told::told_inside(&survey, topic),
+                ..own(topic).cloned().unwrap_or_default()
             };
-            entry_of(topic, Some(told).filter(|told| !told.is_empty()))
+            told_of(topic, Some(told).filter(|told| !told.is_empty()))
         });
         (deltas, layer_deltas)
     }
@@ -132,15 +168,6 @@ impl Registry {
         if let Some(view) = self.world.flows.get_mut(flow).filter(|_| goes_on) {
             view.epoch = view.epoch.max(epoch);
         }
-    }
-
-    /// How long this flow waits before it asks for what another one has announced on the channel of the layer broker: of many
-    /// that miss the same, one asks, and all hear the answer.
-    pub(super) fn patience(&self, with: &FlowId) -> Duration {
-        let others = u64::try_from(self.remotes.len()).unwrap_or(u64::MAX);
-        let longest = others.saturating_mul(PATIENCE_MS).min(MAX_PATIENCE_MS);
-        let hash = text_hash(format!("{}|{with}", self.config.me).as_bytes());
-        Duration::from_millis(hash % (longest + 1))
     }
 
     /// Whether a part of a snapshot is to be said on the channel of the layer broker: not again right after it was.

@@ -86,8 +86,8 @@ pub struct Registry {
     layer_announcer: Announcer,
     /// Parts of snapshots that were said on that channel lately: version and part.
     said_parts: BTreeMap<(u64, u32), Instant>,
-    /// A gateway spoke for flows of its group when it was last looked at.
-    spoke_for_others: bool,
+    /// This flow is a gateway and, when it was last looked at, spoke for flows of its group.
+    speaks_for_others: bool,
     remotes: BTreeMap<FlowId, Remote>,
     world: World,
     outgoing: VecDeque<Outgoing>,
@@ -133,7 +133,7 @@ impl Registry {
             announcer: Announcer::default(),
             layer_announcer: Announcer::default(),
             said_parts: BTreeMap::new(),
-            spoke_for_others: false,
+            speaks_for_others: false,
             remotes: BTreeMap::new(),
             world: World {
                 me: config.me.clone(),
@@ -164,8 +164,10 @@ impl Registry {
     /// What was ignored of other flows' announcements.
     #[must_use]
     pub fn faults(&self) -> SyncFaults {
+        let left_out = [self.announcer.left_out(), self.layer_announcer.left_out()];
         SyncFaults {
-            left_out_routes: self.announcer.left_out.max(self.layer_announcer.left_out),
+            left_out_routes: left_out.iter().map(|left_out| left_out.routes).max().unwrap_or(0),
+            left_out_topics: left_out.iter().map(|left_out| left_out.topics).max().unwrap_or(0),
             ..self.faults
         }
     }
@@ -193,14 +195,15 @@ impl Registry {
     /// Every topic that any flow has an entry for.
     #[must_use]
     pub fn all_topics(&self) -> BTreeSet<TopicName> {
-        let mut topics: BTreeSet<TopicName> = self.routes.keys().cloned().collect();
+        // Most flows have to do with the same ones: each is copied once.
+        let mut topics: BTreeSet<&TopicName> = self.routes.keys().collect();
         for view in self.world.flows.values() {
-            topics.extend(view.topics.keys().cloned());
+            topics.extend(view.topics.keys());
         }
         for remote in self.remotes.values() {
-            topics.extend(remote.topics_with_routes().cloned());
+            topics.extend(remote.topics_with_routes());
         }
-        topics
+        topics.into_iter().cloned().collect()
     }
 
     /// Takes a control payload that was received on a scope.

@@ -7,6 +7,7 @@ use blaze_domain::node_file::AutoBool;
 use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
 use blaze_proto::link::link_control::{Body, Hello, Kind, RouteState, State};
 
+use super::gateways::patience;
 use super::remote::Remote;
 use super::types::RemoteLease;
 use super::{Outgoing, Registry, Way};
@@ -65,9 +66,9 @@ impl Registry {
             Some(_) => {
                 // Its life before this one is over.
                 self.inherit(now, from);
-                changed = self.forget(from);
+                changed = self.forget(now, from);
             }
-            None => changed = self.make_room(),
+            None => changed = self.make_room(now),
         }
         let is_new = !self.remotes.contains_key(from);
         if is_new && self.remotes.len() >= MAX_FLOWS {
@@ -78,10 +79,7 @@ impl Registry {
             Way::Link => (AutoBool::Yes, Role::Gateway),
             Way::Layer => self.said_role(now, from, hello),
         };
-        let patience = match way {
-            Way::Link => Duration::ZERO,
-            Way::Layer => self.patience(from),
-        };
+        let others = self.remotes.len();
         let view = self.world.flows.entry(from.clone()).or_insert_with(|| FlowView {
             kind,
             epoch: hello.epoch,
@@ -105,8 +103,13 @@ impl Registry {
         let same = !is_new && (view.kind, view.state, view.layer_scope, view.gateway, view.role) == said;
         (view.kind, view.state, view.layer_scope, view.gateway, view.role) = said;
         let remote = self.remotes.entry(from.clone()).or_insert_with(Remote::new);
-        remote.on_hello(now, hello.registry_version, hello.registry_digest, patience);
+        let wait = || match way {
+            Way::Link => Duration::ZERO,
+            Way::Layer => patience(&self.config.me, others, from),
+        };
+        remote.on_hello(now, hello.registry_version, hello.registry_digest, wait);
         if !same {
+            self.tell_of(now, from);
             // Which flow receives, reads or answers hangs on all live flows, whatever their own topics are.
             changed.extend(self.all_topics());
         }
@@ -114,7 +117,7 @@ impl Registry {
     }
 
     /// Where there is no room for another flow, one that is down gives way.
-    fn make_room(&mut self) -> BTreeSet<TopicName> {
+    fn make_room(&mut self, now: Instant) -> BTreeSet<TopicName> {
         if self.remotes.len() < MAX_FLOWS {
             return BTreeSet::new();
         }
@@ -122,7 +125,7 @@ impl Registry {
             (view.reach == Reach::Down && *flow != self.config.me).then(|| flow.clone())
         };
         match self.world.flows.iter().find_map(down) {
-            Some(flow) => self.forget(&flow),
+            Some(flow) => self.forget(now, &flow),
             None => BTreeSet::new(),
         }
     }
@@ -171,6 +174,7 @@ impl Registry {
             .values()
             .any(|entry| entry.node.advertise.is_some() || entry.node.request.is_some());
         self.note_parts(now, from, &changed);
+        self.tell_anew(now, &changed);
         changed
     }
 
@@ -190,7 +194,7 @@ impl Registry {
         if ways.is_some_and(|ways| ways.over_layer()) {
             return self.set_reach(now, flow, Reach::Down);
         }
-        self.forget(flow)
+        self.forget(now, flow)
     }
 
     /// The round trip to another flow, which decides when it is asked again.
@@ -201,10 +205,11 @@ impl Registry {
     }
 
     /// Another flow is gone for good. Returns the topics to plan anew.
-    pub fn forget(&mut self, flow: &FlowId) -> BTreeSet<TopicName> {
+    pub fn forget(&mut self, now: Instant, flow: &FlowId) -> BTreeSet<TopicName> {
         if !self.remotes.contains_key(flow) {
             return BTreeSet::new();
         }
+        self.tell_of(now, flow);
         let topics = self.all_topics();
         self.remotes.remove(flow);
         self.world.flows.remove(flow);
@@ -222,6 +227,7 @@ impl Registry {
                 None => layer.push((None, body)),
             }
         }
+        self.see_whom_it_speaks_for(now);
         let (deltas, layer_deltas) = self.announce(now);
         // Those who share the layer broker hear of it there whatever becomes of the link: what is handed over must arrive.
         let over_link = |remote: &Remote| remote.ways.over_link() && !remote.ways.over_layer();

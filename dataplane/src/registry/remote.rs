@@ -134,8 +134,9 @@ impl Remote {
         self.pull_at = None;
     }
 
-    /// The flow told which version it has announced. What is to be pulled is not asked for within `patience`.
-    pub(super) fn on_hello(&mut self, now: Instant, version: u64, digest: u64, patience: Duration) {
+    /// The flow told which version it has announced. What is to be pulled is not asked for within the time that `patience`
+    /// gives, which costs something to reckon.
+    pub(super) fn on_hello(&mut self, now: Instant, version: u64, digest: u64, patience: impl FnOnce() -> Duration) {
         if version < self.version {
             // A late Hello, unless the next ones say so too.
             self.older_hellos += 1;
@@ -153,7 +154,7 @@ impl Remote {
         }
         self.doubt |= version == self.version;
         if self.pull.is_none() && self.pull_at.is_none() {
-            self.plan_pull(now + patience);
+            self.plan_pull(now + patience());
         }
     }
 
@@ -337,15 +338,22 @@ impl Remote {
         } else {
             BTreeSet::new()
         };
-        for entry in join(pieces).into_values() {
+        // What goes makes room for what comes.
+        let (removed, told): (Vec<_>, Vec<_>) = join(pieces).into_values().partition(|entry| entry.removed);
+        for entry in removed {
+            match entry.topic.parse() {
+                Ok(topic) if self.entries.contains_key(&topic) => {
+                    gone.insert(topic);
+                }
+                Ok(_) => {}
+                Err(_) => faults.bad_entries += 1,
+            }
+        }
+        for entry in told {
             let Ok((topic, merged)) = from_wire(&entry) else {
                 faults.bad_entries += 1;
                 continue;
             };
-            if entry.removed {
-                gone.insert(topic);
-                continue;
-            }
             gone.remove(&topic);
             if !self.entries.contains_key(&topic) && self.entries.len() >= MAX_ENTRIES + gone.len() {
                 faults.too_many_entries += 1;

@@ -139,7 +139,7 @@ impl Registry {
             changed.extend(self.update_reach(now, flow));
         }
         for flow in &forgotten {
-            changed.extend(self.forget(flow));
+            changed.extend(self.forget(now, flow));
         }
         changed.extend(self.settle(now));
         changed
@@ -175,6 +175,7 @@ impl Registry {
             Some(view) if view.reach != reach => view.reach = reach,
             _ => return BTreeSet::new(),
         }
+        self.tell_of(now, flow);
         if reach == Reach::Down {
             self.inherit(now, flow);
             if let Some(remote) = self.remotes.get_mut(flow) {

@@ -150,4 +150,6 @@ pub struct SyncFaults {
     pub dropped_replies: u64,
     /// Own route states that were not announced, because there are too many.
     pub left_out_routes: u64,
+    /// Topics that were not announced or no longer, because a flow announces no more than 12,000.
+    pub left_out_topics: u64,
 }

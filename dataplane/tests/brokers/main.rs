@@ -222,6 +222,32 @@ async fn leases_survive_a_restart_of_the_flow() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_other_flows_say_faster_than_it_can_be_read_is_counted() {
+    let (redis, kafka) = (Server::new(BrokerKind::Redis), Server::new(BrokerKind::Kafka));
+    let node = Node::started("fog/fog-1", &redis, &kafka).await;
+    let client = kafka.hub.broker();
+    let publisher = client
+        .publisher(&"blaze/flow/peers".parse().unwrap(), PublisherOptions::default())
+        .unwrap();
+    let counted = |node: &Node| {
+        let metrics = node.get("/metrics").to_string();
+        let (_, rest) = metrics.split_once("event=\\\"replica_message_overrun\\\"} ").unwrap();
+        rest.starts_with(|digit: char| ('1'..='9').contains(&digit))
+    };
+    assert!(!counted(&node));
+    // More than wait at a time, and longer than are looked at.
+    let message = Bytes::from(vec![0; 5_000]);
+    until("the overrun is counted", || {
+        for _ in 0..50_000 {
+            assert_eq!(publisher.publish_bare(&message, None), PublishOutcome::Taken);
+        }
+        counted(&node)
+    })
+    .await;
+    node.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_scope_of_another_flow_is_told_and_not_bridged() {
     let (redis, kafka) = (Server::new(BrokerKind::Redis), Server::new(BrokerKind::Kafka));
     let node = Node::started("fog/fog-1", &redis, &kafka).await;

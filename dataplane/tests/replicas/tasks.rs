@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use blaze_brokers::{Begin, Content, Place, PublisherOptions, Received};
 use blaze_domain::{Scope, TopicName};
-use blaze_flow::control::{Duty, Output};
+use blaze_flow::control::{Duty, Output, read_replica_message};
 use blaze_flow::lane::path::TopicInfo;
 use blaze_flow::lane::writer::NewWriter;
 use blaze_flow::plan::{Target, TopicPlan};
@@ -75,7 +75,8 @@ impl World {
                 && (!self.split || record.by == index)
             {
                 let appended_ms = (record.at - start).as_millis() as i64;
-                flow.control.replica_message(now, payload, Some(appended_ms));
+                let message = read_replica_message(payload);
+                flow.control.replica_message(now, message, Some(appended_ms));
             }
         }
     }

@@ -3,7 +3,6 @@
 use blaze_brokers::Begin;
 use blaze_proto::link::LinkControl;
 use blaze_proto::link::link_control::{Advertise, Channel, Delta, Egress, Entry, Hello, Kind, Request, State};
-use prost::Message as _;
 
 use super::*;
 use crate::lane::load::{Loads, TopicLoad};
@@ -104,9 +103,7 @@ impl Pair {
             body: Some(body),
             channel: Some(channel),
         };
-        self.bench
-            .core
-            .replica_message(self.bench.now, &message.encode_to_vec(), Some(0));
+        self.bench.core.replica_message(self.bench.now, Some(message), Some(0));
     }
 
     fn hello(&mut self) {

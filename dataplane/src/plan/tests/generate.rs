@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use blaze_domain::{FlowId, LayerKind};
 
+use crate::plan::Survey;
 use crate::plan::told::{told_inside, told_outside};
 
 use super::worlds::{advertise, flow, request, topic};
@@ -149,9 +150,9 @@ impl System {
             if !group(id) {
                 view.topics.clear();
                 view.topics
-                    .extend(told_outside(&all(id), &topic()).map(|told| (topic(), told)));
+                    .extend(told_outside(&Survey::new(&all(id)), &topic()).map(|told| (topic(), told)));
             } else if id != me && view.role.is_gateway() && !own.role.is_gateway() {
-                let outside = told_inside(&self.known_to(id), &topic());
+                let outside = told_inside(&Survey::new(&self.known_to(id)), &topic());
                 view.topics.entry(topic()).or_default().outside = outside;
             }
         }

@@ -467,8 +467,8 @@ fn state_and_reach_of_others_replan_everything() {
     assert_eq!(fog.set_reach(now, &me, Reach::Down), all);
     assert!(fog.set_reach(now, &me, Reach::Down).is_empty());
     assert_eq!(fog.set_state(FlowState::Ready), all);
-    assert_eq!(fog.forget(&me), all);
-    assert!(fog.forget(&me).is_empty());
+    assert_eq!(fog.forget(now, &me), all);
+    assert!(fog.forget(now, &me).is_empty());
     assert_eq!(fog.world().flows.len(), 1);
 }
 
