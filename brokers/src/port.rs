@@ -509,7 +509,8 @@ impl Subscription {
         self
     }
 
-    /// Offset of the first message that it can get, by partition; empty where the server has no places.
+    /// Offset of the first message that it can get, by partition; empty where the server has no places. What is kept for late
+    /// joiners may lie before; partitions that the topic gets later are read from their beginning.
     #[must_use]
     pub fn starts(&self) -> &[i64] {
         &self.starts

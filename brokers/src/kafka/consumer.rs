@@ -8,29 +8,30 @@
 //! what lies at or behind the end that it saw when it subscribed. A topic that was made anew has another identity, which
 //! this client learns before it gets a record of it: it is then read from its beginning, for all its readers.
 
+mod positions;
+#[cfg(test)]
+mod tests;
+mod thread;
 mod topic;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use blaze_domain::names::ChannelName;
 use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
 use parking_lot::Mutex;
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
-use rdkafka::error::{KafkaError, RDKafkaErrorCode};
-use rdkafka::message::{BorrowedMessage, Message as _};
 use tokio_util::sync::CancellationToken;
 
 use super::clock::BrokerClock;
 use super::context::{LastError, ReadContext};
 use super::directory::{Marks, TopicInfo};
 use super::identity::Identities;
-use super::receive::receive;
 use super::settings::Settings;
 use crate::port::{Received, SubscriptionSender};
-use topic::{Partition, Reader, TopicState};
+use topic::{Partition, TopicState};
 
 /// How long the thread may sleep: closing waits for that.
 const POLL: Duration = Duration::from_millis(100);
@@ -73,6 +74,9 @@ pub(super) enum Join<'a> {
 #[derive(Default)]
 struct State {
     topics: HashMap<Arc<str>, TopicState>,
+    /// Topics that were made to be read from elsewhere since the thread last looked: what it polled meanwhile may be a record
+    /// of before.
+    moved: HashSet<Arc<str>>,
     /// Number of identity changes that were looked at.
     identities_seen: u64,
     closed: bool,
@@ -101,21 +105,7 @@ impl Consumer {
         supervisor: &Supervisor,
         stop: &CancellationToken,
     ) -> Result<Arc<Self>, String> {
-        let context = ReadContext::new(last_error);
-        let identities = Arc::clone(&context.identities);
-        let client: Client = settings
-            .consumer(large)
-            .create_with_context(context)
-            .map_err(|error| error.to_string())?;
-        let consumer = Arc::new(Self {
-            layer: layer.to_owned(),
-            client: Mutex::new(Some(Arc::new(client))),
-            identities,
-            state: Mutex::default(),
-            clock: Arc::clone(clock),
-            last_error: Arc::clone(last_error),
-            lost_position: AtomicBool::new(false),
-        });
+        let consumer = Arc::new(Self::new(large, layer, settings, clock, last_error)?);
         let name = if large { "kafka-read-l" } else { "kafka-read" };
         let run = {
             let (consumer, stop) = (Arc::clone(&consumer), stop.clone());
@@ -127,95 +117,29 @@ impl Consumer {
         Ok(consumer)
     }
 
-    fn run(&self, stop: &CancellationToken) {
-        while !stop.is_cancelled() {
-            let Some(client) = self.client.lock().clone() else {
-                break;
-            };
-            let next = client.poll(POLL);
-            let mut state = self.state.lock();
-            let reset = self.follow_identities(&mut state, &client);
-            match next {
-                None => {}
-                // It was read at a position of the topic that was before, and comes again.
-                Some(Ok(message)) if reset.iter().any(|topic| &**topic == message.topic()) => {}
-                Some(Ok(message)) => self.deliver(&mut state, &client, &message),
-                Some(Err(error)) => self.note_error(&error),
-            }
-        }
-        self.close();
-        let client = self.client.lock().take();
-        drop(client);
-    }
-
-    fn note_error(&self, error: &KafkaError) {
-        if matches!(
-            error.rdkafka_error_code(),
-            Some(RDKafkaErrorCode::AutoOffsetReset | RDKafkaErrorCode::OffsetOutOfRange)
-        ) {
-            self.lost_position.store(true, Ordering::Release);
-        }
-        self.last_error.note(error.to_string());
-        tracing::debug!(%error, "reading");
-    }
-
-    /// Topics that were made anew are read from their beginning. Returns which.
-    fn follow_identities(&self, state: &mut State, client: &Client) -> Vec<Arc<str>> {
-        let changes = self.identities.changes();
-        if changes == state.identities_seen {
-            return Vec::new();
-        }
-        state.identities_seen = changes;
-        let mut reset = Vec::new();
-        for topic in state.topics.values_mut() {
-            let Some(uuid) = self.identities.of(&topic.source.topic) else {
-                continue;
-            };
-            match &topic.uuid {
-                Some(before) if *before == uuid => {}
-                None => topic.identify(Some(uuid), &self.layer),
-                Some(before) => {
-                    tracing::info!(topic = %topic.source.topic, ?before, now = ?uuid, "the topic was made anew");
-                    topic.made_anew(uuid, &self.layer);
-                    if topic.assigned {
-                        topic.reassign(client);
-                    }
-                    reset.push(Arc::clone(&topic.source.topic));
-                }
-            }
-        }
-        reset
-    }
-
-    fn deliver(&self, state: &mut State, client: &Client, message: &BorrowedMessage<'_>) {
-        let Some(topic) = state.topics.get_mut(message.topic()) else {
-            return;
-        };
-        let Ok(number) = usize::try_from(message.partition()) else {
-            return;
-        };
-        let Some(partition) = topic.partitions.get_mut(number) else {
-            return;
-        };
-        let offset = message.offset();
-        if offset < partition.next {
-            return;
-        }
-        partition.next = offset + 1;
-        let identity = partition.bare_writer.zip(u64::try_from(offset + 1).ok());
-        // A tombstone takes away; there is nothing to deliver.
-        let Some(payload) = message.payload() else { return };
-        let wanted = |reader: &Reader| reader.starts.get(number).is_none_or(|start| offset >= *start);
-        if topic.readers.iter().any(wanted) {
-            let received = receive(&topic.source.channel, message, payload, identity, &self.clock);
-            topic
-                .readers
-                .retain(|reader| !wanted(reader) || reader.sender.send(received.clone()));
-        }
-        if topic.readers.is_empty() {
-            let name = Arc::clone(&topic.source.topic);
-            forget(state, client, &name);
-        }
+    /// Makes the client alone.
+    fn new(
+        large: bool,
+        layer: &str,
+        settings: &Settings,
+        clock: &Arc<Mutex<BrokerClock>>,
+        last_error: &Arc<LastError>,
+    ) -> Result<Self, String> {
+        let context = ReadContext::new(last_error);
+        let identities = Arc::clone(&context.identities);
+        let client: Client = settings
+            .consumer(large)
+            .create_with_context(context)
+            .map_err(|error| error.to_string())?;
+        Ok(Self {
+            layer: layer.to_owned(),
+            client: Mutex::new(Some(Arc::new(client))),
+            identities,
+            state: Mutex::default(),
+            clock: Arc::clone(clock),
+            last_error: Arc::clone(last_error),
+            lost_position: AtomicBool::new(false),
+        })
     }
 
     /// Takes a reader in that begins at the given offsets. `info` is what the server said of the topic just before.
@@ -232,25 +156,31 @@ impl Consumer {
         };
         self.learn(&client, &source.topic);
         let mut state = self.state.lock();
-        if state.closed {
+        let State {
+            topics, moved, closed, ..
+        } = &mut *state;
+        if *closed {
             return Err(Refused::Closed);
         }
-        if let Some(topic) = state.topics.get_mut(&source.topic) {
+        let mut note_move = || moved.insert(Arc::clone(&source.topic));
+        if let Some(topic) = topics.get_mut(&source.topic) {
             if topic.awaited {
                 topic.came(info, &self.layer, &client);
+                note_move();
             } else if let (Some(known), Some(found)) = (&topic.uuid, &info.uuid)
                 && known != found
             {
                 topic.made_anew(found.clone(), &self.layer);
                 topic.grow(info.partitions, &self.layer);
                 topic.reassign(&client);
+                note_move();
             } else if matches!(join, Join::AfterKept(_))
                 && topic.partitions.iter().zip(&starts).any(|(at, start)| at.next > *start)
             {
                 return Err(Refused::Behind(topic.partitions.iter().map(|at| at.next).collect()));
             }
-            if let Join::Rewinding = join {
-                topic.rewind(&starts, &client);
+            if matches!(join, Join::Rewinding) && topic.rewind(&starts, &client) {
+                note_move();
             }
             topic.take_in(sender, starts, join);
             return Ok(());
@@ -275,7 +205,9 @@ impl Consumer {
             .assign(&client)
             .map_err(|error| Refused::Failed(error.to_string()))?;
         topic.take_in(sender, starts, join);
-        state.topics.insert(Arc::clone(&source.topic), topic);
+        // It may have been read until a moment ago.
+        note_move();
+        topics.insert(Arc::clone(&source.topic), topic);
         Ok(())
     }
 
@@ -361,61 +293,6 @@ impl Consumer {
         }
     }
 
-    /// A topic has so many partitions: those that are new are read from their beginning.
-    pub(super) fn note_partitions(&self, topic: &str, partitions: usize) {
-        let Some(client) = self.client.lock().clone() else {
-            return;
-        };
-        let mut state = self.state.lock();
-        let Some(topic) = state.topics.get_mut(topic) else {
-            return;
-        };
-        if topic.assigned && partitions > topic.partitions.len() {
-            topic.grow(partitions, &self.layer);
-            topic.reassign(&client);
-        }
-    }
-
-    /// Looks whether the positions of a topic are on the server, and moves those that are not to what is nearest.
-    pub(super) fn check_positions(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
-        let Some(client) = self.client.lock().clone() else {
-            return;
-        };
-        let mut state = self.state.lock();
-        let Some(topic) = state.topics.get_mut(topic) else {
-            return;
-        };
-        if !topic.assigned || topic.uuid != info.uuid {
-            return;
-        }
-        for (number, (partition, mark)) in topic.partitions.iter_mut().zip(marks).enumerate() {
-            let at = partition.next.clamp(mark.low, mark.high.max(mark.low));
-            if at != partition.next {
-                tracing::warn!(
-                    topic = %topic.source.topic, partition = number, position = partition.next, moved_to = at,
-                    "the server no longer has what was to be read next"
-                );
-                partition.next = at;
-            }
-        }
-        // Also where nothing moved: the client stops reading a partition whose position it could not find for a moment.
-        topic.reassign(&client);
-    }
-
-    /// Looks whether a topic is read although records wait.
-    pub(super) fn watch(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
-        let Some(client) = self.client.lock().clone() else {
-            return;
-        };
-        let mut state = self.state.lock();
-        if let Some(topic) = state.topics.get_mut(topic)
-            && topic.assigned
-            && topic.uuid == info.uuid
-        {
-            topic.watch(marks, Instant::now(), &client);
-        }
-    }
-
     /// Stops reading, but for what stays open.
     pub(super) fn stand_back(&self) {
         let Some(client) = self.client.lock().clone() else {
@@ -437,12 +314,14 @@ impl Consumer {
         if !lets() {
             return;
         }
-        let Some(topic) = state.topics.get_mut(topic) else {
+        let State { topics, moved, .. } = &mut *state;
+        let Some(topic) = topics.get_mut(topic) else {
             return;
         };
         if topic.assigned {
             return;
         }
+        moved.insert(Arc::clone(&topic.source.topic));
         if topic.awaited {
             topic.came(info, &self.layer, &client);
             return;

@@ -282,8 +282,10 @@ impl Inner {
                     .map(|(_, message)| as_kept(message))
                     .collect()
             };
-            match consumer.add(&source, &info, starts, sender.clone(), Join::AfterKept(&mut kept)) {
-                Ok(()) => return Ok(subscription),
+            let join = Join::AfterKept(&mut kept);
+            match consumer.add(&source, &info, starts.clone(), sender.clone(), join) {
+                // What is kept has been before.
+                Ok(()) => return Ok(subscription.starting_at(starts)),
                 Err(Refused::Behind(next)) => ends = next,
                 Err(error) => return Err(refused(&error)),
             }

@@ -255,17 +255,22 @@ fn check_property(key: &str, value: &str) -> Result<(), OpenError> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use blaze_domain::node_file::{LayerBroker, NodeFile};
 
     use super::*;
 
     fn section(properties: &str) -> Section {
+        section_at("127.0.0.1:9092", properties)
+    }
+
+    /// The section of a server at this address.
+    pub(in crate::kafka) fn section_at(bootstrap: &str, properties: &str) -> Section {
         let tree = serde_json::json!({
             "layer": {"name": "fog", "kind": "fog"},
             "node": {"name": "server-1"},
             "brokers": {"layer": {"kafka": {
-                "bootstrap": ["127.0.0.1:9092"],
+                "bootstrap": [bootstrap],
                 "properties": serde_json::from_str::<serde_json::Value>(properties).unwrap(),
             }}},
         });

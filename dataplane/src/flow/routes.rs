@@ -123,6 +123,9 @@ impl Routes {
                     .position(|(from, to, _)| (*from, *to) == (bridge.from, &bridge.to));
                 made.map_or_else(|| Err(String::new()), |at| writers.swap_remove(at).2)
             });
+            if let Duty::Takes(begin) = duty {
+                state.core.takes_over(id, begin);
+            }
             state.deliver_waiting(now, id);
             let stopped_at = state.core.stopped_at(id);
             let path = state.core.path(id);
@@ -134,10 +137,7 @@ impl Routes {
             return None;
         };
         for (scope, wanted, with_kept) in reads {
-            let begin = match duty {
-                Duty::Takes(begin) if scope == Scope::Layer => begin.clone(),
-                _ => Begin::Now,
-            };
+            let anew = matches!(duty, Duty::Takes(begin) if scope == Scope::Layer && *begin != Begin::Now);
             self.read(
                 &Reading {
                     id,
@@ -147,7 +147,7 @@ impl Routes {
                     with_kept,
                 },
                 wanted,
-                begin,
+                anew,
             );
         }
         (*duty == Duty::GivesUp && !stopped_at.is_empty()).then_some(stopped_at)
@@ -211,9 +211,8 @@ impl Routes {
         Ok(NewWriter { publisher, options })
     }
 
-    /// Reads a scope for a topic, or no longer. A `begin` other than now is where bridges out of the layer begin that the topic
-    /// gets now.
-    fn read(&self, reading: &Reading<'_>, wanted: bool, begin: Begin) {
+    /// Reads a scope for a topic, or no longer. `anew`: bridges out of the layer begin elsewhere than where it is read now.
+    fn read(&self, reading: &Reading<'_>, wanted: bool, anew: bool) {
         let &Reading {
             id,
             topic,
@@ -233,12 +232,12 @@ impl Routes {
         }
         let before = match held {
             // Who has begun with what was kept has it.
-            Some(source) if source.large == large && (source.with_kept || !with_kept) && begin == Begin::Now => {
+            Some(source) if source.large == large && (source.with_kept || !with_kept) && !anew => {
                 sources.insert((id, scope), source);
                 return;
             }
             Some(source) => {
-                tracing::info!(%topic, %scope, large, with_kept, ?begin, "the subscription begins anew");
+                tracing::info!(%topic, %scope, large, with_kept, takes_over = anew, "the subscription begins anew");
                 source.task.stop();
                 Some(source.task)
             }
@@ -258,7 +257,6 @@ impl Routes {
                 ..SubscribeOptions::default()
             },
             state: Arc::clone(&state),
-            begin,
             before,
         };
         let name = format!("source {scope} {topic}");
@@ -291,8 +289,6 @@ struct SourceTask {
     scope: Scope,
     options: SubscribeOptions,
     state: Arc<Mutex<SourceState>>,
-    /// Where bridges out of the layer begin.
-    begin: Begin,
     /// The task that it replaces: two at a time would read everything twice.
     before: Option<TaskHandle>,
 }
@@ -304,9 +300,7 @@ impl SourceTask {
             before.finished().await;
         }
         let mut begin = match self.scope {
-            Scope::Layer => self
-                .plane
-                .read(|state| state.core.begin_reading(self.topic, &self.begin, again)),
+            Scope::Layer => self.plane.read(|state| state.core.begin_reading(self.topic, again)),
             Scope::Node | Scope::Inter => Begin::Now,
         };
         let mut reported = false;
@@ -319,7 +313,7 @@ impl SourceTask {
                 Ok(mut subscription) => {
                     // What comes after an outage begins then.
                     begin = Begin::Now;
-                    if !subscription.starts().is_empty() && self.scope == Scope::Layer {
+                    if self.scope == Scope::Layer {
                         self.plane
                             .read(|state| state.core.reads_from(self.topic, subscription.starts()));
                     }

@@ -200,6 +200,9 @@ impl World {
                 options: PublisherOptions::default(),
             })
         });
+        if let Duty::Takes(begin) = duty {
+            flow.plane.core.takes_over(id, begin);
+        }
         flow.plane.deliver_waiting(now, id);
         let stopped_at = flow.plane.core.stopped_at(id);
         for scope in [Scope::Node, Scope::Layer] {
@@ -213,15 +216,16 @@ impl World {
             let log = if scope == Scope::Layer { kafka } else { redis }.lock();
             let records = log.get(&channel(index, scope, topic.as_str()));
             let records = records.map_or(&[][..], Vec::as_slice);
-            let begin = match duty {
-                Duty::Takes(begin) if scope == Scope::Layer => begin.clone(),
-                _ => Begin::Now,
-            };
+            let anew = matches!(duty, Duty::Takes(begin) if scope == Scope::Layer && *begin != Begin::Now);
             let again = flow.reads.contains_key(&key);
-            if again && begin == Begin::Now {
+            if again && !anew {
                 continue;
             }
-            let start = match flow.plane.core.begin_reading(id, &begin, again) {
+            let begin = match scope {
+                Scope::Layer => flow.plane.core.begin_reading(id, again),
+                _ => Begin::Now,
+            };
+            let start = match begin {
                 Begin::Now => records.len(),
                 Begin::At(offsets) => offsets[0] as usize,
                 Begin::Since { appended_ms, latest } => {

@@ -64,7 +64,8 @@ impl TopicState {
     }
 
     /// A reader that comes begins before what is read next: it is read again from there, and not given to those that had it.
-    pub(super) fn rewind(&mut self, starts: &[i64], client: &Client) {
+    /// Returns whether that is so.
+    pub(super) fn rewind(&mut self, starts: &[i64], client: &Client) -> bool {
         let mut moved = false;
         for (number, (partition, start)) in self.partitions.iter_mut().zip(starts).enumerate() {
             if *start >= partition.next {
@@ -82,6 +83,7 @@ impl TopicState {
         if moved && self.assigned {
             self.reassign(client);
         }
+        moved
     }
 
     pub(super) fn identify(&mut self, uuid: Option<TopicUuid>, layer: &str) {

@@ -2,8 +2,10 @@
 
 use blaze_brokers::{Begin, Broker, Place, SubscribeOptions};
 use blaze_domain::names::ChannelName;
+use blaze_tests::servers::unique_name;
 
-use super::{Flow, Reader, frame, publish, publisher, reader, start_server};
+use super::plain::{PlainProducer, make_topic};
+use super::{Flow, Reader, frame, publish, publisher, reader, start_server, subscribe};
 
 async fn from(broker: &dyn Broker, channel: &ChannelName, begin: Begin) -> (Reader, Vec<i64>) {
     let subscription = broker.subscribe_from(channel, SubscribeOptions::default(), begin).await;
@@ -100,4 +102,30 @@ async fn after_the_last_record_a_time_is_the_end() {
     assert_eq!(starts, [1]);
     publish(writer.as_ref(), &frame(&channel, 1, 2));
     expect(&mut later, 2..=2).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn who_gets_what_is_kept_is_told_where_it_goes_on_too() {
+    let server = start_server().await;
+    let flow = Flow::open(&server).await;
+    let name = unique_name("keptplaces");
+    make_topic(&server, &name, 3, &[]).await;
+    let channel: ChannelName = name.parse().unwrap();
+    let plain = PlainProducer::new(&server);
+    plain.write(&name, 0, &["one", "two"]);
+    plain.write(&name, 2, &["one"]);
+    let with_kept = SubscribeOptions {
+        with_kept: true,
+        ..SubscribeOptions::default()
+    };
+    let mut reader = subscribe(&flow.broker, &channel, with_kept).await;
+    assert_eq!(reader.subscription.starts(), [2, 0, 1]);
+    for (partition, offset) in [(2, 1), (1, 0), (0, 2)] {
+        plain.write(&name, partition, &["live"]);
+        let place = reader.next().await.place.unwrap();
+        assert_eq!(
+            (place.partition, place.offset),
+            (usize::try_from(partition).unwrap(), offset)
+        );
+    }
 }

@@ -161,15 +161,14 @@ fn what_was_read_after_the_last_bridge_is_read_again() {
     bench.publish_on_layer(5..8);
     // The node's source ends, too: it has no places.
     bench.core.reads_no_more(bench.topic, Scope::Node);
-    assert_eq!(bench.core.stopped_at(bench.topic), [8]);
+    assert_eq!(bench.core.stopped_at(bench.topic), stopped);
     bench.core.reads_no_more(bench.topic, Scope::Layer);
     assert_eq!(bench.link.submitted.len(), 5);
     bench.apply(vec![bridge(Scope::Layer, to_cloud())], TopicInfo::default());
     let begin = Begin::At(stopped.into());
-    assert_eq!(
-        bench.core.begin_reading(bench.topic, &begin, false),
-        Begin::At([5].into())
-    );
+    bench.core.takes_over(bench.topic, &begin);
+    assert_eq!(bench.core.begin_reading(bench.topic, false), begin);
+    bench.core.reads_from(bench.topic, &[5]);
     bench.publish_on_layer(5..9);
     let sequences: Vec<u64> = bench
         .link
@@ -185,16 +184,16 @@ fn what_was_read_after_the_last_bridge_is_read_again() {
 fn a_topic_that_is_read_on_for_its_node_is_taken_back_without_a_gap_either() {
     let both = vec![bridge(Scope::Layer, to_cloud()), bridge(Scope::Layer, to_node())];
     let mut bench = Bench::new(both.clone());
+    bench.core.reads_from(bench.topic, &[0]);
     bench.publish_on_layer(0..5);
     bench.apply(vec![bridge(Scope::Layer, to_node())], TopicInfo::default());
     let stopped = bench.core.stopped_at(bench.topic);
     bench.publish_on_layer(5..8);
     bench.apply(both, TopicInfo::default());
     let begin = Begin::At(stopped.into());
-    assert_eq!(
-        bench.core.begin_reading(bench.topic, &begin, true),
-        Begin::At([5].into())
-    );
+    bench.core.takes_over(bench.topic, &begin);
+    assert_eq!(bench.core.begin_reading(bench.topic, true), begin);
+    bench.core.reads_from(bench.topic, &[5]);
     bench.publish_on_layer(5..9);
     let sequences = |frames: Vec<Frame>| -> Vec<u64> { frames.iter().map(Frame::sequence).collect() };
     let sent = bench.link.submitted.iter().map(|(_, _, frame)| frame.clone()).collect();

@@ -1,0 +1,161 @@
+//! Against the server that the client library simulates. The test polls in place of the thread, so that it decides what happens
+//! between polling and handing out.
+
+use std::future::Future as _;
+use std::pin::pin;
+use std::task::{Context, Waker};
+use std::time::Instant;
+
+use blaze_domain::TopicName;
+use rdkafka::ClientConfig;
+use rdkafka::message::{BorrowedMessage, Message as _};
+use rdkafka::mocking::MockCluster;
+use rdkafka::producer::{BaseProducer, BaseRecord, DefaultProducerContext, Producer as _};
+
+use super::*;
+use crate::kafka::settings::tests::section_at;
+use crate::port::{SubscribeOptions, Subscription, subscription};
+
+const TOPIC: &str = "fog.imu.data";
+const INFO: TopicInfo = TopicInfo {
+    uuid: None,
+    partitions: 1,
+};
+
+struct Bench {
+    consumer: Consumer,
+    client: Arc<Client>,
+    source: Source,
+    /// The server lives as long.
+    _server: MockCluster<'static, DefaultProducerContext>,
+}
+
+/// A reader, and the offsets that it got.
+struct Offsets {
+    subscription: Subscription,
+    got: Vec<i64>,
+}
+
+impl Offsets {
+    fn take(&mut self) -> &[i64] {
+        let mut batch = Vec::new();
+        let mut context = Context::from_waker(Waker::noop());
+        // Not ready = nothing in the batch.
+        let _ = pin!(self.subscription.receive(&mut batch, 100)).poll(&mut context);
+        let places = batch.iter().filter_map(|received| received.place);
+        self.got.extend(places.map(|place| place.offset));
+        &self.got
+    }
+}
+
+impl Bench {
+    /// A topic of one partition with so many records.
+    fn new(records: usize) -> Self {
+        let server = MockCluster::new(1).unwrap();
+        server.create_topic(TOPIC, 1, 1).unwrap();
+        let bootstrap = server.bootstrap_servers();
+        let producer: BaseProducer = ClientConfig::new()
+            .set("bootstrap.servers", &bootstrap)
+            .create()
+            .unwrap();
+        for _ in 0..records {
+            let record = BaseRecord::<(), str>::to(TOPIC).partition(0).payload("bare");
+            producer.send(record).map_err(|(error, _)| error).unwrap();
+        }
+        producer.flush(Duration::from_secs(10)).unwrap();
+        let settings = Settings::new(&section_at(&bootstrap, "{}")).unwrap();
+        let clock = Arc::new(Mutex::new(BrokerClock::new(Instant::now())));
+        let consumer = Consumer::new(false, "fog", &settings, &clock, &Arc::default()).unwrap();
+        let client = consumer.client.lock().clone().unwrap();
+        let channel = ChannelName::from(&"imu/data".parse::<TopicName>().unwrap());
+        Self {
+            consumer,
+            client,
+            source: Source {
+                channel,
+                topic: TOPIC.into(),
+                stays_open: false,
+            },
+            _server: server,
+        }
+    }
+
+    fn add(&self, start: i64, join: Join<'_>) -> Offsets {
+        let (sender, subscription) = subscription(SubscribeOptions::default());
+        self.consumer
+            .add(&self.source, &INFO, vec![start], sender, join)
+            .unwrap();
+        Offsets {
+            subscription,
+            got: Vec::new(),
+        }
+    }
+
+    /// Polls a record without handing it out.
+    fn poll(&self) -> BorrowedMessage<'_> {
+        let until = Instant::now() + Duration::from_secs(20);
+        while Instant::now() < until {
+            match self.client.poll(POLL) {
+                Some(Ok(message)) => return message,
+                other => self.consumer.hand_out(&self.client, other),
+            }
+        }
+        panic!("nothing came");
+    }
+
+    /// Hands records out until a reader has got the one at `last`.
+    fn hand_out_until(&self, reader: &mut Offsets, last: i64) {
+        while reader.take().last() != Some(&last) {
+            let message = self.poll();
+            self.consumer.hand_out(&self.client, Some(Ok(message)));
+        }
+    }
+}
+
+#[test]
+fn a_record_that_waited_while_a_reader_came_does_not_hide_what_is_read_again() {
+    let bench = Bench::new(6);
+    let mut first = bench.add(0, Join::Following);
+    bench.hand_out_until(&mut first, 2);
+    let waiting = bench.poll();
+    assert_eq!(waiting.offset(), 3);
+    let mut second = bench.add(0, Join::Rewinding);
+    bench.consumer.hand_out(&bench.client, Some(Ok(waiting)));
+    bench.hand_out_until(&mut second, 5);
+    assert_eq!(second.take(), [0, 1, 2, 3, 4, 5]);
+    assert_eq!(first.take(), [0, 1, 2, 3, 4, 5]);
+}
+
+#[test]
+fn a_record_that_was_polled_after_a_reader_came_is_not_lost() {
+    let bench = Bench::new(6);
+    let mut first = bench.add(0, Join::Following);
+    bench.hand_out_until(&mut first, 3);
+    let mut second = bench.add(1, Join::Rewinding);
+    let fresh = bench.poll();
+    assert_eq!(fresh.offset(), 1, "the client reads from there already");
+    bench.consumer.hand_out(&bench.client, Some(Ok(fresh)));
+    bench.hand_out_until(&mut second, 5);
+    assert_eq!(second.take(), [1, 2, 3, 4, 5]);
+    assert_eq!(first.take(), [0, 1, 2, 3, 4, 5]);
+}
+
+#[test]
+fn readers_that_come_while_records_flow_get_each_once_and_in_order() {
+    let bench = Bench::new(40);
+    let mut readers = vec![bench.add(0, Join::Following)];
+    for at in [7, 19, 31] {
+        bench.hand_out_until(&mut readers[0], at);
+        let waiting = bench.poll();
+        readers.push(bench.add(at / 2, Join::Rewinding));
+        bench.consumer.hand_out(&bench.client, Some(Ok(waiting)));
+    }
+    for (reader, start) in readers.iter_mut().zip([0, 3, 9, 15]) {
+        bench.hand_out_until(reader, 39);
+        assert!(
+            reader.take().iter().copied().eq(start..40),
+            "from {start}: {:?}",
+            reader.got
+        );
+    }
+}
