@@ -153,6 +153,7 @@ fn rows() -> Vec<Row> {
         "a name that the broker cannot express": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::NameNotExpressible) => NotFlowing NameNotExpressible Advertise;
         "two names that are one on the broker": &["e/a node+"], |s| s.hint(StepKind::Request, WhyCode::NameCollision) => NotFlowing NameCollision Request;
         "not allowed": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::AccessDenied) => NotFlowing AccessDenied Advertise;
+        "no room for another lease": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::TooManyLeases) => NotFlowing TooManyLeases Advertise;
         "no such origin": PAIR, |s| { ask(&mut s.world, "c/b", "node").from = vec![filter("x/*/*")]; s.replan(); } => NotFlowing NoMatchingOrigin Plan;
         "other types": PAIR, |s| {
             offer(&mut s.world, "e/a", "node").type_name = "a/A".to_owned();
