@@ -13,6 +13,9 @@ use super::{GuidPrefix, Participant};
 /// The good-bye of nobody: read once, then passed over.
 const NOBODY: GuidPrefix = GuidPrefix(*b"blaze-nobody");
 
+/// RustDDS takes several that come at once as one or as several.
+const AT_ONCE: usize = 8;
+
 /// Nudges one participant of this process.
 pub(super) struct Nudge {
     socket: UdpSocket,
@@ -32,9 +35,11 @@ impl Nudge {
         })
     }
 
-    /// Lets RustDDS read on to the next announcement that it cannot decode.
+    /// Lets RustDDS read on to the next announcement that it cannot decode, or some further.
     pub(super) fn give(&self) {
-        // One that is lost is followed by the next.
-        let _ = self.socket.send_to(&self.datagram, self.to);
+        for _ in 0..AT_ONCE {
+            // One that is lost is followed by the next.
+            let _ = self.socket.send_to(&self.datagram, self.to);
+        }
     }
 }
