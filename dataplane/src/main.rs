@@ -262,7 +262,7 @@ mod tests {
 
     fn file(rest: serde_json::Value) -> NodeFile {
         let mut tree = json!({
-            "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "a"}, "brokers": {"layer": "memory"}
+            "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "a"}, "brokers": {"layer": {"memory": {}}}
         });
         let serde_json::Value::Object(rest) = rest else {
             unreachable!("an object")
