@@ -32,7 +32,7 @@ const PARTICIPANT_GUID: [u8; 4] = [0x50, 0x00, 0x10, 0x00];
 const FIRST_NUMBER: u32 = 0x4000_0000;
 
 /// Says good-bye for others to one participant of this host.
-pub(in crate::dds) struct Farewell {
+pub(super) struct Farewell {
     socket: UdpSocket,
     /// Where the own participant takes announcements.
     to: SocketAddrV4,
@@ -40,7 +40,7 @@ pub(in crate::dds) struct Farewell {
 }
 
 impl Farewell {
-    pub(in crate::dds) fn new(address: Ipv4Addr, port: u16) -> io::Result<Self> {
+    pub(super) fn new(address: Ipv4Addr, port: u16) -> io::Result<Self> {
         Ok(Self {
             socket: UdpSocket::bind((address, 0))?,
             to: SocketAddrV4::new(address, port),
@@ -48,7 +48,7 @@ impl Farewell {
         })
     }
 
-    pub(in crate::dds) fn say(&mut self, whose: GuidPrefix) -> io::Result<()> {
+    pub(super) fn say(&mut self, whose: GuidPrefix) -> io::Result<()> {
         // A number that was seen is passed over.
         self.number = self.number.wrapping_add(1);
         self.socket.send_to(&datagram(whose, self.number), self.to).map(|_| ())
