@@ -84,6 +84,7 @@ struct State {
 
 /// One client that reads.
 pub(super) struct Consumer {
+    large: bool,
     layer: String,
     client: Mutex<Option<Arc<Client>>>,
     identities: Arc<Identities>,
@@ -125,21 +126,58 @@ impl Consumer {
         clock: &Arc<Mutex<BrokerClock>>,
         last_error: &Arc<LastError>,
     ) -> Result<Self, String> {
-        let context = ReadContext::new(last_error);
-        let identities = Arc::clone(&context.identities);
-        let client: Client = settings
-            .consumer(large)
-            .create_with_context(context)
-            .map_err(|error| error.to_string())?;
+        let identities = Arc::default();
+        let client = Self::connect(large, settings, &identities, last_error)?;
         Ok(Self {
+            large,
             layer: layer.to_owned(),
-            client: Mutex::new(Some(Arc::new(client))),
+            client: Mutex::new(Some(client)),
             identities,
             state: Mutex::default(),
             clock: Arc::clone(clock),
             last_error: Arc::clone(last_error),
             lost_position: AtomicBool::new(false),
         })
+    }
+
+    fn connect(
+        large: bool,
+        settings: &Settings,
+        identities: &Arc<Identities>,
+        last_error: &Arc<LastError>,
+    ) -> Result<Arc<Client>, String> {
+        let context = ReadContext::new(identities, last_error);
+        let made = settings.consumer(large).create_with_context(context);
+        made.map(Arc::new).map_err(|error| error.to_string())
+    }
+
+    /// Whether the client gets an answer of the server. Waits for it.
+    pub(super) fn is_answered(&self, topic: &str, timeout: Duration) -> bool {
+        let client = self.client.lock().clone();
+        client.is_none_or(|client| client.fetch_metadata(Some(topic), timeout).is_ok())
+    }
+
+    /// Begins anew with a client that knows nothing; it reads on where the old one stood. Blocks while that one ends.
+    pub(super) fn remake(&self, settings: &Settings) -> Result<(), String> {
+        let made = Self::connect(self.large, settings, &self.identities, &self.last_error)?;
+        let mut state = self.state.lock();
+        let State { topics, moved, .. } = &mut *state;
+        let old = {
+            let mut client = self.client.lock();
+            // Who was closed stays closed.
+            let Some(client) = client.as_mut() else { return Ok(()) };
+            std::mem::replace(client, Arc::clone(&made))
+        };
+        for (name, topic) in topics.iter_mut().filter(|(_, topic)| topic.assigned) {
+            if let Err(error) = topic.assign(&made) {
+                // It is asked for again when it is seen to stand still.
+                tracing::warn!(topic = %name, %error, "the topic cannot be read");
+            }
+            moved.insert(Arc::clone(name));
+        }
+        drop(state);
+        drop(old);
+        Ok(())
     }
 
     /// Takes a reader in that begins at the given offsets. `info` is what the server said of the topic just before.

@@ -47,9 +47,9 @@ pub(super) struct ReadContext {
 }
 
 impl ReadContext {
-    pub(super) fn new(last_error: &Arc<LastError>) -> Self {
+    pub(super) fn new(identities: &Arc<Identities>, last_error: &Arc<LastError>) -> Self {
         Self {
-            identities: Arc::default(),
+            identities: Arc::clone(identities),
             last_error: Arc::clone(last_error),
         }
     }

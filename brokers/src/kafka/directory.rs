@@ -78,14 +78,33 @@ pub(super) struct Directory {
 
 impl Directory {
     pub(super) fn new(settings: &Settings, last_error: &Arc<LastError>) -> Result<Self, KafkaError> {
-        let context = ReadContext::new(last_error);
-        let identities = Arc::clone(&context.identities);
-        let client = settings.questions().create_with_context(context)?;
+        let identities = Arc::default();
+        let client = Self::connect(settings, &identities, last_error)?;
         Ok(Self {
-            client: Mutex::new(Some(Arc::new(client))),
+            client: Mutex::new(Some(client)),
             identities,
             turn: Mutex::default(),
         })
+    }
+
+    fn connect(
+        settings: &Settings,
+        identities: &Arc<Identities>,
+        last_error: &Arc<LastError>,
+    ) -> Result<Arc<Client>, KafkaError> {
+        let context = ReadContext::new(identities, last_error);
+        settings.questions().create_with_context(context).map(Arc::new)
+    }
+
+    /// Begins anew with a client that knows nothing. Blocks while the old one ends.
+    pub(super) fn remake(&self, settings: &Settings, last_error: &Arc<LastError>) -> Result<(), KafkaError> {
+        let made = Self::connect(settings, &self.identities, last_error)?;
+        let mut client = self.client.lock();
+        // Who was closed stays closed.
+        let old = client.as_mut().map(|client| std::mem::replace(client, made));
+        drop(client);
+        drop(old);
+        Ok(())
     }
 
     fn client(&self) -> Result<Arc<Client>, LookupError> {

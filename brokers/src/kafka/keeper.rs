@@ -9,6 +9,7 @@ use super::consumer::Consumer;
 use super::directory::Listing;
 use super::flow_side::Made;
 use super::inner::Inner;
+use super::settings::Lot;
 use super::topics::Topic;
 
 /// How long the server has for an answer.
@@ -22,11 +23,54 @@ const MAX_ASKED: usize = 512;
 /// Topics that a service asks for one by one in a round.
 const PER_ROUND: usize = 8;
 
+/// How often the clients that read and write are asked whether they get answers.
+const LOOK: Duration = Duration::from_secs(5);
+/// How long such an answer may take: somebody else got one just before.
+const QUICK: Duration = Duration::from_millis(300);
+/// A client that gets no answer for this long while the server gives some is made anew. The client library takes brokers that an answer
+/// does not name off its list; of a server that named none, because it had lost itself for a moment, it then never hears again.
+const FORSAKEN: Duration = Duration::from_secs(3);
+
+/// Since when a client gets no answer.
+#[derive(Default)]
+struct Silence(Option<Instant>);
+
+impl Silence {
+    /// Takes whether there was an answer. Tells whether the client is to be made anew.
+    fn note(&mut self, now: Instant, answered: bool) -> bool {
+        if answered {
+            self.0 = None;
+            return false;
+        }
+        let since = *self.0.get_or_insert(now);
+        let forsaken = now.saturating_duration_since(since) >= FORSAKEN;
+        if forsaken {
+            self.0 = Some(now);
+        }
+        forsaken
+    }
+
+    fn is_there(&self) -> bool {
+        self.0.is_some()
+    }
+}
+
+/// What of the clients is known.
+#[derive(Default)]
+struct Watch {
+    directory: Silence,
+    admin: Silence,
+    consumers: HashMap<bool, Silence>,
+    producers: HashMap<Lot, Silence>,
+    looked: Option<Instant>,
+}
+
 /// Runs until the broker is closed.
 pub(super) fn run(inner: &Inner) {
     let mut turn = 0_usize;
+    let mut watch = Watch::default();
     while !inner.stop.is_cancelled() {
-        let calm = round(inner, turn);
+        let calm = round(inner, turn, &mut watch);
         turn = turn.wrapping_add(1);
         if !inner.stop.is_cancelled() {
             inner.bell.wait(if calm { CALM } else { BUSY });
@@ -36,12 +80,55 @@ pub(super) fn run(inner: &Inner) {
     inner.close_admin();
 }
 
+impl Watch {
+    /// Looks whether the clients that read and write get answers, which the server has just given.
+    fn look(&mut self, inner: &Inner) {
+        let silent = self
+            .consumers
+            .values()
+            .chain(self.producers.values())
+            .any(Silence::is_there);
+        let is_due = |at: Instant| at.elapsed() >= LOOK;
+        if !silent && !self.looked.is_none_or(is_due) {
+            return;
+        }
+        self.looked = Some(Instant::now());
+        let (consumers, producers) = {
+            let clients = inner.clients.lock();
+            (clients.consumers.clone(), clients.producers.clone())
+        };
+        for (large, consumer) in consumers {
+            let answered = consumer.is_answered(&inner.probe, QUICK);
+            if self.consumers.entry(large).or_default().note(Instant::now(), answered) {
+                tracing::warn!("the Kafka consumer is made anew: it gets no answer");
+                if let Err(error) = consumer.remake(&inner.settings) {
+                    inner.last_error.note(error);
+                }
+            }
+        }
+        for (lot, producer) in producers {
+            let answered = producer.is_answered(&inner.probe, QUICK);
+            if self.producers.entry(lot).or_default().note(Instant::now(), answered) {
+                producer.remake();
+            }
+        }
+    }
+}
+
 /// Asks once and acts on the answer. Returns whether nothing is missing.
-fn round(inner: &Inner, turn: usize) -> bool {
+fn round(inner: &Inner, turn: usize, watch: &mut Watch) -> bool {
     // A flow needs to know all topics, to make those that are missing; a service only whether someone answers.
     let one = inner.flow.is_none().then_some(&*inner.probe);
-    let listing = match inner.directory.list(one, ANSWER) {
-        Ok(listing) if listing.brokers > 0 => listing,
+    let listed = inner.directory.list(one, ANSWER);
+    let answered = listed.as_ref().is_ok_and(|listing| listing.brokers > 0);
+    if watch.directory.note(Instant::now(), answered) {
+        tracing::debug!("the client that asks is made anew");
+        if let Err(error) = inner.directory.remake(&inner.settings, &inner.last_error) {
+            inner.last_error.note(error.to_string());
+        }
+    }
+    let listing = match listed {
+        Ok(listing) if answered => listing,
         Ok(_) => return lost(inner, "no broker of the cluster is there"),
         Err(error) => return lost(inner, &error.to_string()),
     };
@@ -49,7 +136,11 @@ fn round(inner: &Inner, turn: usize) -> bool {
         return lost(inner, &reason);
     }
     if let Some(flow) = &inner.flow {
-        match flow.keep_topics(inner, &listing) {
+        let kept = flow.keep_topics(inner, &listing);
+        if watch.admin.note(Instant::now(), kept.is_ok()) {
+            inner.close_admin();
+        }
+        match kept {
             Err(reason) => return lost(inner, &reason),
             Ok(Made::Needed) => return false,
             // They are there when the server lists them: the next round comes at once.
@@ -65,6 +156,7 @@ fn round(inner: &Inner, turn: usize) -> bool {
         }
     }
     found(inner, listing.brokers);
+    watch.look(inner);
     for consumer in inner.consumers() {
         keep_reading(inner, &consumer, &listing, turn);
     }
@@ -193,3 +285,6 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

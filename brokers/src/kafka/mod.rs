@@ -18,6 +18,8 @@ mod directory;
 mod flow_side;
 mod gate;
 mod identity;
+#[cfg(test)]
+mod impostor;
 mod inner;
 mod keeper;
 mod keyed;

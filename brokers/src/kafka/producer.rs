@@ -142,6 +142,18 @@ impl Producer {
             .map(Arc::new)
     }
 
+    /// Whether the client gets an answer of the server. Waits for it.
+    pub(super) fn is_answered(&self, topic: &str, timeout: Duration) -> bool {
+        let client = self.client.lock().clone();
+        client.is_none_or(|client| client.client().fetch_metadata(Some(topic), timeout).is_ok())
+    }
+
+    /// Lets the poll thread begin anew with a client that knows nothing. What the old one holds is dropped and counted.
+    pub(super) fn remake(&self) {
+        self.context.fatal.store(true, Ordering::Release);
+        self.context.bell.ring();
+    }
+
     /// A queue for a publisher.
     pub(super) fn lane(&self, target: Target) -> Lane<Target> {
         self.outbox.lane(target, Some(self.lot.longest_wait()))
@@ -295,7 +307,10 @@ impl Producer {
                 if fatal.is_none() && !self.context.fatal.load(Ordering::Acquire) {
                     continue;
                 }
-                let reason = fatal.map_or_else(|| "unknown".to_owned(), |(code, text)| format!("{code}: {text}"));
+                let reason = fatal.map_or_else(
+                    || "it gets no answer".to_owned(),
+                    |(code, text)| format!("{code}: {text}"),
+                );
                 tracing::warn!(producer = self.lot.as_str(), reason, "the Kafka producer is made anew");
             }
             self.context.fatal.store(false, Ordering::Release);

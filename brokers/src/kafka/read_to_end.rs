@@ -40,7 +40,7 @@ impl<T> ReaderToEnd<T> {
     ) -> Result<Self, LookupError> {
         let client: BaseConsumer<ReadContext> = settings
             .reader_to_end()
-            .create_with_context(ReadContext::new(last_error))?;
+            .create_with_context(ReadContext::new(&Arc::default(), last_error))?;
         let mut list = TopicPartitionList::new();
         for (partition, mark) in (0..).zip(marks) {
             list.add_partition_offset(topic, partition, Offset::Offset(mark.low))?;

@@ -57,7 +57,7 @@ const FIXED: &[&str] = &[
 ];
 
 /// What a producer is for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub(super) struct Lot {
     /// What is lost is sent again for long.
     pub(super) reliable: bool,

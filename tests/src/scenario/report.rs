@@ -27,6 +27,10 @@ pub struct Route {
     pub reordered: u64,
     /// From publishing to the consumer's callback, ms, sorted; of the time in which faults are played.
     pub latencies_ms: Vec<f64>,
+    /// Seconds after the consumer's start when something came last.
+    pub heard_s: usize,
+    /// The same of when something came after a later one, and how many.
+    pub reordered_s: Vec<(usize, u64)>,
 }
 
 impl Route {
@@ -131,6 +135,8 @@ pub struct Report {
     pub routes: Vec<Route>,
     /// By node.
     pub flows: Vec<FlowReport>,
+    /// The last words of all processes, for whoever asks why something does not hold.
+    pub tails: String,
 }
 
 impl Report {
@@ -207,6 +213,7 @@ mod tests {
             name: "a scenario".to_owned(),
             routes: vec![route],
             flows: Vec::new(),
+            tails: String::new(),
         }
     }
 

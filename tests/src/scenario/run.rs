@@ -250,6 +250,7 @@ impl Running {
             name: scenario.name.to_owned(),
             routes: routes.collect(),
             flows: self.flow_reports(&usage)?,
+            tails: self.tails(),
         })
     }
 
@@ -387,8 +388,27 @@ impl Probe {
             duplicated: self.last(topic, "duplicated"),
             reordered: self.last(topic, "reordered"),
             latencies_ms,
+            heard_s: steps(&lines, topic, "received").last().map_or(0, |step| step.0),
+            reordered_s: steps(&lines, topic, "reordered"),
         }
     }
+}
+
+/// In which rows a number of a topic grew, and by how much; there is a row a second.
+fn steps(lines: &[String], topic: &str, field: &str) -> Vec<(usize, u64)> {
+    let mut before = 0;
+    let mut steps = Vec::new();
+    for (row, line) in lines.iter().enumerate() {
+        let Ok(value) = serde_json::from_str::<Value>(line) else {
+            continue;
+        };
+        let now = of_topic(&value, topic)[field].as_u64().unwrap_or(before);
+        if now > before {
+            steps.push((row, now - before));
+        }
+        before = now;
+    }
+    steps
 }
 
 /// Bridges that do not say where every message went.

@@ -113,7 +113,15 @@ fn a_mixed_load_with_random_faults() -> anyhow::Result<()> {
     }
     let report = run(&scenario).with_context(|| format!("seed {seed}, {seconds} s"))?;
     println!("{report}");
-    report
-        .check(&scenario.expect)
-        .with_context(|| format!("seed {seed}, {seconds} s"))
+    for route in &report.routes {
+        println!(
+            "{} {}: last heard {} s after its start, out of order at {:?} s",
+            route.consumer, route.topic, route.heard_s, route.reordered_s
+        );
+    }
+    let checked = report.check(&scenario.expect);
+    if checked.is_err() {
+        println!("{}", report.tails);
+    }
+    checked.with_context(|| format!("seed {seed}, {seconds} s"))
 }

@@ -26,8 +26,7 @@ struct Bench {
     consumer: Consumer,
     client: Arc<Client>,
     source: Source,
-    /// The server lives as long.
-    _server: MockCluster<'static, DefaultProducerContext>,
+    server: MockCluster<'static, DefaultProducerContext>,
 }
 
 /// A reader, and the offsets that it got.
@@ -76,7 +75,7 @@ impl Bench {
                 topic: TOPIC.into(),
                 stays_open: false,
             },
-            _server: server,
+            server,
         }
     }
 
@@ -158,4 +157,22 @@ fn readers_that_come_while_records_flow_get_each_once_and_in_order() {
             reader.got
         );
     }
+}
+
+#[test]
+fn a_client_that_is_made_anew_reads_on_where_the_old_one_stood() {
+    let mut bench = Bench::new(20);
+    let mut reader = bench.add(0, Join::Following);
+    bench.hand_out_until(&mut reader, 6);
+    // It was polled and not handed out.
+    let waiting = bench
+        .client
+        .poll(Duration::from_secs(10))
+        .map(|polled| polled.map(|message| message.detach()));
+    assert!(matches!(&waiting, Some(Ok(message)) if message.offset() == 7));
+    let settings = Settings::new(&section_at(&bench.server.bootstrap_servers(), "{}")).unwrap();
+    bench.consumer.remake(&settings).unwrap();
+    bench.client = bench.consumer.client.lock().clone().unwrap();
+    bench.hand_out_until(&mut reader, 19);
+    assert!(reader.take().iter().copied().eq(0..20), "{:?}", reader.got);
 }

@@ -11,6 +11,7 @@ use std::str::FromStr;
 use std::time::Duration;
 
 use blaze_domain::{LayerName, NodeName, Reliability, ServiceName, TopicName};
+use blaze_runtime::logs::{self, LogFormat};
 use clap::{Parser, ValueEnum};
 
 use site::Site;
@@ -99,6 +100,7 @@ impl FromStr for Topic {
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
     let options = Options::parse();
+    let _logs = logs::init("warn", LogFormat::Text)?;
     let site = Site::start(&options).await?;
     eprintln!("ready node={} admin={}", site.node, site.admin);
     match options.role {
