@@ -81,6 +81,14 @@ pub(super) fn run(inner: &Inner) {
 }
 
 impl Watch {
+    /// The server answers nobody. What a client waits meanwhile says nothing about it: one that was not answered just before would
+    /// else be given up right after, with all that it holds.
+    fn nobody_is_answered(&mut self) {
+        self.admin = Silence::default();
+        self.consumers.clear();
+        self.producers.clear();
+    }
+
     /// Looks whether the clients that read and write get answers, which the server has just given.
     fn look(&mut self, inner: &Inner) {
         let silent = self
@@ -126,6 +134,9 @@ fn round(inner: &Inner, turn: usize, watch: &mut Watch) -> bool {
         if let Err(error) = inner.directory.remake(&inner.settings, &inner.last_error) {
             inner.last_error.note(error.to_string());
         }
+    }
+    if !answered {
+        watch.nobody_is_answered();
     }
     let listing = match listed {
         Ok(listing) if answered => listing,
