@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! gives up ─► stopped at these places ─► lanes are empty ─► handed over
-//!                                     └► not within 300 ms ─► taken back: it goes on from these places
+//!                                     └► not within 400 ms ─► taken back: it goes on from these places
 //! ```
 //!
 //! Until it is handed over the others hear that it is still carried. So nothing that this flow has sent is overtaken by what the
@@ -21,9 +21,9 @@ use crate::plan::TopicPlan;
 use crate::registry::LEGACY;
 use crate::world::{Carrying, FlowState, Handover, Hold};
 
-/// What is on its way when a topic is given up must have arrived within this time. Well below
+/// What is on its way when a topic is given up must have arrived, and have been written, within this time. Well below
 /// [`DRAIN`](crate::lane::core::DRAIN), after which what waits in a lane is dropped.
-const EMPTY_WITHIN: Duration = Duration::from_millis(300);
+const EMPTY_WITHIN: Duration = Duration::from_millis(400);
 
 /// What a plan changes of who carries a topic out of the layer.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]

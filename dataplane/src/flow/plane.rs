@@ -10,6 +10,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::Received;
 use blaze_domain::{DropReason, FlowId, Scope};
+use blaze_proto::link::link_control::Body;
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::Notify;
 
@@ -71,6 +72,10 @@ impl LaneLink for NoLink {
     fn is_suspect(&self, _to: &FlowId) -> bool {
         true
     }
+    fn is_there(&self, _to: &FlowId) -> bool {
+        false
+    }
+    fn tell(&mut self, _now: Instant, _to: &FlowId, _body: Body) {}
 }
 
 impl PlaneState {
@@ -118,6 +123,10 @@ impl PlaneState {
                 } => {
                     self.core.receiver_dropped(&topic, reason, messages);
                 }
+                LinkEvent::WrittenAsked { from, topic, token } => {
+                    self.core.written_asked(now, from, topic, token, engine);
+                }
+                LinkEvent::Written { from, token } => self.core.written(&from, token),
                 other => news(other),
             }
         }

@@ -12,6 +12,7 @@ use super::measure::RateMeter;
 use super::path::{BridgeState, Phase, Sink, TopicId};
 use super::reading::For;
 use super::stats::BridgeStats;
+use super::succession::{Succession, Waiting};
 use super::writer::{NewWriter, Writer};
 use crate::limit::bucket::TokenBucket;
 use crate::link::{StreamKey, Submit};
@@ -31,6 +32,8 @@ impl BridgeState {
             ended: None,
             bucket: planned.lane.max_rate_hz.map(|rate| TokenBucket::new(rate, now)),
             sink,
+            held: None,
+            unwritten: None,
             stats: BridgeStats::default(),
             out_rate: RateMeter::new(now),
             load: LoadMeter::new(now),
@@ -43,6 +46,7 @@ impl BridgeState {
         if begins {
             self.phase = Phase::Up { since: now };
             self.load = LoadMeter::new(now);
+            self.unwritten = None;
         }
         let begins = begins || (planned.lane.durable && !self.lane.durable);
         self.ended = None;
@@ -154,6 +158,7 @@ impl BridgeState {
         topic: TopicId,
         message: &Admitted,
         large: bool,
+        succession: &mut Succession,
         link: &mut dyn LaneLink,
     ) {
         let frame = &message.frame;
@@ -189,42 +194,72 @@ impl BridgeState {
                     PublishOutcome::TooLarge => self.stats.dropped.add(DropReason::TooLarge, 1),
                 }
             }
-            Sink::Lane { lane, class } => {
-                let wanted = if large {
-                    Priority::Bulk
-                } else {
-                    self.lane.priority.unwrap_or(Priority::State)
-                };
-                // A small message of the new class must not overtake a large one of the old.
-                if wanted != *class && link.queued(*lane) == 0 {
-                    *class = wanted;
-                }
-                let Target::Inter { receiver, .. } = &self.target else {
-                    return;
-                };
-                let submit = Submit {
-                    to: receiver,
-                    class: *class,
-                    lane: *lane,
-                    stream: StreamKey {
-                        topic: topic.0,
-                        writer: frame.writer(),
-                    },
-                    // The link adds its own hop.
+            Sink::Lane { .. } => {
+                let waiting = Waiting {
                     frame: frame.clone().with_hops_and_age(message.hops, message.age_us),
                     arrived: now,
-                    reliable: self.lane.reliable,
                     lifespan: (lifespan_ms > 0).then(|| Duration::from_millis(lifespan_ms.into())),
-                    keep_newest: if *class == Priority::Bulk && !self.lane.reliable {
-                        self.lane.depth.max(1) as usize
-                    } else {
-                        0
-                    },
                 };
-                if let Err(reason) = link.submit(now, submit) {
-                    self.stats.dropped.add(reason, 1);
+                if self.held.is_some() {
+                    self.hold(waiting, large, succession);
+                } else {
+                    self.submit(now, topic, waiting, large, link);
                 }
             }
+        }
+    }
+
+    /// Gives a message to the link.
+    pub(super) fn submit(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        message: Waiting,
+        large: bool,
+        link: &mut dyn LaneLink,
+    ) {
+        let (Sink::Lane { lane, class }, Target::Inter { receiver, .. }) = (&mut self.sink, &self.target) else {
+            return;
+        };
+        let wanted = if large {
+            Priority::Bulk
+        } else {
+            self.lane.priority.unwrap_or(Priority::State)
+        };
+        // A small message of the new class must not overtake a large one of the old.
+        if wanted != *class && link.queued(*lane) == 0 {
+            *class = wanted;
+        }
+        let submit = Submit {
+            to: receiver,
+            class: *class,
+            lane: *lane,
+            stream: StreamKey {
+                topic: topic.0,
+                writer: message.frame.writer(),
+            },
+            // The link adds its own hop.
+            frame: message.frame,
+            arrived: message.arrived,
+            reliable: self.lane.reliable,
+            lifespan: message.lifespan,
+            keep_newest: if *class == Priority::Bulk {
+                self.keep_newest()
+            } else {
+                0
+            },
+        };
+        if let Err(reason) = link.submit(now, submit) {
+            self.stats.dropped.add(reason, 1);
+        }
+    }
+
+    /// So many large messages of a writer wait at most; 0: only bytes count.
+    pub(super) fn keep_newest(&self) -> usize {
+        if self.lane.reliable {
+            0
+        } else {
+            self.lane.depth.max(1) as usize
         }
     }
 }

@@ -15,6 +15,7 @@ use std::time::{Duration, Instant};
 use blaze_brokers::Received;
 use blaze_domain::{DropReason, FlowId, Scope, TopicName, WriterId};
 use blaze_proto::Frame;
+use blaze_proto::link::link_control::Body;
 use lru::LruCache;
 
 use super::admit::Admitted;
@@ -25,6 +26,7 @@ use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use super::places::topic_id;
 use super::reading::For;
 use super::stats::Drops;
+use super::succession::Succession;
 use super::window::DuplicateWindow;
 use super::writer::{NewWriter, Writer};
 use crate::link::{Engine, LaneId, PeerState, Submit};
@@ -52,6 +54,10 @@ pub trait LaneLink {
     fn drop_lane(&mut self, lane: LaneId) -> u64;
     /// Whether a flow does not acknowledge for the moment, or is not known.
     fn is_suspect(&self, to: &FlowId) -> bool;
+    /// Whether a flow lives, as far as is known.
+    fn is_there(&self, to: &FlowId) -> bool;
+    /// Tells a flow something, or not, if it cannot be reached: what matters is told again.
+    fn tell(&mut self, now: Instant, to: &FlowId, body: Body);
 }
 
 impl LaneLink for Engine {
@@ -66,6 +72,12 @@ impl LaneLink for Engine {
     }
     fn is_suspect(&self, to: &FlowId) -> bool {
         self.peer(to).is_none_or(|peer| peer.state != PeerState::Up)
+    }
+    fn is_there(&self, to: &FlowId) -> bool {
+        self.peer(to).is_some_and(|peer| peer.state != PeerState::Down)
+    }
+    fn tell(&mut self, now: Instant, to: &FlowId, body: Body) {
+        let _ = self.send_control(now, to, body);
     }
 }
 
@@ -97,6 +109,8 @@ pub struct DataCore {
     pub(super) draining: bool,
     /// Came over the link before their bridge stood.
     pub(super) early: Early,
+    /// What waits for the last receivers of their topics, and questions of others.
+    pub(super) succession: Succession,
     /// Of transient_local writers, for bridges that begin later.
     pub(super) kept: KeptMessages,
     /// Durable bridges that have just begun: topic and place.
@@ -122,6 +136,7 @@ impl DataCore {
             free_lanes: Vec::new(),
             draining: false,
             early: Early::default(),
+            succession: Succession::default(),
             kept: KeptMessages::default(),
             begun: Vec::new(),
             unattributed: Drops::default(),
@@ -318,34 +333,21 @@ impl DataCore {
     pub fn drain(&mut self, now: Instant, link: &mut dyn LaneLink) -> Option<Instant> {
         let gone = self.early.expire(now);
         self.without_destination(gone);
-        let mut next = self.early.next_expiry();
+        let mut next = earlier(self.early.next_expiry(), self.answer(now, link));
         if !self.draining {
             return next;
         }
         let mut still_draining = false;
-        for bridge in self.topics.iter_mut().flat_map(|topic| &mut topic.bridges) {
-            let Phase::Draining { until } = bridge.phase else {
-                continue;
-            };
-            let lane = bridge.lane_id();
-            let queued = match lane {
-                Some(lane) => link.queued(lane),
-                None => bridge.settle(),
-            };
-            // What a bridge from the inter scope has to empty is on its way to it: it stays until the end.
-            let empty = bridge.from != Scope::Inter && queued == 0;
-            if empty || now >= until {
-                if let Some(lane) = lane {
-                    bridge
-                        .stats
-                        .dropped
-                        .add(DropReason::NoDestination, link.drop_lane(lane));
+        for index in 0..self.topics.len() {
+            let topic = topic_id(index);
+            let path = &mut self.topics[index];
+            for bridge in &mut path.bridges {
+                if let Some(until) = bridge.empty(now, path.name.as_str(), link) {
+                    still_draining = true;
+                    next = earlier(next, Some(until));
                 }
-                bridge.end(now);
-            } else {
-                still_draining = true;
-                next = Some(next.map_or(until, |other: Instant| other.min(until)));
             }
+            self.release(now, topic, link);
         }
         self.draining = still_draining;
         next
@@ -362,10 +364,14 @@ impl DataCore {
         let large = path.is_large(self.config.large_bytes);
         for bridge in path.bridges.iter_mut().filter(|bridge| bridge.from == from) {
             if bridge.takes() && bridge.wants(message) && bridge.is_meant(message.meant) {
-                bridge.pass(now, topic, message, large, link);
+                bridge.pass(now, topic, message, large, &mut self.succession, link);
             }
         }
     }
+}
+
+fn earlier(one: Option<Instant>, other: Option<Instant>) -> Option<Instant> {
+    one.into_iter().chain(other).min()
 }
 
 #[cfg(test)]

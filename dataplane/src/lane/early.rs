@@ -43,6 +43,11 @@ impl Early {
         gone
     }
 
+    /// Whether a message of the topic waits.
+    pub(super) fn holds(&self, topic: &str) -> bool {
+        self.waiting.iter().any(|(_, frame)| frame.topic() == topic)
+    }
+
     /// When the next one has waited long enough.
     pub(super) fn next_expiry(&self) -> Option<Instant> {
         self.waiting.front().map(|(since, _)| *since + WAIT)

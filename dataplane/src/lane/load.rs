@@ -107,7 +107,7 @@ impl BridgeState {
     }
 
     /// Whether it carries what services of the layer scope publish to another group.
-    fn carries_out(&self) -> bool {
+    pub(super) fn carries_out(&self) -> bool {
         self.from == Scope::Layer && matches!(self.sink, Sink::Lane { .. })
     }
 

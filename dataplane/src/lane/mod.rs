@@ -11,5 +11,6 @@ pub mod path;
 mod places;
 pub mod reading;
 pub mod stats;
+mod succession;
 pub mod window;
 pub mod writer;

@@ -13,6 +13,7 @@ use super::load::LoadMeter;
 use super::measure::RateMeter;
 use super::reading::Places;
 use super::stats::{BridgeStats, Drops};
+use super::succession::{Held, Unwritten};
 use super::writer::Writer;
 use crate::limit::bucket::TokenBucket;
 use crate::link::LaneId;
@@ -134,6 +135,10 @@ pub struct BridgeState {
     pub bucket: Option<TokenBucket>,
     /// Where it writes.
     pub sink: Sink,
+    /// Messages that wait until the receiver before this one has written its own.
+    pub(super) held: Option<Held>,
+    /// It drains, and what its receiver got must be written before another one goes on.
+    pub(super) unwritten: Option<Unwritten>,
     /// Counters.
     pub stats: BridgeStats,
     /// Written per second.

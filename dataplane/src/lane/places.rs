@@ -78,6 +78,7 @@ impl DataCore {
     ) {
         let path = &mut self.topics[topic.0 as usize];
         path.info = info;
+        let mut orphans = Vec::new();
         for bridge in &mut path.bridges {
             let planned = plan
                 .bridges
@@ -87,6 +88,11 @@ impl DataCore {
                 Phase::Up { .. } if !planned => {
                     bridge.phase = Phase::Draining { until: now + DRAIN };
                     self.draining = true;
+                    if let Some(held) = bridge.held.take() {
+                        orphans.push((bridge.from, bridge.target.clone(), held));
+                    } else if bridge.has_successor(plan) {
+                        bridge.unwritten = Some(self.succession.unwritten(now, topic));
+                    }
                 }
                 Phase::Failed { .. } if !planned => bridge.end(now),
                 _ => {}
@@ -102,6 +108,12 @@ impl DataCore {
             if begins && bridge.lane.durable {
                 self.begun.push((topic, at));
             }
+            if begins {
+                self.hold_back(topic, at);
+            }
+        }
+        for (from, target, held) in orphans {
+            self.adopt(topic, from, &target, held);
         }
     }
 
@@ -118,7 +130,7 @@ impl DataCore {
             };
             for message in self.kept.of(now, topic, bridge.from) {
                 if bridge.takes() && bridge.wants(&message) {
-                    bridge.pass(now, topic, &message, large, link);
+                    bridge.pass(now, topic, &message, large, &mut self.succession, link);
                 }
             }
         }

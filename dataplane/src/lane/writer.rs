@@ -55,6 +55,11 @@ impl Writer {
         Arc::ptr_eq(&self.made.publisher, &other.publisher)
     }
 
+    /// Messages that it took.
+    pub(super) fn taken(&self) -> u64 {
+        self.taken
+    }
+
     /// Messages that wait for the server.
     #[must_use]
     pub fn queued(&self) -> u64 {

@@ -94,6 +94,22 @@ pub enum LinkEvent {
         /// What it says.
         body: Body,
     },
+    /// A peer asks whether all of a topic that came over the link is with the brokers that it is for.
+    WrittenAsked {
+        /// The flow that asks.
+        from: FlowId,
+        /// The topic.
+        topic: String,
+        /// To be given back in the answer.
+        token: u64,
+    },
+    /// A peer says that it is.
+    Written {
+        /// The flow that was asked.
+        from: FlowId,
+        /// Of the question.
+        token: u64,
+    },
     /// A Hello, each one.
     Hello {
         /// The flow that sent it.

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use blaze_domain::{FlowId, Priority};
 use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Body, Feedback, Hello};
+use blaze_proto::link::link_control::{Body, Feedback, Hello, Written, WrittenRequest};
 use bytes::Bytes;
 use prost::Message as _;
 
@@ -150,6 +150,13 @@ impl Engine {
         let from = peer.endpoint.flow.clone();
         match body {
             Body::Feedback(feedback) => self.feedback_received(now, at, &feedback),
+            Body::WrittenRequest(WrittenRequest { topic, token }) if peer.is_connected() => {
+                self.ledger
+                    .events
+                    .push_back(LinkEvent::WrittenAsked { from, topic, token });
+            }
+            Body::Written(Written { token }) => self.ledger.events.push_back(LinkEvent::Written { from, token }),
+            Body::WrittenRequest(_) => {}
             Body::Goodbye(goodbye) if goodbye.epoch == peer.endpoint.epoch => self.goodbye_received(now, at),
             Body::Goodbye(_) => self.counters.stale += 1,
             Body::Delta(_) | Body::SnapshotRequest(_) | Body::Snapshot(_) => {

@@ -166,7 +166,9 @@ impl Registry {
                 }
                 return BTreeSet::new();
             }
-            Body::Hello(_) | Body::Feedback(_) | Body::Goodbye(_) => return BTreeSet::new(),
+            Body::Hello(_) | Body::Feedback(_) | Body::Goodbye(_) | Body::WrittenRequest(_) | Body::Written(_) => {
+                return BTreeSet::new();
+            }
         };
         // A Hello does not say whether there is a node scope: whoever has services on one has it.
         view.node_scope = view

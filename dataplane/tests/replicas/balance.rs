@@ -82,7 +82,7 @@ impl World {
                     at: self.now,
                     by: usize::MAX,
                 };
-                let mut log = self.kafka.lock();
+                let mut log = self.kafka.log.lock();
                 log.entry(stream.topic.to_string()).or_default().push(record);
             }
         }
@@ -126,7 +126,7 @@ impl World {
 
     fn became(&self) -> Became {
         let mut became = Became::default();
-        let log = self.redis.lock();
+        let log = self.redis.log.lock();
         let core = &self.flows[0].plane.core;
         for stream in &self.streams {
             let records = log.get(&channel(0, Scope::Node, stream.topic.as_str()));

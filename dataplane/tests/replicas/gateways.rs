@@ -44,6 +44,7 @@ impl World {
         let mut counts = BTreeMap::new();
         for record in self
             .redis
+            .log
             .lock()
             .get(&channel(index, Scope::Node, topic))
             .into_iter()
@@ -226,7 +227,7 @@ fn control_traffic_grows_with_the_flows_alone() {
     for clouds in [20, 100] {
         let mut world = World::with(1, clouds);
         let said = |world: &World| -> (usize, usize) {
-            let log = world.kafka.lock();
+            let log = world.kafka.log.lock();
             let all = log.get("peers").map_or(&[][..], Vec::as_slice);
             let bytes = all.iter().map(|record| match &record.content {
                 Content::Bare { payload, .. } => payload.len(),

@@ -9,6 +9,7 @@
 mod balance;
 #[path = "../support/flights.rs"]
 mod flights;
+mod frozen;
 mod gateways;
 mod parts;
 mod tasks;

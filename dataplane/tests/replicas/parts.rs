@@ -1,6 +1,6 @@
 //! The parts of the simulated system: what brokers keep, what flies, who lives.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -12,6 +12,8 @@ use blaze_flow::link::transport::Endpoint;
 use blaze_proto::Frame;
 use bytes::Bytes;
 use parking_lot::Mutex;
+use rand::RngExt;
+use rand::rngs::StdRng;
 
 /// How a replica ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -30,6 +32,8 @@ pub(crate) struct Found {
     /// Written twice under one identity.
     pub(crate) twice_up: usize,
     pub(crate) twice_down: usize,
+    /// Written to Kafka behind a newer one.
+    pub(crate) late_up: usize,
     /// Repeats that the robot's flow dropped.
     pub(crate) repeats_down: u64,
     /// Replicas that carry the topic to the robot now.
@@ -51,10 +55,70 @@ pub(crate) struct Record {
 /// Channels that keep what is written.
 pub(crate) type Log = Arc<Mutex<BTreeMap<String, Vec<Record>>>>;
 
-pub(crate) struct LogWriter {
+/// A server that keeps a log, and stands still at times: then what is written waits with whoever writes it.
+#[derive(Clone, Default)]
+pub(crate) struct Server {
     pub(crate) log: Log,
-    pub(crate) channel: String,
-    pub(crate) clock: Arc<Mutex<Instant>>,
+    state: Arc<Mutex<Standing>>,
+}
+
+#[derive(Default)]
+struct Standing {
+    frozen_since: Option<Instant>,
+    /// By flow and number of the writer: channel and record, oldest first.
+    waiting: BTreeMap<(usize, u64), VecDeque<(String, Record)>>,
+    writers: u64,
+}
+
+impl Server {
+    pub(crate) fn writer(&self, flow: usize, channel: String, clock: &Arc<Mutex<Instant>>) -> LogWriter {
+        let mut state = self.state.lock();
+        state.writers += 1;
+        LogWriter {
+            server: self.clone(),
+            key: (flow, state.writers),
+            channel,
+            clock: Arc::clone(clock),
+        }
+    }
+
+    pub(crate) fn freeze(&self, now: Instant) {
+        self.state.lock().frozen_since = Some(now);
+    }
+
+    /// What waited is written: each writer's in order, those of several in any.
+    pub(crate) fn thaw(&self, now: Instant, random: &mut StdRng) {
+        let mut state = self.state.lock();
+        state.frozen_since = None;
+        let mut log = self.log.lock();
+        while !state.waiting.is_empty() {
+            let at = random.random_range(0..state.waiting.len());
+            let Some(key) = state.waiting.keys().nth(at).copied() else {
+                break;
+            };
+            match state.waiting.get_mut(&key).and_then(VecDeque::pop_front) {
+                Some((channel, record)) => log.entry(channel).or_default().push(Record { at: now, ..record }),
+                None => drop(state.waiting.remove(&key)),
+            }
+        }
+    }
+
+    /// What waited with a flow that was killed is lost.
+    pub(crate) fn forget(&self, flow: usize) {
+        self.state.lock().waiting.retain(|key, _| key.0 != flow);
+    }
+
+    /// Until when what was written can be read now.
+    pub(crate) fn readable(&self, now: Instant) -> Instant {
+        self.state.lock().frozen_since.unwrap_or(now)
+    }
+}
+
+pub(crate) struct LogWriter {
+    server: Server,
+    key: (usize, u64),
+    channel: String,
+    clock: Arc<Mutex<Instant>>,
 }
 
 impl Publisher for LogWriter {
@@ -64,14 +128,23 @@ impl Publisher for LogWriter {
             at: *self.clock.lock(),
             by: usize::MAX,
         };
-        self.log.lock().entry(self.channel.clone()).or_default().push(record);
+        let (channel, mut state) = (self.channel.clone(), self.server.state.lock());
+        if state.frozen_since.is_some() {
+            state.waiting.entry(self.key).or_default().push_back((channel, record));
+        } else {
+            self.server.log.lock().entry(channel).or_default().push(record);
+        }
         PublishOutcome::Taken
     }
     fn publish_bare(&self, _: &Bytes, _: Option<Instant>) -> PublishOutcome {
         PublishOutcome::Taken
     }
     fn later(&self) -> Later {
-        Later::default()
+        let queued = self.server.state.lock().waiting.get(&self.key).map_or(0, VecDeque::len);
+        Later {
+            queued: queued as u64,
+            ..Later::default()
+        }
     }
 }
 

@@ -8,12 +8,12 @@ use blaze_domain::{Scope, TopicName};
 use blaze_flow::control::{Duty, Output, read_replica_message};
 use blaze_flow::lane::path::TopicInfo;
 use blaze_flow::lane::writer::NewWriter;
-use blaze_flow::plan::{Target, TopicPlan};
+use blaze_flow::plan::{Bridge, Target, TopicPlan};
 use blaze_flow::world::FlowState;
 use blaze_proto::link::link_control::State;
 use rand::RngExt;
 
-use crate::parts::{Life, LogWriter, Packet, Record, channel};
+use crate::parts::{Life, Packet, Record, channel};
 use crate::world::World;
 
 /// How often it is measured what a flow carries.
@@ -22,14 +22,16 @@ const MEASURE: Duration = Duration::from_secs(1);
 impl World {
     /// What the source tasks and the task of the channel of flows do.
     pub(crate) fn read(&mut self, index: usize) {
-        let (now, wall, visible) = (self.now, self.wall(), self.now - self.kafka_delay);
+        let (now, wall) = (self.now, self.wall());
         let topics: Vec<(TopicName, Scope)> = self.flows[index].reads.keys().cloned().collect();
         for (topic, scope) in topics {
-            let log = Arc::clone(if scope == Scope::Layer {
+            let server = if scope == Scope::Layer {
                 &self.kafka
             } else {
                 &self.redis
-            });
+            };
+            let visible = server.readable(now) - self.kafka_delay;
+            let log = Arc::clone(&server.log);
             let flow = &mut self.flows[index];
             let (Some(next), Some(id)) = (
                 flow.reads.get_mut(&(topic.clone(), scope)),
@@ -61,8 +63,9 @@ impl World {
         if index == 0 {
             return;
         }
+        let visible = self.kafka.readable(now) - self.kafka_delay;
         let said: Vec<Record> = {
-            let log = self.kafka.lock();
+            let log = self.kafka.log.lock();
             let all = log.get("peers").map_or(&[][..], Vec::as_slice);
             let new = all.iter().skip(self.flows[index].peers);
             new.take_while(|record| record.at <= visible).cloned().collect()
@@ -138,7 +141,13 @@ impl World {
                 at: now,
                 by: index,
             };
-            return self.kafka.lock().entry("peers".to_owned()).or_default().push(record);
+            return self
+                .kafka
+                .log
+                .lock()
+                .entry("peers".to_owned())
+                .or_default()
+                .push(record);
         }
         let flow = &mut self.flows[index];
         let Some(engine) = &mut flow.plane.engine else {
@@ -185,16 +194,19 @@ impl World {
         let (now, kafka, redis, clock) = (self.now, &self.kafka, &self.redis, &self.clock);
         let flow = &mut self.flows[index];
         let id = flow.plane.core.intern(topic, now)?;
+        let core = &flow.plane.core;
+        let writer_of = |bridge: &Bridge| core.writer_of(topic, bridge.from, &bridge.to).cloned();
+        let mut before: Vec<Option<NewWriter>> = plan.bridges.iter().map(writer_of).collect();
         flow.plane.core.apply(now, id, info, plan, |bridge| {
-            let (log, scope) = match bridge.to {
+            let at = plan.bridges.iter().position(|planned| planned == bridge);
+            if let Some(made) = at.and_then(|at| before[at].take()) {
+                return Ok(made);
+            }
+            let (server, scope) = match bridge.to {
                 Target::Layer => (kafka, Scope::Layer),
                 _ => (redis, Scope::Node),
             };
-            let writer = LogWriter {
-                log: Arc::clone(log),
-                channel: channel(index, scope, topic.as_str()),
-                clock: Arc::clone(clock),
-            };
+            let writer = server.writer(index, channel(index, scope, topic.as_str()), clock);
             Ok(NewWriter {
                 publisher: Arc::new(writer),
                 options: PublisherOptions::default(),
@@ -213,7 +225,7 @@ impl World {
                 }
                 continue;
             }
-            let log = if scope == Scope::Layer { kafka } else { redis }.lock();
+            let log = if scope == Scope::Layer { kafka } else { redis }.log.lock();
             let records = log.get(&channel(index, scope, topic.as_str()));
             let records = records.map_or(&[][..], Vec::as_slice);
             let anew = matches!(duty, Duty::Takes(begin) if scope == Scope::Layer && *begin != Begin::Now);

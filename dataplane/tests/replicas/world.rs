@@ -12,7 +12,7 @@ use blaze_flow::flow::plane::PlaneState;
 use blaze_flow::lane::core::{DataConfig, DataCore};
 use blaze_flow::link::transport::Endpoint;
 use blaze_flow::link::{Engine, EngineConfig, Limits};
-use blaze_flow::plan::{PlanRules, TopicPlan};
+use blaze_flow::plan::{PlanRules, Target, TopicPlan};
 use blaze_flow::registry::LayerNames;
 use blaze_flow::world::LayerScopeId;
 use blaze_proto::link::link_control::LayerScope;
@@ -24,7 +24,7 @@ use rand::{RngExt, SeedableRng};
 use serde_json::json;
 
 use crate::flights::Flights;
-use crate::parts::{End, Flow, Found, Life, Log, Packet, Record, Stream, channel};
+use crate::parts::{End, Flow, Found, Life, Log, Packet, Record, Server, Stream, channel};
 
 const STEP: Duration = Duration::from_millis(5);
 const WALL_NS: u64 = 1_700_000_000_000_000_000;
@@ -44,8 +44,8 @@ pub(crate) struct World {
     pub(crate) clock: Arc<Mutex<Instant>>,
     /// 0 is the robot.
     pub(crate) flows: Vec<Flow>,
-    pub(crate) kafka: Log,
-    pub(crate) redis: Log,
+    pub(crate) kafka: Server,
+    pub(crate) redis: Server,
     pub(crate) network: Flights<Packet>,
     pub(crate) known: HashMap<(usize, usize), (u64, u64)>,
     pub(crate) one_way: Duration,
@@ -102,8 +102,8 @@ impl World {
             now,
             clock: Arc::new(Mutex::new(now)),
             flows: Vec::new(),
-            kafka: Log::default(),
-            redis: Log::default(),
+            kafka: Server::default(),
+            redis: Server::default(),
             network: Flights::default(),
             known: HashMap::new(),
             publishing: false,
@@ -202,7 +202,7 @@ impl World {
             epoch,
             life: Life::Alive,
             reads: BTreeMap::new(),
-            peers: self.kafka.lock().get("peers").map_or(0, Vec::len),
+            peers: self.kafka.log.lock().get("peers").map_or(0, Vec::len),
             inside,
             was_inside: inside,
             leaves: None,
@@ -257,7 +257,10 @@ impl World {
         let flow = &mut self.flows[index];
         self.handed_over += flow.control.handovers().0;
         match end {
-            End::Killed => flow.life = Life::Dead,
+            End::Killed => {
+                flow.life = Life::Dead;
+                self.kafka.forget(index);
+            }
             End::Stopped => {
                 flow.life = Life::Draining(now);
                 flow.control.start_draining(now, wall_ms);
@@ -269,6 +272,7 @@ impl World {
         assert_eq!(self.flows[index].life, Life::Dead, "it has not ended in time");
         let heard = self
             .redis
+            .log
             .lock()
             .get(&channel(index, Scope::Node, DOWN))
             .map_or(0, Vec::len);
@@ -279,6 +283,23 @@ impl World {
 
     pub(crate) fn stop_publishing(&mut self) {
         self.publishing = false;
+    }
+
+    /// The replica that the robot sends to.
+    pub(crate) fn receiver_up(&self) -> Option<FlowId> {
+        let plan = self.flows[0].control.plans().get(UP)?;
+        let receivers = plan.bridges.iter().filter_map(|bridge| match &bridge.to {
+            Target::Inter { receiver, .. } => Some(receiver.clone()),
+            _ => None,
+        });
+        receivers.min()
+    }
+
+    /// Kafka stands still for so long.
+    pub(crate) fn freeze_kafka(&mut self, time: Duration) {
+        self.kafka.freeze(self.now);
+        self.run_for(time);
+        self.kafka.thaw(self.now, &mut self.random);
     }
 
     /// Whether the replicas hear each other, on Kafka and over the link.
@@ -346,7 +367,7 @@ impl World {
                 by: usize::MAX,
             };
             let channel = channel(index, Scope::Node, topic);
-            self.redis.lock().entry(channel).or_default().push(record);
+            self.redis.log.lock().entry(channel).or_default().push(record);
             self.said.push((index, sequence));
         }
     }
@@ -365,8 +386,8 @@ impl World {
         self.next_publish += PERIOD;
         self.sent += 1;
         let ways = [
-            (&self.redis, Scope::Node, UP, "edge", "robot-1"),
-            (&self.kafka, Scope::Layer, DOWN, "cloud", ""),
+            (&self.redis.log, Scope::Node, UP, "edge", "robot-1"),
+            (&self.kafka.log, Scope::Layer, DOWN, "cloud", ""),
         ];
         for (log, scope, topic, layer, node) in ways {
             let origin = Origin {
@@ -424,9 +445,24 @@ impl World {
         counts
     }
 
+    /// Messages that were written to Kafka behind a newer one.
+    fn late(&self, topic: &str) -> usize {
+        let mut newest = 0;
+        let mut late = 0;
+        for record in self.kafka.log.lock().get(topic).into_iter().flatten() {
+            if let Content::Frame(frame) = &record.content
+                && frame.hops() > 0
+            {
+                late += usize::from(frame.sequence() < newest);
+                newest = newest.max(frame.sequence());
+            }
+        }
+        late
+    }
+
     /// Messages that services of the replicas' nodes missed or got out of turn within a life of their flow.
     fn holes(&self) -> usize {
-        let log = self.redis.lock();
+        let log = self.redis.log.lock();
         let mut holes = 0;
         for index in 1..=self.clouds {
             let all = log
@@ -446,8 +482,8 @@ impl World {
     }
 
     pub(crate) fn judge(&mut self) -> Found {
-        let up = Self::written(&self.kafka, UP);
-        let down = Self::written(&self.redis, &channel(0, Scope::Node, DOWN));
+        let up = Self::written(&self.kafka.log, UP);
+        let down = Self::written(&self.redis.log, &channel(0, Scope::Node, DOWN));
         let lost = |counts: &BTreeMap<u64, usize>| (1..=self.sent).filter(|n| !counts.contains_key(n)).count();
         let twice = |counts: &BTreeMap<u64, usize>| counts.values().filter(|count| **count > 1).count();
         let topic: TopicName = DOWN.parse().unwrap();
@@ -461,6 +497,7 @@ impl World {
             lost_down: lost(&down),
             twice_up: twice(&up),
             twice_down: twice(&down),
+            late_up: self.late(UP),
             repeats_down: dropped,
             carriers: self.flows.iter().filter(carries).count(),
             handed_over: self.handed_over,

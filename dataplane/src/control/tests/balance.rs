@@ -273,7 +273,7 @@ fn what_has_not_arrived_in_time_stays_and_goes_on_where_it_stopped() {
     let mut pair = Pair::new(Some(0), [300, 200, 100]);
     pair.run_until_given_up(20_000).unwrap();
     pair.duties.clear();
-    pair.run(280);
+    pair.run(380);
     assert_eq!((pair.duties.len(), pair.carried()), (0, vec!["t1", "t2"]));
     pair.run(40);
     assert_eq!(pair.duties, [(topic("t0"), Duty::Takes(Begin::At([7].into())))]);

@@ -1,9 +1,11 @@
 //! The message path alone: a link that only takes notes, brokers that only collect.
 
 mod load;
+mod succession;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use blaze_brokers::{Content, Later, PublishOutcome, Publisher, PublisherOptions};
 use blaze_domain::{LayerName, Origin, Priority};
@@ -21,6 +23,8 @@ struct NotingLink {
     submitted: Vec<(LaneId, Priority, Frame)>,
     waiting: BTreeMap<LaneId, u64>,
     refuse: bool,
+    told: Vec<(FlowId, Body)>,
+    gone: Option<FlowId>,
 }
 
 impl LaneLink for NotingLink {
@@ -41,12 +45,19 @@ impl LaneLink for NotingLink {
     fn is_suspect(&self, _to: &FlowId) -> bool {
         self.refuse
     }
+    fn is_there(&self, to: &FlowId) -> bool {
+        self.gone.as_ref() != Some(to)
+    }
+    fn tell(&mut self, _now: Instant, to: &FlowId, body: Body) {
+        self.told.push((to.clone(), body));
+    }
 }
 
 #[derive(Default)]
 struct Collector {
     frames: Mutex<Vec<Frame>>,
     bare: Mutex<Vec<Bytes>>,
+    queued: AtomicU64,
 }
 
 impl Publisher for Collector {
@@ -58,8 +69,11 @@ impl Publisher for Collector {
         self.bare.lock().push(payload.clone());
         PublishOutcome::Taken
     }
-    fn later(&self) -> blaze_brokers::Later {
-        blaze_brokers::Later::default()
+    fn later(&self) -> Later {
+        Later {
+            queued: self.queued.load(Ordering::SeqCst),
+            ..Later::default()
+        }
     }
 }
 
@@ -715,6 +729,9 @@ fn a_bridge_takes_the_place_of_one_that_ended_long_ago() {
         bench.core.drain(bench.now, &mut bench.link);
     }
     assert!(bench.core.path(bench.topic).bridges.len() <= 3);
+    // The receivers before it never say that they have written what they got.
+    bench.now += FORGET;
+    bench.core.drain(bench.now, &mut bench.link);
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
     let (lane, _, _) = bench.link.submitted[0];
     bench.core.lane_out(lane, 1, 1);
