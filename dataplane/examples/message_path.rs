@@ -74,6 +74,7 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
         from: Vec::new(),
         degraded: None,
         relays: Vec::new(),
+        shared: None,
     };
     let plan = TopicPlan {
         bridges: vec![Bridge {

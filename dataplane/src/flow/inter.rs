@@ -25,6 +25,8 @@ use crate::link::{DownReason, LinkEvent};
 const RETRY: Duration = Duration::from_secs(1);
 /// How long what is queued may take to leave before the good-bye …
 const DRAIN: Duration = Duration::from_millis(600);
+/// How long what came over it may wait for brokers besides.
+const WRITTEN: Duration = Duration::from_millis(1500);
 /// … and how long the good-bye may take.
 const GOODBYE: Duration = Duration::from_millis(100);
 /// How often it is looked whether the transport works.
@@ -197,6 +199,16 @@ impl InterScope {
             })
         };
         while Instant::now() < until && still_draining() {
+            std::thread::sleep(LOOK);
+        }
+        // As for a flow that is stopped: others go on with the good-bye.
+        let waits_for_brokers = || {
+            self.plane.with(|state| {
+                state.run_timers(Instant::now());
+                state.core.has_unwritten()
+            })
+        };
+        while Instant::now() < until + WRITTEN && waits_for_brokers() {
             std::thread::sleep(LOOK);
         }
         self.plane

@@ -339,6 +339,7 @@ impl RunningFlow {
     pub async fn drain(&self) {
         let shared = &self.shared;
         shared.readiness.stop();
+        shared.plane.with(|state| state.core.leave(Instant::now()));
         self.leave.draining.cancel();
         let until = Instant::now() + DRAIN;
         // Nothing is planned any more, and whoever comes next knows where to begin: only then are the bridges draining.
@@ -350,6 +351,16 @@ impl RunningFlow {
             })
         };
         while Instant::now() < until && still_draining() {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        // With the good-bye others take the topics over: what they write must not be overtaken by what still waits for a broker here.
+        let waits_for_brokers = || {
+            shared.plane.with(|state| {
+                state.run_timers(Instant::now());
+                state.core.has_unwritten()
+            })
+        };
+        while Instant::now() < until + CLOSE && waits_for_brokers() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
         shared
@@ -365,8 +376,9 @@ impl RunningFlow {
         }
         shared.routes.stop();
         let brokers = [&shared.brokers.node, &shared.brokers.layer];
+        let closed_by = tokio::time::Instant::now() + CLOSE;
         for broker in brokers.into_iter().flatten() {
-            if tokio::time::timeout(CLOSE, broker.close()).await.is_err() {
+            if tokio::time::timeout_at(closed_by, broker.close()).await.is_err() {
                 tracing::warn!(broker = %broker.kind(), "the broker did not take everything in time");
             }
         }

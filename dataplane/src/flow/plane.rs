@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::Received;
-use blaze_domain::{DropReason, FlowId, Scope};
+use blaze_domain::{DropReason, FlowId, Priority, Scope};
 use blaze_proto::link::link_control::Body;
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::Notify;
@@ -72,10 +72,15 @@ impl LaneLink for NoLink {
     fn is_suspect(&self, _to: &FlowId) -> bool {
         true
     }
-    fn is_there(&self, _to: &FlowId) -> bool {
+    fn answers(&self, _to: &FlowId) -> bool {
         false
     }
-    fn tell(&mut self, _now: Instant, _to: &FlowId, _body: Body) {}
+    fn has_room(&self, _to: &FlowId, _class: Priority, _bytes: usize) -> bool {
+        true
+    }
+    fn tell(&mut self, _now: Instant, _to: &FlowId, _body: Body) -> bool {
+        false
+    }
 }
 
 impl PlaneState {
@@ -127,7 +132,12 @@ impl PlaneState {
                     self.core.written_asked(now, from, topic, token, engine);
                 }
                 LinkEvent::Written { from, token } => self.core.written(&from, token),
-                other => news(other),
+                other => {
+                    if !matches!(other, LinkEvent::Hello { .. } | LinkEvent::Control { .. }) {
+                        self.core.stir();
+                    }
+                    news(other);
+                }
             }
         }
     }

@@ -6,7 +6,7 @@ use blaze_brokers::PublishOutcome;
 use blaze_domain::{DropReason, Priority, Scope};
 
 use super::admit::Admitted;
-use super::core::LaneLink;
+use super::core::{DRAIN, LaneLink};
 use super::load::LoadMeter;
 use super::measure::RateMeter;
 use super::path::{BridgeState, Phase, Sink, TopicId};
@@ -32,6 +32,7 @@ impl BridgeState {
             ended: None,
             bucket: planned.lane.max_rate_hz.map(|rate| TokenBucket::new(rate, now)),
             sink,
+            submitted: false,
             held: None,
             unwritten: None,
             stats: BridgeStats::default(),
@@ -161,6 +162,9 @@ impl BridgeState {
         succession: &mut Succession,
         link: &mut dyn LaneLink,
     ) {
+        if let Phase::Draining { until, latest } = &mut self.phase {
+            *until = (*until).max(now + DRAIN).min(*latest);
+        }
         let frame = &message.frame;
         let bytes = frame.payload().len() as u64;
         self.stats.taken.add(bytes);
@@ -196,32 +200,29 @@ impl BridgeState {
             }
             Sink::Lane { .. } => {
                 let waiting = Waiting {
+                    large,
                     frame: frame.clone().with_hops_and_age(message.hops, message.age_us),
                     arrived: now,
                     lifespan: (lifespan_ms > 0).then(|| Duration::from_millis(lifespan_ms.into())),
                 };
                 if self.held.is_some() {
-                    self.hold(waiting, large, succession);
+                    // It is counted when it leaves here: it may go to another bridge.
+                    self.stats.taken.remove(bytes);
+                    self.hold(waiting, succession);
                 } else {
-                    self.submit(now, topic, waiting, large, link);
+                    self.submit(now, topic, waiting, link);
                 }
             }
         }
     }
 
     /// Gives a message to the link.
-    pub(super) fn submit(
-        &mut self,
-        now: Instant,
-        topic: TopicId,
-        message: Waiting,
-        large: bool,
-        link: &mut dyn LaneLink,
-    ) {
+    pub(super) fn submit(&mut self, now: Instant, topic: TopicId, message: Waiting, link: &mut dyn LaneLink) {
+        let keep_newest = self.keep_newest();
         let (Sink::Lane { lane, class }, Target::Inter { receiver, .. }) = (&mut self.sink, &self.target) else {
             return;
         };
-        let wanted = if large {
+        let wanted = if message.large {
             Priority::Bulk
         } else {
             self.lane.priority.unwrap_or(Priority::State)
@@ -243,12 +244,9 @@ impl BridgeState {
             arrived: message.arrived,
             reliable: self.lane.reliable,
             lifespan: message.lifespan,
-            keep_newest: if *class == Priority::Bulk {
-                self.keep_newest()
-            } else {
-                0
-            },
+            keep_newest: if *class == Priority::Bulk { keep_newest } else { 0 },
         };
+        self.submitted = true;
         if let Err(reason) = link.submit(now, submit) {
             self.stats.dropped.add(reason, 1);
         }

@@ -8,12 +8,12 @@
 //! Without input or output of its own: brokers are writers that never wait, the link is a [`LaneLink`], time is given.
 //! Production holds it behind one lock that is taken once per batch; the simulated network drives the same code.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::num::NonZeroUsize;
 use std::time::{Duration, Instant};
 
 use blaze_brokers::Received;
-use blaze_domain::{DropReason, FlowId, Scope, TopicName, WriterId};
+use blaze_domain::{DropReason, FlowId, Priority, Scope, TopicName, WriterId};
 use blaze_proto::Frame;
 use blaze_proto::link::link_control::Body;
 use lru::LruCache;
@@ -54,10 +54,12 @@ pub trait LaneLink {
     fn drop_lane(&mut self, lane: LaneId) -> u64;
     /// Whether a flow does not acknowledge for the moment, or is not known.
     fn is_suspect(&self, to: &FlowId) -> bool;
-    /// Whether a flow lives, as far as is known.
-    fn is_there(&self, to: &FlowId) -> bool;
-    /// Tells a flow something, or not, if it cannot be reached: what matters is told again.
-    fn tell(&mut self, now: Instant, to: &FlowId, body: Body);
+    /// Whether a flow lives, as far as is known, and answers when it is asked what it has written.
+    fn answers(&self, to: &FlowId) -> bool;
+    /// Whether the queue to a flow takes so many bytes more without coming near its bound.
+    fn has_room(&self, to: &FlowId, class: Priority, bytes: usize) -> bool;
+    /// Tells a flow something. `false`: it could not be queued.
+    fn tell(&mut self, now: Instant, to: &FlowId, body: Body) -> bool;
 }
 
 impl LaneLink for Engine {
@@ -73,11 +75,14 @@ impl LaneLink for Engine {
     fn is_suspect(&self, to: &FlowId) -> bool {
         self.peer(to).is_none_or(|peer| peer.state != PeerState::Up)
     }
-    fn is_there(&self, to: &FlowId) -> bool {
-        self.peer(to).is_some_and(|peer| peer.state != PeerState::Down)
+    fn answers(&self, to: &FlowId) -> bool {
+        self.answers_written(to)
     }
-    fn tell(&mut self, now: Instant, to: &FlowId, body: Body) {
-        let _ = self.send_control(now, to, body);
+    fn has_room(&self, to: &FlowId, class: Priority, bytes: usize) -> bool {
+        Engine::has_room(self, to, class, bytes)
+    }
+    fn tell(&mut self, now: Instant, to: &FlowId, body: Body) -> bool {
+        self.send_control(now, to, body).is_ok()
     }
 }
 
@@ -105,8 +110,12 @@ pub struct DataCore {
     pub(super) vacant: Vec<TopicId>,
     /// Lanes of topics that were forgotten.
     pub(super) free_lanes: Vec<LaneId>,
-    /// A bridge empties its queue.
-    pub(super) draining: bool,
+    /// Topics with bridges that empty their queues, or hold messages.
+    pub(super) draining: BTreeSet<TopicId>,
+    /// Something has happened to one of these since they were looked at.
+    pub(super) stirred: bool,
+    /// When they are to be looked at, whatever happens.
+    look_at: Option<Instant>,
     /// Came over the link before their bridge stood.
     pub(super) early: Early,
     /// What waits for the last receivers of their topics, and questions of others.
@@ -134,7 +143,9 @@ impl DataCore {
             lanes: Vec::new(),
             vacant: Vec::new(),
             free_lanes: Vec::new(),
-            draining: false,
+            draining: BTreeSet::new(),
+            stirred: false,
+            look_at: None,
             early: Early::default(),
             succession: Succession::default(),
             kept: KeptMessages::default(),
@@ -253,6 +264,7 @@ impl DataCore {
         let Some(topic) = delivering else {
             // The sender knew of the pair before this flow did: the bridge may come in a moment.
             let gone = self.early.hold(now, frame);
+            self.look_at = earlier(self.look_at, self.early.next_expiry());
             self.without_destination(gone);
             return;
         };
@@ -309,6 +321,7 @@ impl DataCore {
 
     /// Messages of a lane have left for good.
     pub fn lane_out(&mut self, lane: LaneId, messages: u64, bytes: u64) {
+        self.stir_lane(lane);
         if let Some(bridge) = self.lane_bridge(lane) {
             bridge.stats.out.add_many(messages, bytes);
         }
@@ -316,6 +329,7 @@ impl DataCore {
 
     /// What the link dropped of a lane.
     pub fn lane_dropped(&mut self, lane: LaneId, reason: DropReason, messages: u64) {
+        self.stir_lane(lane);
         if let Some(bridge) = self.lane_bridge(lane) {
             bridge.stats.dropped.add(reason, messages);
         }
@@ -329,27 +343,41 @@ impl DataCore {
         }
     }
 
-    /// Ends bridges that have drained. Returns when it wants to be called again.
+    /// Something has changed that bridges may wait for: who is there, what waits in lanes.
+    pub fn stir(&mut self) {
+        self.stirred |= !self.draining.is_empty();
+    }
+
+    fn stir_lane(&mut self, lane: LaneId) {
+        if let Some((topic, _)) = self.lanes.get(lane.0 as usize) {
+            self.stirred |= self.draining.contains(topic);
+        }
+    }
+
+    /// Ends bridges that have drained, sends what was held, and answers questions. Returns when it wants to be called again; calls
+    /// before that cost nothing.
     pub fn drain(&mut self, now: Instant, link: &mut dyn LaneLink) -> Option<Instant> {
+        if !self.stirred && self.look_at.is_none_or(|at| now < at) {
+            return self.look_at;
+        }
+        self.stirred = false;
         let gone = self.early.expire(now);
         self.without_destination(gone);
         let mut next = earlier(self.early.next_expiry(), self.answer(now, link));
-        if !self.draining {
-            return next;
-        }
-        let mut still_draining = false;
-        for index in 0..self.topics.len() {
-            let topic = topic_id(index);
-            let path = &mut self.topics[index];
+        for topic in std::mem::take(&mut self.draining) {
+            let mut again = None;
+            let path = &mut self.topics[topic.0 as usize];
             for bridge in &mut path.bridges {
-                if let Some(until) = bridge.empty(now, path.name.as_str(), link) {
-                    still_draining = true;
-                    next = earlier(next, Some(until));
-                }
+                let at = bridge.empty(now, path.name.as_str(), &mut self.succession, link);
+                again = earlier(again, at);
             }
-            self.release(now, topic, link);
+            again = earlier(again, self.release(now, topic, link));
+            if again.is_some() {
+                self.draining.insert(topic);
+                next = earlier(next, again);
+            }
         }
-        self.draining = still_draining;
+        self.look_at = next;
         next
     }
 

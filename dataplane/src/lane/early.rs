@@ -3,7 +3,7 @@
 //! Both flows learn of a pair by the same announcement, but not at the same moment: the sender may be quicker by some
 //! hundred milliseconds. What it sends then is meant for us and waits here, bounded, until the bridge stands.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use blaze_proto::Frame;
@@ -19,6 +19,8 @@ const MAX_BYTES: usize = 8 * 1024 * 1024;
 #[derive(Default)]
 pub(super) struct Early {
     waiting: VecDeque<(Instant, Frame)>,
+    /// How many of each topic.
+    topics: HashMap<String, usize>,
     bytes: usize,
 }
 
@@ -26,6 +28,12 @@ impl Early {
     /// Holds a message. Returns those that gave way.
     pub(super) fn hold(&mut self, now: Instant, frame: Frame) -> Vec<Frame> {
         self.bytes += frame.wire_len();
+        match self.topics.get_mut(frame.topic()) {
+            Some(count) => *count += 1,
+            None => {
+                self.topics.insert(frame.topic().to_owned(), 1);
+            }
+        }
         self.waiting.push_back((now, frame));
         let mut gone = Vec::new();
         while self.waiting.len() > MAX_MESSAGES || (self.bytes > MAX_BYTES && self.waiting.len() > 1) {
@@ -45,7 +53,7 @@ impl Early {
 
     /// Whether a message of the topic waits.
     pub(super) fn holds(&self, topic: &str) -> bool {
-        self.waiting.iter().any(|(_, frame)| frame.topic() == topic)
+        self.topics.contains_key(topic)
     }
 
     /// When the next one has waited long enough.
@@ -55,7 +63,7 @@ impl Early {
 
     /// The messages of a topic, older by what they waited.
     pub(super) fn take(&mut self, now: Instant, topic: &str) -> Vec<Frame> {
-        if self.waiting.is_empty() {
+        if self.topics.remove(topic).is_none() {
             return Vec::new();
         }
         let (taken, left): (VecDeque<_>, VecDeque<_>) = std::mem::take(&mut self.waiting)
@@ -74,6 +82,12 @@ impl Early {
     fn pop(&mut self) -> Option<Frame> {
         let (_, frame) = self.waiting.pop_front()?;
         self.bytes -= frame.wire_len();
+        if let Some(count) = self.topics.get_mut(frame.topic()) {
+            *count -= 1;
+            if *count == 0 {
+                self.topics.remove(frame.topic());
+            }
+        }
         Some(frame)
     }
 }
@@ -101,8 +115,10 @@ mod tests {
         assert_eq!(taken.iter().map(Frame::sequence).collect::<Vec<_>>(), [1, 2, 3]);
         assert!(taken.iter().all(|frame| frame.age_us() == 20_000));
         assert!(early.take(now, "a").is_empty());
+        assert!(early.holds("b") && !early.holds("a"));
         assert_eq!(early.expire(now + WAIT).len(), 3);
         assert_eq!((early.bytes, early.next_expiry()), (0, None));
+        assert!(!early.holds("b"));
     }
 
     #[test]

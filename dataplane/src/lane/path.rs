@@ -105,8 +105,10 @@ pub enum Phase {
     },
     /// Its pair has vanished: it empties its queue.
     Draining {
-        /// Until then at most.
+        /// Until then, unless more comes that was on its way to it …
         until: Instant,
+        /// … but until then at most.
+        latest: Instant,
     },
     /// Its writer cannot be made: the reason is with the bridge.
     Failed {
@@ -135,6 +137,8 @@ pub struct BridgeState {
     pub bucket: Option<TokenBucket>,
     /// Where it writes.
     pub sink: Sink,
+    /// It has given messages to its lane since it last ended.
+    pub(super) submitted: bool,
     /// Messages that wait until the receiver before this one has written its own.
     pub(super) held: Option<Held>,
     /// It drains, and what its receiver got must be written before another one goes on.

@@ -7,6 +7,7 @@ use blaze_domain::{TopicName, WriterId};
 
 use super::core::{DRAIN, DataCore, FORGET, LaneLink, MAX_TOPICS};
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
+use super::succession::LONGEST_WAIT;
 use super::writer::NewWriter;
 use crate::link::LaneId;
 use crate::plan::{Bridge, Target, TopicPlan};
@@ -78,7 +79,6 @@ impl DataCore {
     ) {
         let path = &mut self.topics[topic.0 as usize];
         path.info = info;
-        let mut orphans = Vec::new();
         for bridge in &mut path.bridges {
             let planned = plan
                 .bridges
@@ -86,12 +86,13 @@ impl DataCore {
                 .any(|p| p.from == bridge.from && p.to == bridge.target);
             match bridge.phase {
                 Phase::Up { .. } if !planned => {
-                    bridge.phase = Phase::Draining { until: now + DRAIN };
-                    self.draining = true;
-                    if let Some(held) = bridge.held.take() {
-                        orphans.push((bridge.from, bridge.target.clone(), held));
-                    } else if bridge.has_successor(plan) {
-                        bridge.unwritten = Some(self.succession.unwritten(now, topic));
+                    bridge.phase = Phase::Draining {
+                        until: now + DRAIN,
+                        latest: now + LONGEST_WAIT,
+                    };
+                    self.draining.insert(topic);
+                    if bridge.has_successor(plan) {
+                        self.succession.await_written(now, topic, bridge);
                     }
                 }
                 Phase::Failed { .. } if !planned => bridge.end(now),
@@ -109,12 +110,11 @@ impl DataCore {
                 self.begun.push((topic, at));
             }
             if begins {
-                self.hold_back(topic, at);
+                self.hold_back(now, topic, at);
             }
         }
-        for (from, target, held) in orphans {
-            self.adopt(topic, from, &target, held);
-        }
+        self.pass_on(topic);
+        self.stir();
     }
 
     /// Gives bridges of a topic that have begun what was kept for them. To be called after [`DataCore::apply`].
@@ -128,10 +128,15 @@ impl DataCore {
             let Some(bridge) = path.bridges.get_mut(at) else {
                 continue;
             };
+            // What is kept is older than what another bridge has held for this one.
+            let passed_on = bridge.held.as_mut().map(std::mem::take);
             for message in self.kept.of(now, topic, bridge.from) {
                 if bridge.takes() && bridge.wants(&message) {
                     bridge.pass(now, topic, &message, large, &mut self.succession, link);
                 }
+            }
+            if let Some(held) = &mut bridge.held {
+                held.append(passed_on);
             }
         }
     }

@@ -25,6 +25,12 @@ impl Count {
         self.messages += messages;
         self.bytes += bytes;
     }
+
+    /// Takes one message back.
+    pub(super) fn remove(&mut self, bytes: u64) {
+        self.messages = self.messages.saturating_sub(1);
+        self.bytes = self.bytes.saturating_sub(bytes);
+    }
 }
 
 /// Dropped messages by reason.

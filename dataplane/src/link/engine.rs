@@ -319,6 +319,23 @@ impl Engine {
         FORGET_AFTER
     }
 
+    /// Whether a flow lives and answers when it is asked what it has written.
+    #[must_use]
+    pub fn answers_written(&self, flow: &FlowId) -> bool {
+        let peer = self.by_flow.get(flow).and_then(|at| self.peers[*at].as_ref());
+        let says_so = |peer: &Peer| peer.hello.as_ref().is_some_and(|hello| hello.answers_written);
+        peer.is_some_and(|peer| peer.is_connected() && says_so(peer))
+    }
+
+    /// Whether the queue of a class to a flow is empty, or takes so many bytes more and is at most half full then. Of a flow that
+    /// cannot be written to: yes, as nothing waits for it.
+    #[must_use]
+    pub fn has_room(&self, flow: &FlowId, class: Priority, bytes: usize) -> bool {
+        let peer = self.by_flow.get(flow).and_then(|at| self.peers[*at].as_ref());
+        let full = |peer: &Peer| peer.is_connected() && !peer.send[class_index(class)].has_room(bytes);
+        !peer.is_some_and(full)
+    }
+
     /// Whether nothing waits to be sent to anybody but LinkControl.
     #[must_use]
     pub fn is_drained(&self) -> bool {

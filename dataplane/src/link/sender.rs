@@ -189,6 +189,11 @@ impl SendClass {
         message.bytes() + MESSAGE_OVERHEAD
     }
 
+    /// Whether nothing waits, or so many bytes more make half of what may.
+    pub(crate) fn has_room(&self, bytes: usize) -> bool {
+        self.waiting_bytes == 0 || self.waiting_bytes + bytes <= self.limits.queue_bytes / 2
+    }
+
     /// Takes a message; the oldest that are not started give way.
     pub(crate) fn submit(&mut self, submit: Submit<'_>, ledger: &mut Ledger) {
         if submit.keep_newest > 0 {

@@ -120,6 +120,7 @@ impl Engine {
             egress: self.egress,
             public_key: Bytes::new(),
             ingress_bytes_per_s: None,
+            answers_written: true,
             // Who is on the inter scope is a gateway, if its group has any.
             ..Hello::default()
         }

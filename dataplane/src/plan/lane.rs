@@ -52,6 +52,7 @@ impl LaneBuilder {
                 .any(|(offer, ask)| asks_too_much(offer, ask))
                 .then_some(WhyCode::QosMismatch),
             relays: Vec::new(),
+            shared: None,
         };
         self.cap(&mut lane);
         Some(lane)

@@ -35,7 +35,7 @@ pub use rules::PlanRules;
 pub use survey::Survey;
 pub(crate) use view::{Group, Pairing, Publisher, Requester, TopicView, meets_directly, type_detail};
 
-use crate::world::{FlowState, OriginFilter, World};
+use crate::world::{FlowState, LayerScopeId, OriginFilter, World};
 use lane::LaneBuilder;
 
 /// What one flow does for one topic.
@@ -164,6 +164,8 @@ pub struct LaneSpec {
     /// Out of the layer: flows, sorted, that are not on the inter scope, so that what they wrote to the layer scope from their
     /// own nodes is carried as if it was born there.
     pub relays: Vec<FlowId>,
+    /// To another group: the layer broker that its flows share, so that another of them could be the receiver as well; `None`: it is alone.
+    pub shared: Option<LayerScopeId>,
 }
 
 impl LaneSpec {
@@ -372,6 +374,10 @@ impl Planner<'_, '_> {
                 .lane(self.view.pairs([publisher], requesters.iter().copied()))
                 .map(|lane| LaneSpec {
                     relays: relays.to_vec(),
+                    shared: match group {
+                        Group::Shared(_, broker) => Some(broker),
+                        Group::Alone(_) => None,
+                    },
                     ..lane
                 });
             let Some(receiver) = self.view.next_receiver(publisher, group, &kept) else {

@@ -274,7 +274,8 @@ impl World {
         match flow.life {
             Life::Draining(since) => {
                 let over = now - since >= Duration::from_millis(600);
-                if over || (flow.control.has_handed_over() && !flow.plane.core.is_draining()) {
+                let written = now - since >= Duration::from_millis(2_100) || !flow.plane.core.has_unwritten();
+                if written && (over || (flow.control.has_handed_over() && !flow.plane.core.is_draining())) {
                     flow.control.say_goodbye();
                     if let Some(engine) = &mut flow.plane.engine {
                         engine.goodbye(now);

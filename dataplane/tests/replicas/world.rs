@@ -264,6 +264,7 @@ impl World {
             End::Stopped => {
                 flow.life = Life::Draining(now);
                 flow.control.start_draining(now, wall_ms);
+                flow.plane.core.leave(now);
             }
         }
     }

@@ -17,6 +17,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::lane::path::{BareInfo, TopicInfo};
 use crate::plan::{Bridge, TopicPlan};
+use crate::world::LayerScopeId;
 
 #[derive(Default)]
 struct NotingLink {
@@ -25,6 +26,8 @@ struct NotingLink {
     refuse: bool,
     told: Vec<(FlowId, Body)>,
     gone: Option<FlowId>,
+    /// Messages that may wait when more are released; 0 = any number.
+    room: u64,
 }
 
 impl LaneLink for NotingLink {
@@ -45,11 +48,15 @@ impl LaneLink for NotingLink {
     fn is_suspect(&self, _to: &FlowId) -> bool {
         self.refuse
     }
-    fn is_there(&self, to: &FlowId) -> bool {
+    fn answers(&self, to: &FlowId) -> bool {
         self.gone.as_ref() != Some(to)
     }
-    fn tell(&mut self, _now: Instant, to: &FlowId, body: Body) {
+    fn has_room(&self, _to: &FlowId, _class: Priority, _bytes: usize) -> bool {
+        self.room == 0 || self.waiting.values().sum::<u64>() < self.room
+    }
+    fn tell(&mut self, _now: Instant, to: &FlowId, body: Body) -> bool {
         self.told.push((to.clone(), body));
+        true
     }
 }
 
@@ -88,6 +95,7 @@ fn lane_spec() -> crate::plan::LaneSpec {
         from: Vec::new(),
         degraded: None,
         relays: Vec::new(),
+        shared: Some(LayerScopeId::kafka("")),
     }
 }
 
@@ -146,16 +154,16 @@ impl Bench {
         });
     }
 
+    /// Whatever has changed.
+    fn drain(&mut self) -> Option<Instant> {
+        self.core.stirred = true;
+        self.core.drain(self.now, &mut self.link)
+    }
+
     fn take(&mut self, from: Scope, contents: Vec<Content>) {
         let mut batch: Vec<Received> = contents
             .into_iter()
-            .map(|content| Received {
-                content,
-                at: self.now,
-                broker_age_us: 0,
-                kept: false,
-                place: None,
-            })
+            .map(|content| received(content, self.now))
             .collect();
         self.core
             .ingest(self.now, WALL, self.topic, from, &mut batch, &mut self.link);
@@ -163,6 +171,16 @@ impl Bench {
 
     fn drops(&self) -> Vec<(DropReason, u64)> {
         self.core.path(self.topic).ingress_drops.iter().collect()
+    }
+}
+
+fn received(content: Content, at: Instant) -> Received {
+    Received {
+        content,
+        at,
+        broker_age_us: 0,
+        kept: false,
+        place: None,
     }
 }
 
@@ -392,10 +410,7 @@ fn a_bridge_that_is_no_longer_planned_drains_and_comes_back_with_its_counters() 
     bench.apply(Vec::new(), TopicInfo::default());
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 2, "robot-1", 0, 1))]);
     assert_eq!(bench.link.submitted.len(), 1, "it takes in nothing more");
-    assert!(
-        bench.core.drain(bench.now, &mut bench.link).is_some(),
-        "something is still queued"
-    );
+    assert!(bench.drain().is_some(), "something is still queued");
     assert!(
         bench.core.drain(bench.now + DRAIN, &mut bench.link).is_none(),
         "the deadline ends it"
@@ -586,7 +601,7 @@ fn a_bridge_that_ends_keeps_its_writer_until_all_is_delivered() {
     bench.write_with(Ok(&adapter));
     bench.publish(1..=4);
     bench.apply(Vec::new(), TopicInfo::default());
-    assert!(bench.core.drain(bench.now, &mut bench.link).is_some(), "it still waits");
+    assert!(bench.drain().is_some(), "it still waits");
     assert!(bench.core.drain(bench.now + DRAIN, &mut bench.link).is_none());
     let ended = |bench: &Bench| bench.core.path(bench.topic).bridges[0].is_over();
     assert!(!ended(&bench) && Arc::strong_count(&adapter) == 2);
@@ -698,7 +713,7 @@ fn a_forgotten_topic_leaves_its_lanes_and_windows_to_others() {
     let (lane, _, _) = bench.link.submitted[0];
     bench.link.waiting.clear();
     bench.apply(Vec::new(), TopicInfo::default());
-    bench.core.drain(bench.now, &mut bench.link);
+    bench.drain();
     bench.core.forget_unused(bench.now);
     bench.now += FORGET;
     assert_eq!(bench.core.forget_unused(bench.now), 1);
@@ -726,12 +741,12 @@ fn a_bridge_takes_the_place_of_one_that_ended_long_ago() {
     for n in 1..100 {
         bench.now += FORGET;
         bench.apply(vec![bridge(Scope::Node, to(n))], TopicInfo::default());
-        bench.core.drain(bench.now, &mut bench.link);
+        bench.drain();
     }
     assert!(bench.core.path(bench.topic).bridges.len() <= 3);
     // The receivers before it never say that they have written what they got.
     bench.now += FORGET;
-    bench.core.drain(bench.now, &mut bench.link);
+    bench.drain();
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
     let (lane, _, _) = bench.link.submitted[0];
     bench.core.lane_out(lane, 1, 1);

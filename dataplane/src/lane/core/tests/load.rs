@@ -127,7 +127,7 @@ fn a_topic_that_cannot_be_handed_over_exactly_stays() {
     bench.apply(vec![bridge(Scope::Layer, to_cloud())], TopicInfo::default());
     assert!(!bench.may_move(), "the bridge into the layer drains");
     bench.now += DRAIN;
-    bench.core.drain(bench.now, &mut bench.link);
+    bench.drain();
     assert!(bench.may_move());
 }
 
@@ -139,7 +139,7 @@ fn a_topic_that_is_given_up_is_emptied_when_its_last_message_has_left() {
     bench.link.waiting.insert(LaneId(0), 1);
     bench.apply(vec![], TopicInfo::default());
     assert_eq!(bench.core.stopped_at(bench.topic), [20]);
-    bench.core.drain(bench.now, &mut bench.link);
+    bench.drain();
     assert!(!bench.core.has_emptied(&name));
     assert_eq!(
         bench.core.measure(bench.now, &bench.link).out_bytes_per_s,
@@ -147,7 +147,7 @@ fn a_topic_that_is_given_up_is_emptied_when_its_last_message_has_left() {
         "it takes nothing in"
     );
     bench.link.waiting.clear();
-    bench.core.drain(bench.now, &mut bench.link);
+    bench.drain();
     assert!(bench.core.has_emptied(&name));
 }
 
