@@ -153,9 +153,23 @@ impl DataCore {
     }
 
     pub(super) fn is_new(&mut self, topic: TopicId, frame: &Frame) -> bool {
+        self.note_sequence(topic, frame, DuplicateWindow::insert)
+    }
+
+    /// The same of a message that came over the link. One that is older than the first of its writer was not meant for this flow, unless it
+    /// is kept for late joiners: it comes when another flow begins to carry the topic, a second back so that nothing is missed, and this
+    /// one has begun a moment ago. It would be written behind newer ones.
+    pub(super) fn is_new_here(&mut self, topic: TopicId, frame: &Frame) -> bool {
+        if frame.depth() > 0 {
+            return self.is_new(topic, frame);
+        }
+        self.note_sequence(topic, frame, DuplicateWindow::insert_since_first)
+    }
+
+    fn note_sequence(&mut self, topic: TopicId, frame: &Frame, insert: fn(&mut DuplicateWindow, u64) -> bool) -> bool {
         let key = (topic, frame.writer());
         if let Some(window) = self.windows.get_mut(&key) {
-            return window.insert(frame.sequence());
+            return insert(window, frame.sequence());
         }
         if self.windows.len() == self.windows.cap().get() {
             self.evicted_writers += 1;

@@ -273,7 +273,7 @@ impl DataCore {
             Some(DropReason::Echo)
         } else if !self.path(topic).info.takes(&frame) {
             Some(DropReason::ForeignOrigin)
-        } else if !self.is_new(topic, &frame) {
+        } else if !self.is_new_here(topic, &frame) {
             Some(DropReason::Duplicate)
         } else {
             None

@@ -8,6 +8,8 @@ const WORDS: usize = 16;
 #[derive(Debug, Clone, Default)]
 pub struct DuplicateWindow {
     highest: u64,
+    /// The first that was noted.
+    first: u64,
     /// Bit `sequence % 1024`: seen.
     seen: [u64; WORDS],
 }
@@ -15,6 +17,9 @@ pub struct DuplicateWindow {
 impl DuplicateWindow {
     /// Notes a sequence. Returns whether it is new.
     pub fn insert(&mut self, sequence: u64) -> bool {
+        if self.highest == 0 {
+            self.first = sequence;
+        }
         if sequence > self.highest {
             self.advance(sequence);
         } else if self.highest - sequence >= WINDOW || self.has(sequence) {
@@ -23,6 +28,11 @@ impl DuplicateWindow {
         let (word, bit) = Self::place(sequence);
         self.seen[word] |= bit;
         true
+    }
+
+    /// As [`DuplicateWindow::insert`], but what is older than the first that was noted is not new.
+    pub fn insert_since_first(&mut self, sequence: u64) -> bool {
+        sequence >= self.first && self.insert(sequence)
     }
 
     fn advance(&mut self, to: u64) {
@@ -68,6 +78,23 @@ mod tests {
                 highest = highest.max(sequence);
             }
         }
+    }
+
+    #[test]
+    fn what_is_older_than_the_first_is_not_new() {
+        let mut window = DuplicateWindow::default();
+        for (sequence, new) in [
+            (8, true),
+            (9, true),
+            (7, false),
+            (11, true),
+            (10, true),
+            (8, false),
+            (5, false),
+        ] {
+            assert_eq!(window.insert_since_first(sequence), new, "{sequence}");
+        }
+        assert!(window.insert(5));
     }
 
     #[test]

@@ -269,6 +269,27 @@ fn an_own_write_that_comes_back_is_an_echo() {
     assert_eq!(bench.out.frames.lock().len(), 1);
 }
 
+/// A flow that has just begun gets newer messages from one carrier, and then what the next one sends again.
+#[test]
+fn what_comes_over_the_link_behind_newer_messages_is_dropped() {
+    let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer)]);
+    let of_fog = |sequence| {
+        let origin = Origin {
+            layer: "fog".into(),
+            node: "fog-1".into(),
+            ..Origin::default()
+        };
+        let header = Header::new("imu/data", origin, WriterId([3; 16]), sequence, WALL);
+        Frame::new(&header, Bytes::new()).unwrap().with_hops_and_age(1, 0)
+    };
+    for sequence in [8, 9, 5, 6, 7, 8, 9, 10] {
+        bench.core.deliver(bench.now, of_fog(sequence), &mut bench.link);
+    }
+    let written: Vec<u64> = bench.out.frames.lock().iter().map(Frame::sequence).collect();
+    assert_eq!(written, [8, 9, 10]);
+    assert_eq!(bench.drops(), [(DropReason::Duplicate, 5)]);
+}
+
 #[test]
 fn bare_payloads_get_an_identity_of_this_life_of_the_flow() {
     let mut bench = Bench::new(vec![
