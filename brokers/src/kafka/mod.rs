@@ -64,8 +64,10 @@ use producer::{Keying, Target};
 use settings::{Lot, Settings};
 use topics::Topics;
 
-/// How long closing waits for what was taken.
+/// How long closing waits for what was taken while the server is known not to answer.
 const DRAIN: Duration = Duration::from_secs(1);
+/// How long while it answers: a leader that is elected, or a busy server, may take more than a second for its acknowledgement.
+const DRAIN_ANSWERED: Duration = Duration::from_secs(3);
 /// How long closing waits for threads and tasks beyond that.
 const END: Duration = Duration::from_secs(3);
 /// How often closing looks whether all was taken.
@@ -237,7 +239,8 @@ impl Broker for KafkaBroker {
     async fn close(&self) {
         let inner = &self.inner;
         inner.begin_close();
-        let until = Instant::now() + DRAIN;
+        let answers = inner.gate.is_open();
+        let until = Instant::now() + if answers { DRAIN_ANSWERED } else { DRAIN };
         while !inner.is_drained() && Instant::now() < until && !inner.stop.is_cancelled() {
             tokio::time::sleep(DRAIN_TURN).await;
         }
