@@ -44,6 +44,8 @@ pub struct FlowView {
     pub gateway: AutoBool,
     /// Whether it is on the inter scope for its group.
     pub role: Role,
+    /// The broker of its layer has not answered it for some seconds: another flow of its group serves that better.
+    pub layer_away: bool,
 }
 
 /// Whether a flow is on the inter scope for the flows that share its layer broker.
@@ -84,6 +86,8 @@ pub struct Part {
     pub carrying: Carrying,
     /// The flows that it sends the topic to over the inter scope, sorted.
     pub receivers: Vec<FlowId>,
+    /// It sends to more flows than it can name.
+    pub more_receivers: bool,
     /// Of the own flow, while it carries the topic: whether it keeps it.
     pub hold: Hold,
 }

@@ -6,7 +6,8 @@
 //!     └───────────┴──────────────────── member ◄────────────────────────┘
 //! ```
 //!
-//! A gateway whose inter scope stops working joins anew, and meanwhile is none.
+//! A gateway whose inter scope stops working joins anew, and meanwhile is none; likewise one that reaches nobody there while another
+//! gateway of its group does.
 //!
 //! A flow that joins says so when it knows what is outside. One that leaves says so first: the others carry for it while what it
 //! sends itself still arrives, so nothing is missed, and repeats have the same identity.
@@ -29,6 +30,8 @@ const WELCOME_FOR: Duration = Duration::from_secs(60);
 const UNNEEDED_FOR: Duration = Duration::from_secs(5);
 /// A flow that cannot join within this time says that it cannot, and another one does.
 const CANNOT: Duration = Duration::from_secs(15);
+/// A gateway that has reached nobody for this long, though another one does, is none until it does.
+const CUT_OFF: Duration = Duration::from_secs(5);
 /// Whoever leaves the inter scope has heard of the flows there from the gateways within this time.
 const HEARD_OF: Duration = Duration::from_secs(30);
 /// One that leaves sends and takes what it did before for this long; its peers are told half way.
@@ -86,6 +89,8 @@ pub(super) struct Gateways {
     choice: Option<(Choice, Instant)>,
     /// It did not come to the inter scope in time, or has lost it.
     cannot: bool,
+    /// Since when it has reached nobody there, though others do.
+    cut_off: Option<Instant>,
     /// What Hello on the inter scope says.
     shown: FlowState,
 }
@@ -112,6 +117,7 @@ impl Gateways {
             left: None,
             choice: None,
             cannot: false,
+            cut_off: None,
             shown: FlowState::Starting,
         }
     }
@@ -224,8 +230,21 @@ impl ControlCore {
         if !concerned || self.state == FlowState::Draining {
             return;
         }
+        self.gateways.cut_off = if self.registry.is_cut_off() {
+            self.gateways.cut_off.or(Some(now))
+        } else {
+            None
+        };
         match self.gateways.stage {
             Stage::Joining { since, there } => self.join(now, since, there),
+            Stage::Gateway if self.is_cut_off(now) => {
+                self.gateways.cannot = true;
+                let stage = Stage::Joining {
+                    since: now,
+                    there: Some(now),
+                };
+                self.enter(now, stage);
+            }
             Stage::Leaving { since } => {
                 self.show_on_link(now);
                 if now.saturating_duration_since(since) >= LEAVE {
@@ -236,6 +255,11 @@ impl ControlCore {
             Stage::Closing => {}
             Stage::Listening | Stage::Gateway | Stage::Member => self.choose(now),
         }
+    }
+
+    fn is_cut_off(&self, now: Instant) -> bool {
+        let since = self.gateways.cut_off;
+        since.is_some_and(|since| now.saturating_duration_since(since) >= CUT_OFF)
     }
 
     fn choose(&mut self, now: Instant) {
@@ -268,7 +292,11 @@ impl ControlCore {
             }
             return;
         };
-        self.gateways.cannot = false;
+        // It is there, but of no use.
+        self.gateways.cannot = self.gateways.cut_off.is_some();
+        if self.gateways.cannot {
+            return;
+        }
         let listened = now.saturating_duration_since(there);
         if listened >= LISTEN && (self.registry.knows_link() || listened >= LISTEN + KNOW_OTHERS) {
             self.enter(now, Stage::Gateway);

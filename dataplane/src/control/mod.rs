@@ -255,6 +255,7 @@ impl ControlCore {
     /// Does what is due. To be called every few ten milliseconds.
     pub fn tick(&mut self, now: Instant, wall_ms: u64) {
         self.follow_choice(now);
+        self.tell_layer_away(now);
         let listened = self.has_listened(now);
         let knows_leases = !LOCAL.iter().any(|scope| self.is_reading_leases(*scope));
         if self.state == FlowState::Starting && listened && knows_leases && self.knows_replicas(now) {

@@ -75,6 +75,8 @@ pub enum Output {
         /// It is.
         shared: bool,
     },
+    /// Say in Hello that the layer broker has not answered for some seconds, or that it does again.
+    LayerAway(bool),
     /// Let the broker of a scope keep or forget a lease.
     SaveLease(UnsavedLease),
     /// Forget what is kept of writers for late joiners: their service no longer advertises the topic.

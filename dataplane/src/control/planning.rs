@@ -173,19 +173,28 @@ impl ControlCore {
         let before = self.durable.remove(topic).unwrap_or_default();
         let Sources { mut known, more } = durable;
         let gone: Vec<OriginFilter> = before.difference(&known).cloned().collect();
-        if (more || self.gateways.has_just_left(now)) && known.len() + gone.len() <= MAX_UNNAMED {
-            known.extend(gone);
+        let unnamed = more || self.gateways.has_just_left(now);
+        let (stay, gone): (Vec<_>, Vec<_>) = gone
+            .into_iter()
+            .partition(|of| unnamed || self.registry.may_return(now, of));
+        if known.len() + stay.len() <= MAX_UNNAMED {
+            known.extend(stay);
+            self.forget_sources(topic, gone, &known);
         } else {
-            for of in gone {
-                self.outputs.push_back(Output::ForgetWriters {
-                    topic: topic.clone(),
-                    of,
-                    but: known.clone(),
-                });
-            }
+            self.forget_sources(topic, [gone, stay].concat(), &known);
         }
         if !known.is_empty() {
             self.durable.insert(topic.clone(), known);
+        }
+    }
+
+    fn forget_sources(&mut self, topic: &TopicName, gone: Vec<OriginFilter>, known: &BTreeSet<OriginFilter>) {
+        for of in gone {
+            self.outputs.push_back(Output::ForgetWriters {
+                topic: topic.clone(),
+                of,
+                but: known.clone(),
+            });
         }
     }
 }

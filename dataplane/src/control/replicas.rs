@@ -194,6 +194,7 @@ impl ControlCore {
                 limit_bytes_per_s: load.limit_bytes_per_s,
             }),
             ingress_bytes_per_s: Some(load.in_bytes_per_s),
+            link_peers: self.registry.link_peers(),
             ..Hello::default()
         }
     }

@@ -1,7 +1,7 @@
 //! What the control core knows of the brokers of its local scopes, and what follows for leases, plans and channels.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName, WhyCode};
@@ -13,6 +13,9 @@ use crate::registry::Restored;
 
 /// The local scopes.
 pub(super) const LOCAL: [Scope; 2] = [Scope::Node, Scope::Layer];
+
+/// Others are told of a layer broker that has not answered for this long: it is as long as they need to notice that a flow has died.
+const AWAY: Duration = Duration::from_millis(2500);
 
 /// Whether the broker of a scope can be used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -44,6 +47,10 @@ pub(super) struct Scopes {
     health: BTreeMap<Scope, ScopeHealth>,
     /// Channels in use on brokers with a flow's side, with their depth.
     prepared: BTreeMap<(Scope, TopicName), u32>,
+    /// Since when the layer broker has not answered.
+    layer_away: Option<Instant>,
+    /// Whether others are told so.
+    says_away: bool,
 }
 
 impl Scopes {
@@ -60,6 +67,9 @@ impl ControlCore {
             return;
         }
         self.scopes.health.insert(scope, health);
+        if scope == Scope::Layer {
+            self.scopes.layer_away = (health == ScopeHealth::Away).then_some(now);
+        }
         self.registry.set_renewable(now, scope, health != ScopeHealth::Away);
         if (before == ScopeHealth::InUse) != (health == ScopeHealth::InUse) {
             let in_use = health == ScopeHealth::InUse;
@@ -72,6 +82,16 @@ impl ControlCore {
         }
         // What other flows are told of routes over this scope changes with it.
         self.touch_all(now);
+    }
+
+    /// Tells others when another flow of the layer serves its broker better, and when that is over.
+    pub(super) fn tell_layer_away(&mut self, now: Instant) {
+        let since = self.scopes.layer_away;
+        let away = since.is_some_and(|since| now.saturating_duration_since(since) >= AWAY);
+        if away != self.scopes.says_away {
+            self.scopes.says_away = away;
+            self.outputs.push_back(Output::LayerAway(away));
+        }
     }
 
     /// Whether the kept leases of a scope are still to be read, so that the flow cannot be ready.

@@ -153,6 +153,26 @@ fn a_flow_is_starting_until_all_kept_leases_are_read() {
 }
 
 #[test]
+fn others_are_told_of_a_layer_broker_that_does_not_answer_for_seconds() {
+    let mut bench = Bench::new();
+    let mut told = |bench: &mut Bench, health, ms| {
+        bench.outputs.clear();
+        bench.core.set_scope_health(bench.now, Scope::Layer, health);
+        bench.step(ms);
+        bench.step(0);
+        let away = bench.outputs.iter().filter_map(|output| match output {
+            Output::LayerAway(away) => Some(*away),
+            _ => None,
+        });
+        away.collect::<Vec<_>>()
+    };
+    assert_eq!(told(&mut bench, ScopeHealth::Away, 2000), []);
+    assert_eq!(told(&mut bench, ScopeHealth::Up, 2000), []);
+    assert_eq!(told(&mut bench, ScopeHealth::Away, 2600), [true]);
+    assert_eq!(told(&mut bench, ScopeHealth::Up, 0), [false]);
+}
+
+#[test]
 fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
     let mut bench = Bench::new();
     bench.core.restore_leases(bench.now, Scope::Node, &[]);

@@ -247,6 +247,9 @@ impl ControlTask {
                     self.publish(Scope::Layer, channel, &body, deadline);
                 }
             }
+            Output::LayerAway(away) => {
+                plane.with(|state| state.engine.as_mut().map(|engine| engine.set_layer_away(now, away)));
+            }
             Output::LayerScope { shared } => {
                 let said = if shared {
                     self.shared.layer_scope
@@ -281,7 +284,7 @@ impl ControlTask {
             Output::ForgetWriters { topic, of, but } => {
                 let writers = plane.with(|state| {
                     let id = state.core.find(topic.as_str())?;
-                    Some(state.core.forget_writers(id, &of, &but))
+                    Some(state.core.forget_writers(now, id, &of, &but))
                 });
                 for writer in writers.into_iter().flatten() {
                     self.forget_writer(&topic, writer);

@@ -124,7 +124,7 @@ impl DataCore {
             let (writer, sequence) = path
                 .bare
                 .entry(from)
-                .or_insert_with(|| (bare_writer(config, from, path.name.as_str()), 0));
+                .or_insert_with(|| (bare_writer(config, from, path.name.as_str(), path.life), 0));
             *sequence += 1;
             (*writer, *sequence)
         });
@@ -159,8 +159,12 @@ impl DataCore {
     /// The same of a message that came over the link. One that is older than the first of its writer was not meant for this flow, unless it
     /// is kept for late joiners: it comes when another flow begins to carry the topic, a second back so that nothing is missed, and this
     /// one has begun a moment ago. It would be written behind newer ones.
-    pub(super) fn is_new_here(&mut self, topic: TopicId, frame: &Frame) -> bool {
+    pub(super) fn is_new_here(&mut self, now: Instant, topic: TopicId, frame: &Frame) -> bool {
         if frame.depth() > 0 {
+            // Its flow was away for so long that it counted as gone: those who join late would never get what it sends again.
+            if self.kept.takes_again(now, topic, frame.writer()) {
+                self.windows.pop(&(topic, frame.writer()));
+            }
             return self.is_new(topic, frame);
         }
         self.note_sequence(topic, frame, DuplicateWindow::insert_since_first)
@@ -181,11 +185,12 @@ impl DataCore {
     }
 }
 
-/// Writer of bare messages that this flow numbers: new at each start of the flow.
-fn bare_writer(config: &DataConfig, from: Scope, topic: &str) -> WriterId {
+/// Writer of bare messages that this flow numbers: new at each start of the flow, and where a topic is there again that was
+/// forgotten, as its numbers begin again.
+fn bare_writer(config: &DataConfig, from: Scope, topic: &str, life: u64) -> WriterId {
     use sha2::{Digest, Sha256};
     let text = format!(
-        "{from}|{}|{}|{topic}|{}|{}",
+        "{from}|{}|{}|{topic}|{}|{}|{life}",
         config.me.layer, config.me.node, config.epoch, config.salt
     );
     let digest = Sha256::digest(text.as_bytes());

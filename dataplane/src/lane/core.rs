@@ -108,6 +108,8 @@ pub struct DataCore {
     pub(super) lanes: Vec<(TopicId, usize)>,
     /// Places of topics that were forgotten.
     pub(super) vacant: Vec<TopicId>,
+    /// Topics that were ever given a place.
+    pub(super) placed: u64,
     /// Lanes of topics that were forgotten.
     pub(super) free_lanes: Vec<LaneId>,
     /// Topics with bridges that empty their queues, or hold messages.
@@ -142,6 +144,7 @@ impl DataCore {
             windows: LruCache::new(capacity),
             lanes: Vec::new(),
             vacant: Vec::new(),
+            placed: 0,
             free_lanes: Vec::new(),
             draining: BTreeSet::new(),
             stirred: false,
@@ -273,7 +276,7 @@ impl DataCore {
             Some(DropReason::Echo)
         } else if !self.path(topic).info.takes(&frame) {
             Some(DropReason::ForeignOrigin)
-        } else if !self.is_new_here(topic, &frame) {
+        } else if !self.is_new_here(now, topic, &frame) {
             Some(DropReason::Duplicate)
         } else {
             None

@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeSet, VecDeque};
 use std::num::NonZeroUsize;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use blaze_domain::{Origin, Scope, WriterId};
 use blaze_proto::Frame;
@@ -22,6 +22,8 @@ const MAX_BYTES: usize = 64 * 1024 * 1024;
 /// Messages of one writer that are kept at most, whatever depth it names.
 const MAX_DEPTH: usize = 10_000;
 
+/// After this time what a writer sends that was forgotten is not a copy that was on its way when that was.
+const AGAIN: Duration = Duration::from_secs(10);
 /// Superseded writers that wait to be fetched at most.
 const MAX_SUPERSEDED: usize = 16_384;
 
@@ -62,6 +64,8 @@ pub(super) struct KeptMessages {
     pub(super) evicted: u64,
     /// Writers of earlier lives of their services, which are to be forgotten by the brokers, too.
     pub(super) superseded: Vec<(TopicId, WriterId)>,
+    /// Writers that were forgotten because nobody advertised for them, and when.
+    forgotten: LruCache<(TopicId, WriterId), Instant>,
 }
 
 impl Default for KeptMessages {
@@ -71,6 +75,7 @@ impl Default for KeptMessages {
             bytes: 0,
             evicted: 0,
             superseded: Vec::new(),
+            forgotten: LruCache::new(NonZeroUsize::new(MAX_WRITERS).unwrap_or(NonZeroUsize::MIN)),
         }
     }
 }
@@ -165,7 +170,13 @@ impl KeptMessages {
     }
 
     /// Forgets writers of a topic. Returns which.
-    pub(super) fn forget(&mut self, topic: TopicId, of: &OriginFilter, but: &BTreeSet<OriginFilter>) -> Vec<WriterId> {
+    pub(super) fn forget(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        of: &OriginFilter,
+        but: &BTreeSet<OriginFilter>,
+    ) -> Vec<WriterId> {
         let is_of = |kept: &Kept| {
             let frame = &kept.frame;
             let matches = |filter: &OriginFilter| {
@@ -174,12 +185,27 @@ impl KeptMessages {
             matches(of) && !but.iter().any(matches)
         };
         let fits = |writer: &Writer| writer.messages.back().is_some_and(is_of);
-        self.remove(|(of, _), writer| *of == topic && fits(writer))
+        let gone = self.remove(|(of, _), writer| *of == topic && fits(writer));
+        for writer in &gone {
+            self.forgotten.put((topic, *writer), now);
+        }
+        gone
+    }
+
+    /// Whether a writer was forgotten a while ago; it is asked once, when something of it comes again.
+    pub(super) fn takes_again(&mut self, now: Instant, topic: TopicId, writer: WriterId) -> bool {
+        let key = (topic, writer);
+        let since = self.forgotten.peek(&key).map(|at| now.saturating_duration_since(*at));
+        since.is_some_and(|since| since >= AGAIN) && self.forgotten.pop(&key).is_some()
     }
 
     /// Forgets topics.
     pub(super) fn forget_topics(&mut self, gone: impl Fn(TopicId) -> bool) {
         self.remove(|(of, _), _| gone(*of));
+        let forgotten: Vec<_> = self.forgotten.iter().map(|(key, _)| *key).collect();
+        for key in forgotten.into_iter().filter(|(topic, _)| gone(*topic)) {
+            self.forgotten.pop(&key);
+        }
     }
 
     fn remove(&mut self, gone: impl Fn(&(TopicId, WriterId), &Writer) -> bool) -> Vec<WriterId> {
@@ -207,7 +233,6 @@ mod tests {
     use super::*;
     use blaze_proto::Header;
     use bytes::Bytes;
-    use std::time::Duration;
 
     const TOPIC: TopicId = TopicId(3);
 
@@ -263,8 +288,15 @@ mod tests {
             ..OriginFilter::default()
         };
         let any = BTreeSet::from([OriginFilter::default()]);
-        assert_eq!(kept.forget(TOPIC, &of, &any), [], "somebody says that it is there");
-        assert_eq!(kept.forget(TOPIC, &of, &BTreeSet::new()), [WriterId([2; 16])]);
+        assert_eq!(kept.forget(now, TOPIC, &of, &any), [], "somebody says that it is there");
+        assert_eq!(kept.forget(now, TOPIC, &of, &BTreeSet::new()), [WriterId([2; 16])]);
+        assert!(
+            !kept.takes_again(now, TOPIC, WriterId([2; 16])),
+            "a copy that was on its way"
+        );
+        assert!(!kept.takes_again(now + AGAIN, TOPIC, WriterId([1; 16])));
+        assert!(kept.takes_again(now + AGAIN, TOPIC, WriterId([2; 16])));
+        assert!(!kept.takes_again(now + AGAIN, TOPIC, WriterId([2; 16])), "once");
         assert_eq!(sequences(&kept, now), [(3, 1)]);
         kept.forget_topics(|_| true);
         assert_eq!((kept.bytes, kept.writers.len()), (0, 0));

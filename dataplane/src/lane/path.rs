@@ -213,6 +213,8 @@ impl BridgeState {
 pub struct TopicPath {
     /// Its name.
     pub name: TopicName,
+    /// Another number each time that a topic is given a place, so that bare messages of a topic that was forgotten have another writer.
+    pub(super) life: u64,
     /// What local advertisements say of it.
     pub info: TopicInfo,
     /// Its bridges, ended ones included: they come back with their counters.
@@ -238,9 +240,10 @@ pub struct TopicPath {
 impl TopicPath {
     /// A topic without bridges.
     #[must_use]
-    pub fn new(name: TopicName, now: Instant) -> Self {
+    pub fn new(name: TopicName, life: u64, now: Instant) -> Self {
         Self {
             name,
+            life,
             info: TopicInfo::default(),
             bridges: Vec::new(),
             largest_bytes: 0,

@@ -51,7 +51,7 @@ impl DataCore {
         if let Some(id) = self.by_name.get(name) {
             return Some(*id);
         }
-        let path = TopicPath::new(name.clone(), now);
+        let path = TopicPath::new(name.clone(), self.placed + 1, now);
         let id = match self.vacant.pop() {
             Some(id) => {
                 self.topics[id.0 as usize] = path;
@@ -63,6 +63,7 @@ impl DataCore {
                 topic_id(self.topics.len() - 1)
             }
         };
+        self.placed += 1;
         self.by_name.insert(name.clone(), id);
         Some(id)
     }
@@ -143,8 +144,14 @@ impl DataCore {
 
     /// A writer's lease is over: what is kept of it goes, unless one of `but` says that it is still there. Returns which writers
     /// that were.
-    pub fn forget_writers(&mut self, topic: TopicId, of: &OriginFilter, but: &BTreeSet<OriginFilter>) -> Vec<WriterId> {
-        self.kept.forget(topic, of, but)
+    pub fn forget_writers(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        of: &OriginFilter,
+        but: &BTreeSet<OriginFilter>,
+    ) -> Vec<WriterId> {
+        self.kept.forget(now, topic, of, but)
     }
 
     /// Writers of earlier lives of their services, since the last call: what brokers keep of them goes, too.

@@ -89,6 +89,7 @@ pub struct Engine {
     pub(super) clocks: Clocks,
     pub(super) sender: SenderId,
     pub(super) state: State,
+    pub(super) layer_away: bool,
     pub(super) registry: (u64, u64),
     pub(super) addresses: Addresses,
     pub(super) guid_prefixes: Vec<Bytes>,
@@ -116,6 +117,7 @@ impl Engine {
             clocks: Clocks::new(now, wall_ns),
             sender: SenderId::of(&config.me, config.epoch),
             state: State::Starting,
+            layer_away: false,
             registry: (0, 0),
             addresses: Addresses::default(),
             guid_prefixes: Vec::new(),
@@ -163,6 +165,14 @@ impl Engine {
     pub fn set_layer_scope(&mut self, now: Instant, scope: LayerScope, id: u64) {
         if self.config.layer_scope != (scope, id) {
             self.config.layer_scope = (scope, id);
+            self.hello_soon(now);
+        }
+    }
+
+    /// Whether the layer broker has not answered for some seconds, for the next Hellos.
+    pub fn set_layer_away(&mut self, now: Instant, away: bool) {
+        if self.layer_away != away {
+            self.layer_away = away;
             self.hello_soon(now);
         }
     }

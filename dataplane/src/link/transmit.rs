@@ -121,6 +121,7 @@ impl Engine {
             public_key: Bytes::new(),
             ingress_bytes_per_s: None,
             answers_written: true,
+            layer_away: self.layer_away,
             // Who is on the inter scope is a gateway, if its group has any.
             ..Hello::default()
         }

@@ -122,6 +122,8 @@ pub(crate) struct TopicView<'w> {
     pub(crate) requesters: Vec<Requester<'w>>,
     /// Of flows that are down.
     lost_requesters: Vec<Requester<'w>>,
+    /// Flows whose layer broker does not answer them.
+    away: Vec<&'w FlowId>,
     /// Whether this flow is on the inter scope.
     role: Role,
     /// Flows of the own group that are on the inter scope for it and carry topics.
@@ -150,6 +152,7 @@ impl<'w> TopicView<'w> {
             publishers: Vec::new(),
             requesters: Vec::new(),
             lost_requesters: Vec::new(),
+            away: Vec::new(),
             role: own.role,
             gateways: Arc::clone(&survey.gateways),
             members: Arc::clone(&survey.members),
@@ -165,6 +168,9 @@ impl<'w> TopicView<'w> {
     }
 
     fn add(&mut self, flow: &'w FlowId, view: &'w FlowView, entry: &'w TopicEntry) {
+        if view.layer_away {
+            self.away.push(flow);
+        }
         let group = Group::of(flow, view);
         if group != self.group && !self.role.is_inside() {
             // Only a gateway knows what flows outside want, and says it.
@@ -327,11 +333,23 @@ impl<'w> TopicView<'w> {
             .chain(gateways.filter(move |_| for_members))
     }
 
+    /// Those of the candidates whose layer broker answers them; all of them where that is so for none.
+    fn able_candidates<'p>(
+        &'p self,
+        publisher: &'p Publisher<'w>,
+        group: Group<'w>,
+    ) -> impl Iterator<Item = &'w FlowId> + use<'p, 'w> {
+        // Of hardly any topic there is one.
+        let some = !self.away.is_empty() && self.candidates(publisher, group).any(|flow| !self.away.contains(&flow));
+        self.candidates(publisher, group)
+            .filter(move |flow| !some || !self.away.contains(flow))
+    }
+
     /// The flow of a group that gets what the publisher sends: one of `kept` if it still could, else by rendezvous.
     pub(crate) fn receiver(&self, publisher: &Publisher<'w>, group: Group<'w>, kept: &[&FlowId]) -> Option<&'w FlowId> {
-        self.candidates(publisher, group)
+        self.able_candidates(publisher, group)
             .find(|candidate| kept.contains(candidate))
-            .or_else(|| rendezvous::choose(self.topic.as_str(), self.candidates(publisher, group)))
+            .or_else(|| rendezvous::choose(self.topic.as_str(), self.able_candidates(publisher, group)))
     }
 
     /// The same for the sender, who leaves the one of `kept` for a better one that has settled.
@@ -343,7 +361,7 @@ impl<'w> TopicView<'w> {
     ) -> Option<&'w FlowId> {
         let held = self.receiver(publisher, group, kept)?;
         let able = |candidate: &&FlowId| *candidate == held || self.is_settled(candidate);
-        rendezvous::choose(self.topic.as_str(), self.candidates(publisher, group).filter(able))
+        rendezvous::choose(self.topic.as_str(), self.able_candidates(publisher, group).filter(able))
     }
 
     /// Whether this flow may get what a publisher outside sends: its sender says so, or would choose it.
@@ -353,7 +371,7 @@ impl<'w> TopicView<'w> {
         }
         let says_so = || {
             let part = self.part_of(publisher.flow);
-            part.is_some_and(|part| part.receivers.contains(self.me))
+            part.is_some_and(|part| part.more_receivers || part.receivers.contains(self.me))
         };
         self.receiver(publisher, self.group, &[]) == Some(self.me) || says_so()
     }

@@ -162,6 +162,35 @@ impl Registry {
         self.remotes.get(flow).is_some_and(|remote| remote.ways.layer.is_some())
     }
 
+    /// Whether a flow that was heard there is not any more, and says on the inter scope that it has another layer broker, or none.
+    pub(super) fn has_left_layer(&self, flow: &FlowId, says: Option<LayerScopeId>) -> bool {
+        let own = self.world.own().and_then(|own| own.layer_scope);
+        let sign = self.remotes.get(flow).and_then(|remote| remote.ways.layer);
+        sign.is_some_and(|sign| sign.over) && says != own
+    }
+
+    /// Flows of other groups that are reached over the inter scope, or may be again in a moment.
+    #[must_use]
+    pub fn link_peers(&self) -> u32 {
+        let reached = self.remotes.values().filter(|remote| remote.ways.layer.is_none());
+        u32::try_from(reached.filter(|remote| remote.ways.over_link()).count()).unwrap_or(u32::MAX)
+    }
+
+    /// Whether this flow reaches nobody over the inter scope while another gateway of its group does: its way there is broken, and
+    /// not that of all.
+    #[must_use]
+    pub fn is_cut_off(&self) -> bool {
+        let gateway = |flow: &FlowId| {
+            let view = self.world.flows.get(flow);
+            view.is_some_and(|view| view.role.is_gateway() && view.reach == Reach::Up && view.state == FlowState::Ready)
+        };
+        self.link_peers() == 0
+            && self
+                .remotes
+                .iter()
+                .any(|(flow, remote)| remote.ways.over_layer() && remote.link_peers > 0 && gateway(flow))
+    }
+
     /// A flow whose process goes on has a new life on the inter scope: what it has announced stays.
     pub(super) fn follow_life(&mut self, flow: &FlowId, epoch: u64, began: u64) {
         let goes_on = self.remotes.get(flow).is_some_and(|remote| remote.began == Some(began));

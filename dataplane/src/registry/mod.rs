@@ -89,6 +89,8 @@ pub struct Registry {
     /// This flow is a gateway and, when it was last looked at, spoke for flows of its group.
     speaks_for_others: bool,
     remotes: BTreeMap<FlowId, Remote>,
+    /// Flows whose last life is over, and until when they may come back with the services that they had.
+    departed: BTreeMap<FlowId, Instant>,
     world: World,
     outgoing: VecDeque<Outgoing>,
     /// For the channel of the layer broker; `None` = everybody there.
@@ -123,6 +125,7 @@ impl Registry {
             parts: BTreeMap::new(),
             gateway: AutoBool::Auto,
             role: Role::Gateway,
+            layer_away: false,
         };
         Self {
             leases: LeaseTable::new(config.max_leases.min(MAX_LEASED_ENTRIES), config.lease_stores.clone()),
@@ -135,6 +138,7 @@ impl Registry {
             said_parts: BTreeMap::new(),
             speaks_for_others: false,
             remotes: BTreeMap::new(),
+            departed: BTreeMap::new(),
             world: World {
                 me: config.me.clone(),
                 flows: BTreeMap::from([(config.me.clone(), own)]),

@@ -29,6 +29,9 @@ pub(crate) const MAX_PARTITIONS: usize = MAX_ROUTES / 2;
 pub const LEGACY: Duration = Duration::from_secs(10);
 /// How much before the last sign of life of a flow that has died the next one begins.
 const BEFORE_LAST_SIGN_MS: i64 = 1000;
+/// How much before the last sign of life of a flow that lives, but has lost its way out, the next one begins: as much more as it takes
+/// to notice that on the inter scope.
+const BEFORE_LOST_WAY_MS: i64 = BEFORE_LAST_SIGN_MS + 2500;
 
 /// Where another flow of the group stopped.
 pub(super) struct Legacy {
@@ -88,6 +91,7 @@ pub(super) fn part_of(flow: &FlowId, routes: &[RouteState], layer: &str) -> Part
     Part {
         carrying,
         receivers: receivers.into_iter().collect(),
+        more_receivers: routes.len() >= MAX_ROUTES,
         hold: Hold::default(),
     }
 }
@@ -204,12 +208,43 @@ impl Registry {
                         self.leave_behind(now, &topic, Begin::At(Arc::clone(&handover.offsets)));
                     }
                     Carrying::Carries => drop(self.legacies.remove(&topic)),
-                    Carrying::No => {}
+                    Carrying::No => self.take_up_lost(now, flow, &topic),
                 }
                 self.urgent.insert(topic.clone());
+            } else if !shares && !self.is_asked_outside(&topic) {
+                // What is left behind is for those who asked all the while.
+                self.legacies.remove(&topic);
             }
             self.put_part(flow, &topic, part);
         }
+    }
+
+    /// A flow of the group does not carry a topic any more and has handed it to nobody, though somebody elsewhere asks for it whom this
+    /// flow reaches: that one has lost its way to them. What it sent since is lost.
+    fn take_up_lost(&mut self, now: Instant, flow: &FlowId, topic: &TopicName) {
+        let carried = self.carrying(flow, topic) == Some(&Carrying::Carries);
+        let sign = self.remotes.get(flow).and_then(Remote::last_sign_ms);
+        if let Some(last_ms) = sign.filter(|_| carried && self.is_asked_outside(topic)) {
+            let since = Begin::Since {
+                appended_ms: last_ms.saturating_sub(BEFORE_LOST_WAY_MS),
+                latest: Arc::default(),
+            };
+            self.leave_behind(now, topic, since);
+        }
+    }
+
+    /// Whether a flow of another group that can be reached asks for the topic.
+    fn is_asked_outside(&self, topic: &TopicName) -> bool {
+        let others = self.world.flows.iter().filter(|(flow, _)| **flow != self.config.me);
+        let mut outside = others.filter(|(flow, view)| view.reach != Reach::Down && !self.shares_layer(flow));
+        outside.any(|(_, view)| {
+            let entry = view.topics.get(topic);
+            entry.is_some_and(|entry| {
+                [&entry.node, &entry.layer, &entry.outside]
+                    .iter()
+                    .any(|scope| scope.request.is_some())
+            })
+        })
     }
 
     fn put_part(&mut self, flow: &FlowId, topic: &TopicName, part: Part) {

@@ -11,10 +11,12 @@ use super::gateways::patience;
 use super::remote::Remote;
 use super::types::RemoteLease;
 use super::{Outgoing, Registry, Way};
-use crate::world::{FlowState, FlowView, LayerScopeId, Reach, Role};
+use crate::world::{FlowState, FlowView, LayerScopeId, OriginFilter, Reach, Role};
 
 /// Most other flows that are followed.
 pub const MAX_FLOWS: usize = 1280;
+/// How long after its last sign of life a flow may come back with the services that it had: they are not gone because it is.
+const RETURNS: Duration = Duration::from_secs(60);
 /// Snapshots that are pulled at a time, so that their unfinished parts stay few.
 const MAX_PULLS: usize = 8;
 /// Messages to other flows that wait for [`Registry::poll`]; snapshot parts beyond it are asked for again.
@@ -55,7 +57,11 @@ impl Registry {
         // Of a flow that shares the layer broker counts what it says there: on the inter scope it speaks to others, and under
         // lives of their own.
         if way == Way::Link && self.is_heard_on_layer(from) {
-            return changed;
+            if !self.has_left_layer(from, layer_scope) {
+                return changed;
+            }
+            // It has another layer broker now, or none: from now on the inter scope is the only way to it.
+            changed = self.forget(now, from);
         }
         match self.world.flows.get(from).map(|view| view.epoch) {
             Some(epoch) if hello.epoch < epoch => {
@@ -66,9 +72,10 @@ impl Registry {
             Some(_) => {
                 // Its life before this one is over.
                 self.inherit(now, from);
-                changed = self.forget(now, from);
+                self.await_return(now, from);
+                changed.extend(self.forget(now, from));
             }
-            None => changed = self.make_room(now),
+            None => changed.extend(self.make_room(now)),
         }
         let is_new = !self.remotes.contains_key(from);
         if is_new && self.remotes.len() >= MAX_FLOWS {
@@ -92,6 +99,7 @@ impl Registry {
             parts: BTreeMap::new(),
             gateway,
             role,
+            layer_away: false,
         });
         // One that is heard in two places may say of itself what it said before.
         let state = if is_new || rank(state) >= rank(view.state) {
@@ -99,10 +107,21 @@ impl Registry {
         } else {
             view.state
         };
-        let said = (kind, state, layer_scope, gateway, role);
-        let same = !is_new && (view.kind, view.state, view.layer_scope, view.gateway, view.role) == said;
-        (view.kind, view.state, view.layer_scope, view.gateway, view.role) = said;
+        let said = (kind, state, layer_scope, gateway, role, hello.layer_away);
+        let (scope, away) = (view.layer_scope, view.layer_away);
+        let same = !is_new && (view.kind, view.state, scope, view.gateway, view.role, away) == said;
+        (
+            view.kind,
+            view.state,
+            view.layer_scope,
+            view.gateway,
+            view.role,
+            view.layer_away,
+        ) = said;
         let remote = self.remotes.entry(from.clone()).or_insert_with(Remote::new);
+        if way == Way::Layer {
+            remote.link_peers = hello.link_peers;
+        }
         let wait = || match way {
             Way::Link => Duration::ZERO,
             Way::Layer => patience(&self.config.me, others, from),
@@ -196,7 +215,18 @@ impl Registry {
         if ways.is_some_and(|ways| ways.over_layer()) {
             return self.set_reach(now, flow, Reach::Down);
         }
+        self.await_return(now, flow);
         self.forget(now, flow)
+    }
+
+    /// A life of a flow is over. Its services may live, and be named by the next.
+    fn await_return(&mut self, now: Instant, flow: &FlowId) {
+        let Some(remote) = self.remotes.get(flow) else { return };
+        let until = remote.down_since.unwrap_or(now) + RETURNS;
+        self.departed.retain(|_, until| *until > now);
+        if until > now && self.departed.len() < MAX_FLOWS {
+            self.departed.insert(flow.clone(), until);
+        }
     }
 
     /// The round trip to another flow, which decides when it is asked again.
@@ -217,6 +247,21 @@ impl Registry {
         self.world.flows.remove(flow);
         self.outgoing.retain(|message| message.to.as_ref() != Some(flow));
         topics
+    }
+
+    /// Whether a service that nobody names may be named again in a moment: the flow of its node has ended, or that of a layer in which no
+    /// other could name it, and has not been there again for long enough to have told of its services.
+    pub(crate) fn may_return(&self, now: Instant, of: &OriginFilter) -> bool {
+        let settled = |flow: &FlowId| self.world.flows.get(flow).is_some_and(|view| view.settled);
+        self.departed.iter().any(|(flow, until)| {
+            let same_layer = of.layer.as_deref().is_none_or(|layer| flow.layer.as_str() == layer);
+            let same_node = of.node.as_deref().is_none_or(|node| flow.node.as_str() == node);
+            let is_alone = || {
+                let others = self.world.flows.keys().filter(|other| other.layer == flow.layer);
+                !others.into_iter().any(settled)
+            };
+            *until > now && same_layer && !settled(flow) && (same_node || is_alone())
+        })
     }
 
     /// What is to be sent to other flows now; each encodes to at most [`MAX_LINK_CONTROL_BYTES`](super::MAX_LINK_CONTROL_BYTES).

@@ -74,6 +74,10 @@ pub(super) struct Remote {
     pub(super) began: Option<u64>,
     /// Since when it has been a gateway, if it was none while it carried topics before.
     pub(super) new_gateway: Option<Instant>,
+    /// Since when it cannot be reached.
+    pub(super) down_since: Option<Instant>,
+    /// Flows of other groups that it reaches over the inter scope, as it says on the channel of the layer broker.
+    pub(super) link_peers: u32,
 }
 
 /// The entries of a flow, as its view in the world has them.
@@ -97,6 +101,8 @@ impl Remote {
             ready_since: None,
             began: None,
             new_gateway: None,
+            down_since: None,
+            link_peers: 0,
         }
     }
 

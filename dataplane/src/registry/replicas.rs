@@ -151,7 +151,7 @@ impl Registry {
             let Some(view) = self.world.flows.get_mut(flow) else {
                 continue;
             };
-            if view.state != FlowState::Ready || view.reach == Reach::Down {
+            if view.state != FlowState::Ready || view.reach == Reach::Down || view.layer_away {
                 remote.ready_since = None;
                 view.settled = false;
                 continue;
@@ -176,6 +176,9 @@ impl Registry {
             _ => return BTreeSet::new(),
         }
         self.tell_of(now, flow);
+        if let Some(remote) = self.remotes.get_mut(flow) {
+            remote.down_since = (reach == Reach::Down).then_some(now);
+        }
         if reach == Reach::Down {
             self.inherit(now, flow);
             if let Some(remote) = self.remotes.get_mut(flow) {

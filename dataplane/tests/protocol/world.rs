@@ -505,6 +505,7 @@ impl<'a> Simulation<'a> {
             match output {
                 Output::Publish { .. }
                 | Output::LayerScope { .. }
+                | Output::LayerAway(_)
                 | Output::Replicas { .. }
                 | Output::Inter { .. }
                 | Output::SaveLease(_)

@@ -1,9 +1,11 @@
 //! A flow that is to be on the inter scope and cannot, and what stays of services that are only not named any more.
 
-use blaze_proto::link::link_control::{Advertise, Delta, Entry, Kind, Source};
+use blaze_proto::link::LinkControl;
+use blaze_proto::link::link_control::{Advertise, Channel, Delta, Entry, Gateway, Hello, Kind, Source};
 
 use super::balance::said_by;
 use super::*;
+use crate::link::DownReason;
 use crate::world::Role;
 
 const TOPIC: &str = "map";
@@ -55,6 +57,11 @@ impl Bench {
 
     /// A robot's flow announces these services on its node as those that advertise the topic.
     fn robot_announces(&mut self, version: u64, services: &[&str], more_sources: bool) {
+        self.robot_announces_in(1, version, services, more_sources);
+    }
+
+    /// The same in a life of its flow.
+    fn robot_announces_in(&mut self, epoch: u64, version: u64, services: &[&str], more_sources: bool) {
         let robot: FlowId = "edge/robot-1".parse().unwrap();
         let source = |service: &&str| Source {
             node: "robot-1".into(),
@@ -72,7 +79,10 @@ impl Bench {
             ..Entry::default()
         };
         let (hello, delta) = (
-            Box::new(said_by(&robot, Kind::Edge)),
+            Box::new(Hello {
+                epoch,
+                ..said_by(&robot, Kind::Edge)
+            }),
             Delta {
                 from_version: version - 1,
                 to_version: version,
@@ -185,4 +195,113 @@ fn what_is_kept_stays_when_its_flow_is_heard_another_way() {
     // No gateway names it.
     bench.wait(20_000);
     assert_eq!(bench.forgotten(), [(of(Some("edge"), "mapper"), BTreeSet::new())]);
+}
+
+/// A service lives on while its flow is started again, and its last message is not published again.
+#[test]
+fn what_is_kept_stays_while_a_flow_begins_a_new_life() {
+    let mut bench = Bench::inside();
+    bench.send(Scope::Node, &lease("request", TOPIC));
+    bench.robot_announces(1, &["mapper", "planner"], false);
+    bench.wait(10_000);
+    bench.core.link_event(
+        bench.now,
+        LinkEvent::PeerForgotten {
+            flow: "edge/robot-1".parse().unwrap(),
+            epoch: 1,
+        },
+    );
+    bench.wait(20_000);
+    assert_eq!(bench.forgotten(), [], "it said good-bye, and may come back");
+    bench.robot_announces_in(2, 1, &["mapper"], false);
+    bench.wait(2_000);
+    assert_eq!(bench.forgotten(), [], "it has not told of all its services yet");
+    bench.wait(10_000);
+    let mapper = BTreeSet::from([of(Some("edge"), "mapper")]);
+    assert_eq!(bench.forgotten(), [(of(Some("edge"), "planner"), mapper)]);
+    // A life that begins without a word before.
+    bench.robot_announces_in(3, 1, &[], false);
+    bench.wait(2_000);
+    assert_eq!(bench.forgotten(), []);
+    bench.robot_announces_in(3, 2, &["mapper"], false);
+    bench.wait(10_000);
+    assert_eq!(bench.forgotten(), []);
+}
+
+#[test]
+fn what_is_kept_of_a_flow_that_does_not_come_back_is_forgotten() {
+    let mut bench = Bench::inside();
+    bench.send(Scope::Node, &lease("request", TOPIC));
+    bench.robot_announces(1, &["mapper"], false);
+    bench.wait(400);
+    bench.core.link_event(
+        bench.now,
+        LinkEvent::PeerForgotten {
+            flow: "edge/robot-1".parse().unwrap(),
+            epoch: 1,
+        },
+    );
+    bench.wait(50_000);
+    assert_eq!(bench.forgotten(), []);
+    bench.wait(20_000);
+    assert_eq!(bench.forgotten().len(), 1);
+}
+
+/// Another gateway of the group says on the channel of the layer broker whom it reaches.
+fn fog_2_reaches(bench: &mut Bench, link_peers: u32) {
+    let flow: FlowId = "fog/fog-2".parse().unwrap();
+    let hello = Hello {
+        gateway: Gateway::Auto.into(),
+        is_gateway: true,
+        link_peers,
+        ..said_by(&flow, Kind::Fog)
+    };
+    let message = LinkControl {
+        body: Some(Body::Hello(hello)),
+        channel: Some(Channel {
+            from: flow.to_string(),
+            epoch: 1,
+            began: 1,
+            to: String::new(),
+        }),
+    };
+    bench.core.replica_message(bench.now, Some(message), Some(0));
+}
+
+/// Its way to all others is broken, and that of another gateway is not.
+#[test]
+fn a_gateway_that_alone_reaches_nobody_leaves_the_work_to_others() {
+    let mut bench = Bench::inside();
+    bench.robot_announces(1, &["mapper"], false);
+    let robot: FlowId = "edge/robot-1".parse().unwrap();
+    let pass = |bench: &mut Bench, seconds: u64, link_peers: u32| {
+        for _ in 0..seconds * 2 {
+            fog_2_reaches(bench, link_peers);
+            bench.wait(500);
+        }
+    };
+    pass(&mut bench, 10, 1);
+    assert_eq!(bench.own().1, Role::Gateway);
+    let down = LinkEvent::PeerDown {
+        flow: robot.clone(),
+        epoch: 1,
+        reason: DownReason::Silent,
+    };
+    bench.core.link_event(bench.now, down);
+    pass(&mut bench, 20, 0);
+    assert_eq!(bench.own().1, Role::Gateway, "nobody reaches anybody");
+    pass(&mut bench, 4, 1);
+    assert_eq!(bench.own().1, Role::Gateway, "a moment says nothing");
+    pass(&mut bench, 20, 1);
+    assert_eq!(bench.own(), (AutoBool::No, Role::Member));
+    assert_eq!(
+        bench.wishes(),
+        [],
+        "it stays on the inter scope, to notice when it works"
+    );
+    bench
+        .core
+        .link_event(bench.now, LinkEvent::PeerRecovered { flow: robot });
+    pass(&mut bench, 10, 1);
+    assert_eq!(bench.own(), (AutoBool::Yes, Role::Gateway));
 }

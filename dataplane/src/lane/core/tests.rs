@@ -753,6 +753,29 @@ fn a_forgotten_topic_leaves_its_lanes_and_windows_to_others() {
 }
 
 #[test]
+fn bare_messages_of_a_topic_that_was_forgotten_have_another_writer() {
+    let mut bench = Bench::new(vec![bridge(Scope::Node, to_cloud())]);
+    let bare = || Content::Bare {
+        payload: Bytes::from_static(b"a"),
+        identity: None,
+    };
+    bench.take(Scope::Node, vec![bare(), bare()]);
+    bench.link.waiting.clear();
+    bench.apply(Vec::new(), TopicInfo::default());
+    bench.drain();
+    bench.core.forget_unused(bench.now);
+    bench.now += FORGET;
+    assert_eq!(bench.core.forget_unused(bench.now), 1);
+    bench.topic = bench.core.intern(&"imu/data".parse().unwrap(), bench.now).unwrap();
+    bench.apply(vec![bridge(Scope::Node, to_cloud())], TopicInfo::default());
+    bench.take(Scope::Node, vec![bare()]);
+    let sent: Vec<_> = bench.link.submitted.iter().map(|(_, _, frame)| frame).collect();
+    assert_eq!(sent.iter().map(|frame| frame.sequence()).collect::<Vec<_>>(), [1, 2, 1]);
+    assert_eq!(sent[0].writer(), sent[1].writer());
+    assert_ne!(sent[1].writer(), sent[2].writer(), "its numbers begin again");
+}
+
+#[test]
 fn a_bridge_takes_the_place_of_one_that_ended_long_ago() {
     let to = |n: usize| Target::Inter {
         layer: "cloud".parse().unwrap(),

@@ -233,6 +233,45 @@ fn whoever_a_sender_has_chosen_takes_it_in_and_so_does_the_one_that_it_will_choo
     assert!(takes(&world, &best) && !takes(&world, &other));
 }
 
+#[test]
+fn who_has_lost_the_layer_broker_is_not_sent_to_while_another_one_has_it() {
+    let mut world = fog_that_listens();
+    let robot = id("e/r");
+    let first = plan_of(&world, &robot, None);
+    let best = receiver(&first);
+    view(&mut world, &best).layer_away = true;
+    let second = plan_of(&world, &robot, Some(&first));
+    assert_ne!(receiver(&second), best);
+    for flow in FLOWS.map(id) {
+        view(&mut world, &flow).layer_away = true;
+    }
+    assert_eq!(
+        receiver(&plan_of(&world, &robot, Some(&first))),
+        best,
+        "it is away for all"
+    );
+    for flow in FLOWS.map(id) {
+        view(&mut world, &flow).layer_away = false;
+    }
+    let back = plan_of(&world, &robot, Some(&second));
+    assert_eq!(receiver(&back), receiver(&second), "it has only just come back");
+    view(&mut world, &best).settled = true;
+    assert_eq!(receiver(&plan_of(&world, &robot, Some(&second))), best);
+}
+
+#[test]
+fn of_more_receivers_than_a_sender_can_name_each_that_could_be_one_takes_it_in() {
+    let mut world = fog_that_listens();
+    let robot = id("e/r");
+    let best = receiver(&plan_of(&world, &robot, None));
+    let takes = |world: &World, flow: &FlowId| plan_of(world, flow, None).bridges.iter().any(|b| b.to == Target::Layer);
+    let others = || FLOWS.map(id).into_iter().filter(|flow| *flow != best);
+    assert!(others().all(|flow| !takes(&world, &flow)));
+    let part = view(&mut world, &robot).parts.entry(topic()).or_default();
+    part.more_receivers = true;
+    assert!(takes(&world, &best) && others().all(|flow| takes(&world, &flow)));
+}
+
 /// Missing layers, and two layers of one kind: who sends what to whom.
 #[test]
 fn incomplete_systems_and_doubled_layers() {

@@ -77,12 +77,13 @@ pub(crate) fn flow(layer_scope: Option<u64>) -> FlowView {
         parts: BTreeMap::new(),
         gateway: AutoBool::Auto,
         role: Role::Gateway,
+        layer_away: false,
     }
 }
 
 /// A world written as one line per flow: `edge/a@1 node+ layer-`: `@1` is its layer broker, `+` an advertisement on
 /// that scope, `-` a request, `-b` a request for bare payloads; `down`, `suspect`, `starting`, `draining` and `settled` as
-/// they read; `carries` and `handed` say who carries the topic out of the layer, `>c/b` whom it is sent to. The first flow is
+/// they read; `away`: its layer broker does not answer it; `many`: it sends to more flows than it names; `carries` and `handed` say who carries the topic out of the layer, `>c/b` whom it is sent to. The first flow is
 /// `me`.
 pub(crate) fn world(lines: &[&str]) -> World {
     let mut flows = BTreeMap::new();
@@ -104,6 +105,8 @@ pub(crate) fn world(lines: &[&str]) -> World {
                 "starting" => view.state = FlowState::Starting,
                 "draining" => view.state = FlowState::Draining,
                 "settled" => view.settled = true,
+                "away" => view.layer_away = true,
+                "many" => part.more_receivers = true,
                 "member" => view.role = Role::Member,
                 "new" => view.role = Role::NewGateway,
                 "leaving" => view.role = Role::Leaving,

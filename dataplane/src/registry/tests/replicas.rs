@@ -75,7 +75,10 @@ impl Pair {
                     self.hello(from);
                 }
                 let over_link = self.flows[from].poll(self.now);
-                assert!(over_link.is_empty(), "there is no link: {over_link:?}");
+                assert!(
+                    over_link.iter().all(|(to, _)| to.layer.as_str() == "edge"),
+                    "there is no link between them: {over_link:?}"
+                );
                 for (to, body) in self.flows[from].poll_layer() {
                     let names = self.names();
                     assert!(to.is_none_or(|to| to == names[1 - from]));
@@ -336,4 +339,68 @@ fn one_that_gave_or_got_a_topic_by_name_rests_for_ten_seconds() {
         assert!(flow.rests(pair.now, &a) && flow.rests(pair.now, &b));
         assert!(!flow.rests(pair.now + REST, &a) && !flow.rests(pair.now + REST, &b));
     }
+}
+
+/// A robot that one of them reaches asks for the topic, or does so no more.
+fn robot_asks(pair: &mut Pair, version: u64, asks: bool) {
+    use blaze_proto::link::link_control::{Body, Delta, Entry, Kind, Request};
+    let robot = id("edge/robot-1");
+    let hello = Hello {
+        layer: "edge".into(),
+        node: "robot-1".into(),
+        kind: Kind::Edge.into(),
+        epoch: 1,
+        state: State::Ready.into(),
+        ..Hello::default()
+    };
+    let delta = Delta {
+        from_version: version - 1,
+        to_version: version,
+        part: 0,
+        parts: 1,
+        entries: vec![Entry {
+            topic: "t".into(),
+            node_request: asks.then(Request::default),
+            ..Entry::default()
+        }],
+    };
+    let now = pair.now;
+    pair.flows[1].on_hello(now, &robot, &hello);
+    pair.flows[1].on_control(now, &robot, Body::Delta(delta));
+}
+
+#[test]
+fn what_a_flow_carried_that_has_lost_its_way_out_begins_a_while_back() {
+    let mut pair = Pair::new(0);
+    pair.run(1000 * MS);
+    let stops = |pair: &mut Pair| {
+        pair.carries(0, &Carrying::Carries);
+        pair.run(1000 * MS);
+        pair.carries(0, &Carrying::No);
+        pair.run(100 * MS);
+    };
+    stops(&mut pair);
+    let now = pair.now;
+    assert_eq!(
+        pair.flows[1].begin_carrying(now, &topic("t"), true),
+        Begin::Now,
+        "nobody asks"
+    );
+    robot_asks(&mut pair, 1, true);
+    stops(&mut pair);
+    let (now, ms) = (pair.now, pair.server_ms());
+    match pair.flows[1].begin_carrying(now, &topic("t"), true) {
+        Begin::Since { appended_ms, .. } => assert!((3500..4500).contains(&(ms - appended_ms)), "{ms} {appended_ms}"),
+        other => panic!("{other:?}"),
+    }
+    stops(&mut pair);
+    robot_asks(&mut pair, 2, false);
+    robot_asks(&mut pair, 3, true);
+    let now = pair.now;
+    let begin = pair.flows[1].begin_carrying(now, &topic("t"), true);
+    assert_eq!(
+        begin,
+        Begin::Now,
+        "whoever asks anew gets what is published from now on"
+    );
 }
