@@ -155,7 +155,7 @@ fn a_flow_is_starting_until_all_kept_leases_are_read() {
 #[test]
 fn others_are_told_of_a_layer_broker_that_does_not_answer_for_seconds() {
     let mut bench = Bench::new();
-    let mut told = |bench: &mut Bench, health, ms| {
+    let told = |bench: &mut Bench, health, ms| {
         bench.outputs.clear();
         bench.core.set_scope_health(bench.now, Scope::Layer, health);
         bench.step(ms);
