@@ -2,6 +2,7 @@
 
 use std::collections::{HashMap, HashSet};
 use std::io;
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -14,6 +15,7 @@ use serde_json::{Value, json};
 use super::channel::{Channel, RawReader};
 use super::deliver::nanos;
 use super::names::ALIVE;
+use super::near::Near;
 use super::presence::Presence;
 use super::probe::Probe;
 use super::shared::{Shared, WriterFacts};
@@ -42,7 +44,7 @@ pub(super) struct Generation {
     signs: RawReader,
     sign: Writer,
     next_sign: Instant,
-    probes: HashMap<GuidPrefix, Probe>,
+    probes: HashMap<GuidPrefix, (SocketAddr, Probe)>,
     next_probe: Instant,
     farewell: Farewell,
     pub(super) presence: Arc<parking_lot::Mutex<Presence>>,
@@ -64,7 +66,8 @@ impl Generation {
                 what: "socket",
                 error: error.to_string(),
             })?;
-        let presence = Arc::<parking_lot::Mutex<Presence>>::default();
+        let near = Near::of_interface(shared.address);
+        let presence = Arc::new(parking_lot::Mutex::new(Presence::new(near)));
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
         Ok(Self {
             watch: participant.watch_endpoints(Box::new(move |endpoints| {
@@ -188,21 +191,19 @@ impl Generation {
 
     /// Those on whose port nothing listens.
     fn refused(&mut self, shared: &Shared) -> Vec<GuidPrefix> {
-        let presence = self.presence.lock();
-        let known: HashMap<GuidPrefix, _> = presence.sockets().collect();
-        self.probes.retain(|prefix, _| known.contains_key(prefix));
-        for (prefix, sockets) in known {
+        let known: HashMap<GuidPrefix, SocketAddr> = self.presence.lock().sockets().collect();
+        // Whoever takes its data elsewhere now is asked there.
+        self.probes
+            .retain(|prefix, (socket, _)| known.get(prefix) == Some(&*socket));
+        for (prefix, socket) in known {
             if self.probes.contains_key(&prefix) {
                 continue;
             }
-            // Loopback addresses of another host are not its own here.
-            let near = |is_loopback: bool| sockets.iter().find(|socket| socket.ip().is_loopback() == is_loopback);
-            let socket = near(shared.address.is_loopback());
-            if let Some(probe) = socket.and_then(|socket| Probe::new(shared.address, *socket).ok()) {
-                self.probes.insert(prefix, probe);
+            if let Ok(probe) = Probe::new(shared.address, socket) {
+                self.probes.insert(prefix, (socket, probe));
             }
         }
-        let refused = self.probes.iter().filter(|(_, probe)| probe.is_refused());
+        let refused = self.probes.iter().filter(|(_, (_, probe))| probe.is_refused());
         refused.map(|(prefix, _)| *prefix).collect()
     }
 }

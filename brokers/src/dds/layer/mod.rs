@@ -17,6 +17,7 @@ mod kept;
 mod life;
 mod make;
 mod names;
+mod near;
 mod presence;
 mod probe;
 mod send;
