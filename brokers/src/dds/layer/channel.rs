@@ -16,6 +16,7 @@ use tokio::sync::oneshot;
 use super::deliver::{Kind, Progress, deliver};
 use super::kept::History;
 use super::names;
+use super::seen::Seen;
 use super::shared::Shared;
 use crate::dds::reader::StoppableThread;
 use crate::dds::sample::{Octets, OctetsAdapter};
@@ -43,8 +44,8 @@ pub(super) struct Readers {
     pub(super) best_effort: Option<RawReader>,
     /// What came before is not delivered: RustDDS keeps samples of a topic for readers to come.
     pub(super) opened: Option<Timestamp>,
-    /// The last sequence number of each writer.
-    pub(super) last: HashMap<EndpointId, i64>,
+    /// What came of each writer.
+    pub(super) seen: HashMap<EndpointId, Seen>,
     pub(super) history: History,
 }
 
@@ -117,12 +118,12 @@ impl Channel {
             reliable,
             best_effort,
             opened,
-            last,
+            seen,
             history,
         } = &mut *readers;
         let mut progress = Progress {
             opened: opened.unwrap_or(Timestamp::ZERO),
-            last,
+            seen,
             history,
         };
         let mut again = false;
@@ -151,6 +152,13 @@ impl Channel {
             sender.send(received);
         } else {
             senders.retain(|sender| sender.send(received.clone()));
+        }
+    }
+
+    /// Messages that were acknowledged are lost to all who subscribed.
+    pub(super) fn note_lost(&self, messages: u64) {
+        for sender in self.senders.lock().iter() {
+            sender.note_lost(messages);
         }
     }
 

@@ -1,6 +1,7 @@
 //! From a DDS sample to the subscriptions of its channel.
 
 use std::collections::HashMap;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use rustdds::Timestamp;
@@ -8,6 +9,7 @@ use rustdds::no_key::DeserializedCacheChange;
 
 use super::channel::Channel;
 use super::kept::History;
+use super::seen::Seen;
 use super::shared::{Shared, WriterFacts};
 use crate::dds::EndpointId;
 use crate::dds::participant::prefix_of;
@@ -30,24 +32,21 @@ pub(super) enum Kind {
 /// How far the readers of a channel have come.
 pub(super) struct Progress<'a> {
     pub(super) opened: Timestamp,
-    pub(super) last: &'a mut HashMap<EndpointId, i64>,
+    pub(super) seen: &'a mut HashMap<EndpointId, Seen>,
     pub(super) history: &'a mut History,
 }
 
 impl Progress<'_> {
-    /// Notes a sample; false when it was delivered before. A topic's samples lie in one cache for both readers.
-    fn is_new(&mut self, shared: &Shared, writer: EndpointId, sequence: i64) -> bool {
-        if self.last.len() >= MAX_WRITERS && !self.last.contains_key(&writer) {
+    /// What was seen of a writer.
+    fn of_writer(&mut self, shared: &Shared, writer: EndpointId) -> &mut Seen {
+        if self.seen.len() >= MAX_WRITERS && !self.seen.contains_key(&writer) {
             let known = shared.writers.read();
-            self.last.retain(|id, _| known.contains_key(id));
-            if self.last.len() >= MAX_WRITERS {
-                self.last.clear();
+            self.seen.retain(|id, _| known.contains_key(id));
+            if self.seen.len() >= MAX_WRITERS {
+                self.seen.clear();
             }
         }
-        let last = self.last.entry(writer).or_insert(i64::MIN);
-        let is_new = sequence > *last;
-        *last = sequence.max(*last);
-        is_new
+        self.seen.entry(writer).or_default()
     }
 }
 
@@ -66,17 +65,25 @@ pub(super) fn deliver(
         // The reliable reader has it, in order and complete.
         return;
     }
-    if !progress.is_new(shared, writer, i64::from(sample.sequence_number)) {
+    let since_opened = sample.receive_instant >= progress.opened;
+    let seen = progress.of_writer(shared, writer);
+    // A topic's samples lie in one cache for both readers.
+    let Some(missing) = seen.take(i64::from(sample.sequence_number), since_opened) else {
         return;
-    }
+    };
     let own = facts.is_some_and(|facts| facts.own);
     let age = age_of(shared, facts, &sample, now);
     let is_old = age > since(progress.opened, now) + if own { Duration::ZERO } else { CLOCK_SLACK };
+    if missing > 0 && !own && !is_old && facts.is_some_and(|facts| facts.reliable) {
+        // RustDDS acknowledges what it takes in, and drops the oldest that were not read in time.
+        shared.counters.overrun.fetch_add(missing, Ordering::Relaxed);
+        channel.note_lost(missing);
+    }
     if channel.with_kept {
         if own && !is_old {
             return;
         }
-    } else if own || is_old || sample.receive_instant < progress.opened {
+    } else if own || is_old || !since_opened {
         return;
     }
     let bytes = sample.into_value().0;

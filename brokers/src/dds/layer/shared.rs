@@ -48,6 +48,7 @@ pub(super) struct Counters {
     pub(super) rebuilds: AtomicU64,
     pub(super) expelled: AtomicU64,
     pub(super) writers_forgotten: AtomicU64,
+    pub(super) overrun: AtomicU64,
 }
 
 impl Counters {
@@ -58,6 +59,7 @@ impl Counters {
             rebuilds: get(&self.rebuilds),
             expelled: get(&self.expelled),
             writers_forgotten: get(&self.writers_forgotten),
+            overrun: get(&self.overrun),
         }
     }
 }
