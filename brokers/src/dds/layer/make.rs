@@ -22,8 +22,10 @@ use super::shared::{Shared, WriterFacts};
 use super::slot::Slot;
 use crate::dds::farewell::Farewell;
 use crate::dds::participant::prefix_of;
+use crate::dds::writer::participant_of;
 use crate::dds::{
-    DdsError, EndpointWatch, Endpoints, GuidPrefix, Illness, Participant, ParticipantConfig, Profile, Pulse, Writer,
+    DdsError, EndpointWatch, Endpoints, FoundWriter, GuidPrefix, Illness, Participant, ParticipantConfig, Profile,
+    Pulse, Writer,
 };
 
 /// Between two signs of life.
@@ -103,6 +105,7 @@ impl Generation {
             reliable: profile.reliable,
             durable: profile.transient_local,
             own: true,
+            signs: true,
         };
         shared.writers.write().insert(writer.id(), facts);
         slot.put(writer, now);
@@ -212,6 +215,8 @@ impl Generation {
 fn note_endpoints(shared: &Shared, presence: &parking_lot::Mutex<Presence>, endpoints: &Endpoints) {
     presence.lock().set_readers(&endpoints.readers);
     let mut best_effort = HashSet::new();
+    let sign = |writer: &FoundWriter| (writer.topic == ALIVE).then(|| participant_of(&writer.id));
+    let alive: HashSet<GuidPrefix> = endpoints.writers.iter().filter_map(sign).collect();
     {
         let mut writers = shared.writers.write();
         writers.retain(|_, facts| facts.own);
@@ -220,6 +225,7 @@ fn note_endpoints(shared: &Shared, presence: &parking_lot::Mutex<Presence>, endp
                 reliable: writer.reliable,
                 durable: writer.durable,
                 own: false,
+                signs: alive.contains(&participant_of(&writer.id)),
             };
             writers.insert(writer.id, facts);
             if !writer.reliable {

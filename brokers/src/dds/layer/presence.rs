@@ -189,9 +189,30 @@ impl Clocks {
         }
     }
 
-    /// What must be added to a participant's time of day; 0 where that is not known.
-    pub(super) fn behind_ns(&self, prefix: GuidPrefix) -> i128 {
-        self.behind.get(&prefix).map_or(0, |(behind, _)| *behind)
+    /// What must be added to a participant's time of day; `None` where no sign of life has told.
+    pub(super) fn behind_ns(&self, prefix: GuidPrefix) -> Option<i128> {
+        self.behind.get(&prefix).map(|(behind, _)| *behind)
+    }
+}
+
+/// What is known of a writer's clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Clock {
+    /// So many nanoseconds behind ours.
+    Behind(i128),
+    /// Nothing yet, but its participant sends signs of life.
+    Awaited,
+    /// Nothing: a plain DDS program.
+    Unknown,
+}
+
+impl Clock {
+    /// How far it is behind ours, where that is known.
+    pub(super) fn behind_ns(self) -> Option<i128> {
+        match self {
+            Self::Behind(behind) => Some(behind),
+            Self::Awaited | Self::Unknown => None,
+        }
     }
 }
 
@@ -317,12 +338,12 @@ mod tests {
     fn the_shortest_way_tells_the_time_best() {
         let now = Instant::now();
         let mut clocks = Clocks::default();
-        assert_eq!(clocks.behind_ns(prefix(1)), 0);
+        assert_eq!(clocks.behind_ns(prefix(1)), None);
         clocks.compare(now, prefix(1), 1_000, 6_000);
         clocks.compare(now, prefix(1), 2_000, 6_500);
         clocks.compare(now, prefix(1), 3_000, 9_000);
-        assert_eq!(clocks.behind_ns(prefix(1)), 4_500);
+        assert_eq!(clocks.behind_ns(prefix(1)), Some(4_500));
         clocks.compare(now + COMPARE_EVERY, prefix(1), 3_000, 9_000);
-        assert_eq!(clocks.behind_ns(prefix(1)), 6_000);
+        assert_eq!(clocks.behind_ns(prefix(1)), Some(6_000));
     }
 }

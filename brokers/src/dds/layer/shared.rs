@@ -13,10 +13,11 @@ use tokio::sync::watch;
 
 use super::DdsCounts;
 use super::channel::Channels;
-use super::presence::Clocks;
+use super::presence::{Clock, Clocks};
 use super::send::Target;
 use super::slot::Slots;
 use crate::dds::EndpointId;
+use crate::dds::writer::participant_of;
 use crate::outbox::{Outbox, OutboxLimits};
 use crate::port::{BrokerStatus, Health};
 
@@ -39,6 +40,8 @@ pub(super) struct WriterFacts {
     pub(super) durable: bool,
     /// Of this participant.
     pub(super) own: bool,
+    /// Its participant sends signs of life.
+    pub(super) signs: bool,
 }
 
 /// Counters of [`DdsCounts`].
@@ -116,6 +119,18 @@ impl Shared {
             fault: Mutex::default(),
             changing: Mutex::default(),
         })
+    }
+
+    /// What is known of a writer's clock.
+    pub(super) fn clock_of(&self, writer: EndpointId, facts: Option<WriterFacts>) -> Clock {
+        if facts.is_some_and(|facts| facts.own) {
+            return Clock::Behind(0);
+        }
+        match self.clocks.read().behind_ns(participant_of(&writer)) {
+            Some(behind_ns) => Clock::Behind(behind_ns),
+            None if facts.is_some_and(|facts| facts.signs) => Clock::Awaited,
+            None => Clock::Unknown,
+        }
     }
 
     pub(super) fn wake_lifecycle(&self) {
