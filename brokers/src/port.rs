@@ -423,7 +423,47 @@ struct Ring {
 struct RingState {
     messages: VecDeque<Received>,
     bytes: usize,
+    /// What the bounds are raised by.
+    more: More,
     closed: bool,
+}
+
+/// Room for what is kept for late joiners, beside the bounds of a subscription, until the reader has taken as much.
+#[derive(Default)]
+struct More {
+    messages: usize,
+    bytes: usize,
+}
+
+impl RingState {
+    /// Takes a message in. Returns how many gave way.
+    fn push(&mut self, message: Received, options: &SubscribeOptions) -> u64 {
+        let size = message.content.size();
+        let max_messages = options.max_messages.saturating_add(self.more.messages);
+        let max_bytes = options.max_bytes.saturating_add(self.more.bytes);
+        let mut lost = 0;
+        while !self.messages.is_empty() && (self.messages.len() >= max_messages || self.bytes + size > max_bytes) {
+            if let Some(oldest) = self.messages.pop_front() {
+                self.bytes -= oldest.content.size();
+                lost += 1;
+            }
+        }
+        self.bytes += size;
+        self.messages.push_back(message);
+        lost
+    }
+
+    /// Takes up to `limit` messages out. Returns how many.
+    fn take(&mut self, batch: &mut Vec<Received>, limit: usize) -> usize {
+        let count = self.messages.len().min(limit);
+        let mut bytes = 0;
+        let taken = self.messages.drain(..count);
+        batch.extend(taken.inspect(|message| bytes += message.content.size()));
+        self.bytes -= bytes;
+        self.more.messages = self.more.messages.saturating_sub(count);
+        self.more.bytes = self.more.bytes.saturating_sub(bytes);
+        count
+    }
 }
 
 /// The adapter's end of a subscription.
@@ -438,6 +478,12 @@ pub struct Subscription {
     /// Offsets that it begins at, by partition.
     starts: Vec<i64>,
 }
+
+/// Messages that are kept for late joiners and handed over beyond the bounds of a subscription, at most: as many as a store
+/// holds of the smallest ones.
+pub const MAX_KEPT_MESSAGES: usize = 262_144;
+/// Their bytes at most (256 MiB), which is what a reader takes of a topic of Kafka.
+pub const MAX_KEPT_BYTES: usize = 256 * 1024 * 1024;
 
 /// Both ends of a subscription.
 #[must_use]
@@ -462,30 +508,46 @@ pub fn subscription(options: SubscribeOptions) -> (SubscriptionSender, Subscript
 impl SubscriptionSender {
     /// Hands a message to the reader. Returns whether the subscription still lives.
     pub fn send(&self, message: Received) -> bool {
-        let size = message.content.size();
-        let mut lost = 0;
-        {
+        let lost = {
             let mut state = self.ring.queue.lock();
             if state.closed {
                 return false;
             }
-            while !state.messages.is_empty()
-                && (state.messages.len() >= self.ring.options.max_messages
-                    || state.bytes + size > self.ring.options.max_bytes)
-            {
-                if let Some(oldest) = state.messages.pop_front() {
-                    state.bytes -= oldest.content.size();
-                    lost += 1;
-                }
-            }
-            state.bytes += size;
-            state.messages.push_back(message);
-        }
-        if lost > 0 {
-            self.ring.dropped.fetch_add(lost, Ordering::Relaxed);
-        }
+            state.push(message, &self.ring.options)
+        };
+        self.note_lost(lost);
         self.ring.readable.notify_one();
         true
+    }
+
+    /// Hands messages to the reader that were kept for late joiners, at once. They raise the bounds until it has taken as
+    /// many, because it cannot read while they are collected: at most by [`MAX_KEPT_MESSAGES`] and [`MAX_KEPT_BYTES`].
+    /// Returns whether the subscription still lives.
+    pub fn send_kept(&self, kept: impl IntoIterator<Item = Received>) -> bool {
+        let lost = {
+            let mut state = self.ring.queue.lock();
+            if state.closed {
+                return false;
+            }
+            let mut lost = 0;
+            for message in kept {
+                let size = message.content.size();
+                state.more.messages = state.more.messages.saturating_add(1).min(MAX_KEPT_MESSAGES);
+                state.more.bytes = state.more.bytes.saturating_add(size).min(MAX_KEPT_BYTES);
+                lost += state.push(message, &self.ring.options);
+            }
+            lost
+        };
+        self.note_lost(lost);
+        self.ring.readable.notify_one();
+        true
+    }
+
+    /// Counts messages that the reader will never get because it, or whoever reads for it, was too slow.
+    pub fn note_lost(&self, messages: u64) {
+        if messages > 0 {
+            self.ring.dropped.fetch_add(messages, Ordering::Relaxed);
+        }
     }
 
     /// Whether the reader has gone.
@@ -522,16 +584,8 @@ impl Subscription {
         loop {
             {
                 let mut state = self.ring.queue.lock();
-                let count = state.messages.len().min(limit);
+                let count = state.take(batch, limit);
                 if count > 0 {
-                    let mut bytes = 0;
-                    batch.extend(
-                        state
-                            .messages
-                            .drain(..count)
-                            .inspect(|message| bytes += message.content.size()),
-                    );
-                    state.bytes -= bytes;
                     return count;
                 }
                 if state.closed {
@@ -542,7 +596,7 @@ impl Subscription {
         }
     }
 
-    /// Messages dropped because this reader was slow, since the last call.
+    /// Messages dropped because this reader, or whoever reads for it, was slow, since the last call.
     #[must_use]
     pub fn take_dropped(&self) -> u64 {
         self.ring.dropped.swap(0, Ordering::Relaxed)
@@ -555,5 +609,83 @@ impl Drop for Subscription {
         state.closed = true;
         state.messages.clear();
         state.bytes = 0;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use futures::FutureExt as _;
+
+    use super::*;
+
+    const SIZE: usize = 10;
+
+    fn message(number: usize) -> Received {
+        let payload = Bytes::from(vec![u8::try_from(number % 256).unwrap(); SIZE]);
+        Received::live(
+            Content::Bare {
+                payload,
+                identity: None,
+            },
+            Instant::now(),
+        )
+    }
+
+    fn bounded(max_messages: usize, max_bytes: usize) -> (SubscriptionSender, Subscription) {
+        subscription(SubscribeOptions {
+            max_messages,
+            max_bytes,
+            ..SubscribeOptions::default()
+        })
+    }
+
+    /// The first bytes of what waits, up to a limit.
+    fn take(subscription: &mut Subscription, limit: usize) -> Vec<u8> {
+        let mut batch = Vec::new();
+        let _ = subscription.receive(&mut batch, limit).now_or_never();
+        let first = |received: Received| match received.content {
+            Content::Bare { payload, .. } => payload[0],
+            other => panic!("{other:?}"),
+        };
+        batch.into_iter().map(first).collect()
+    }
+
+    #[test]
+    fn what_is_kept_raises_the_bounds_until_it_is_read() {
+        for (max_messages, max_bytes) in [(3, usize::MAX), (usize::MAX, 3 * SIZE)] {
+            let (sender, mut subscription) = bounded(max_messages, max_bytes);
+            assert!(sender.send_kept((0..10).map(message)));
+            for number in 10..13 {
+                sender.send(message(number));
+            }
+            assert_eq!(subscription.take_dropped(), 0);
+            assert_eq!(take(&mut subscription, 6), [0, 1, 2, 3, 4, 5]);
+            // Seven wait, and of what was kept four more may.
+            sender.send(message(13));
+            assert_eq!(subscription.take_dropped(), 1);
+            assert_eq!(take(&mut subscription, 100), [7, 8, 9, 10, 11, 12, 13]);
+            for number in 14..18 {
+                sender.send(message(number));
+            }
+            assert_eq!(subscription.take_dropped(), 1, "the bounds are those of before");
+            assert_eq!(take(&mut subscription, 100), [15, 16, 17]);
+        }
+    }
+
+    #[test]
+    fn what_others_lost_for_a_reader_counts() {
+        let (sender, subscription) = bounded(3, usize::MAX);
+        sender.note_lost(5);
+        assert_eq!((subscription.take_dropped(), subscription.take_dropped()), (5, 0));
+        drop(subscription);
+        assert!(!sender.send_kept([message(1)]));
+    }
+
+    #[test]
+    fn what_is_kept_is_bounded() {
+        let (sender, mut subscription) = bounded(1, usize::MAX);
+        sender.send_kept((0..MAX_KEPT_MESSAGES + 3).map(message));
+        assert_eq!(subscription.take_dropped(), 2);
+        assert_eq!(take(&mut subscription, usize::MAX).len(), MAX_KEPT_MESSAGES + 1);
     }
 }

@@ -9,6 +9,7 @@ use bytes::Bytes;
 use rustdds::dds::WriteError;
 use rustdds::{DataWriterStatus, RTPSEntity, StatusEvented, Timestamp, WriteOptionsBuilder, no_key};
 
+use super::GuidPrefix;
 use super::sample::{Octets, OctetsAdapter};
 
 /// Identity of a reader or writer on the wire: its participant's and four bytes.
@@ -16,6 +17,13 @@ pub type EndpointId = [u8; 16];
 
 pub(super) fn endpoint_of(guid: rustdds::GUID) -> EndpointId {
     guid.to_bytes()
+}
+
+/// Whose reader or writer it is.
+pub(super) fn participant_of(endpoint: &EndpointId) -> GuidPrefix {
+    let mut prefix = [0; 12];
+    prefix.copy_from_slice(&endpoint[..12]);
+    GuidPrefix(prefix)
 }
 
 /// What became of a sample.

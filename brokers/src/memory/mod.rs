@@ -207,15 +207,14 @@ impl MemoryHub {
         if options.with_kept {
             let kept = self.shared.kept.lock().of_channel(&channel.name);
             let now = Instant::now();
-            for (frame, since) in kept {
-                sender.send(Received {
-                    content: Content::Frame(frame),
-                    at: now,
-                    broker_age_us: u64::try_from(now.saturating_duration_since(since).as_micros()).unwrap_or(u64::MAX),
-                    kept: true,
-                    place: None,
-                });
-            }
+            let received = |(frame, since)| Received {
+                content: Content::Frame(frame),
+                at: now,
+                broker_age_us: u64::try_from(now.saturating_duration_since(since).as_micros()).unwrap_or(u64::MAX),
+                kept: true,
+                place: None,
+            };
+            sender.send_kept(kept.into_iter().map(received));
         }
         readers.push(sender.clone());
         Ok((sender, subscription))

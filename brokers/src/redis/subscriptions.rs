@@ -105,13 +105,13 @@ impl Reader {
 
     fn join(&mut self, kept: Vec<Received>) {
         let mut highest = HashMap::new();
-        for message in kept {
+        for message in &kept {
             if let Content::Frame(frame) = &message.content {
                 let highest = highest.entry(frame.writer()).or_insert(0);
                 *highest = frame.sequence().max(*highest);
             }
-            self.sender.send(message);
         }
+        self.sender.send_kept(kept);
         if let Phase::Joining(held) = std::mem::replace(&mut self.phase, Phase::Filtered(highest)) {
             if held.dropped > 0 {
                 tracing::warn!(

@@ -16,6 +16,7 @@ use tokio::sync::oneshot;
 use super::deliver::{Kind, Progress, deliver};
 use super::kept::History;
 use super::names;
+use super::seen::Seen;
 use super::shared::Shared;
 use crate::dds::reader::StoppableThread;
 use crate::dds::sample::{Octets, OctetsAdapter};
@@ -43,8 +44,8 @@ pub(super) struct Readers {
     pub(super) best_effort: Option<RawReader>,
     /// What came before is not delivered: RustDDS keeps samples of a topic for readers to come.
     pub(super) opened: Option<Timestamp>,
-    /// The last sequence number of each writer.
-    pub(super) last: HashMap<EndpointId, i64>,
+    /// What came of each writer.
+    pub(super) seen: HashMap<EndpointId, Seen>,
     pub(super) history: History,
 }
 
@@ -117,12 +118,12 @@ impl Channel {
             reliable,
             best_effort,
             opened,
-            last,
+            seen,
             history,
         } = &mut *readers;
         let mut progress = Progress {
             opened: opened.unwrap_or(Timestamp::ZERO),
-            last,
+            seen,
             history,
         };
         let mut again = false;
@@ -133,11 +134,13 @@ impl Channel {
             // What came before the waker was set woke nobody.
             again |= self.drain_one(shared, reader, kind, &mut progress);
         }
-        let quiet = progress.history.quiet(Instant::now());
+        let clock = |writer: EndpointId| {
+            let facts = shared.writers.read().get(&writer).copied();
+            shared.clock_of(writer, facts)
+        };
+        let quiet = progress.history.quiet(Instant::now(), clock);
         drop(readers);
-        for received in quiet {
-            self.send(received);
-        }
+        self.send_kept(quiet);
         if again {
             self.note_samples();
         }
@@ -152,6 +155,30 @@ impl Channel {
         } else {
             senders.retain(|sender| sender.send(received.clone()));
         }
+    }
+
+    /// Hands messages that were kept to all who subscribed.
+    pub(super) fn send_kept(&self, kept: Vec<Received>) {
+        if kept.is_empty() {
+            return;
+        }
+        for sender in self.senders.lock().iter() {
+            sender.send_kept(kept.iter().cloned());
+        }
+    }
+
+    /// Messages that were acknowledged are lost to all who subscribed.
+    pub(super) fn note_lost(&self, messages: u64) {
+        for sender in self.senders.lock().iter() {
+            sender.note_lost(messages);
+        }
+    }
+
+    /// Whether it holds messages that were kept, until their writers are quiet. Not to be waited for while a reader is made.
+    fn holds_history(&self) -> bool {
+        self.readers
+            .try_lock()
+            .is_some_and(|readers| !readers.history.is_empty())
     }
 
     /// Returns whether there may be more.
@@ -328,18 +355,32 @@ pub(super) fn start(shared: &Arc<Shared>, large: bool) -> Result<StoppableThread
     StoppableThread::start(name, Arc::default(), move |stop| {
         let ready = Arc::clone(&shared.channels.ready[usize::from(large)]);
         let _ = ready.thread.set(thread::current());
+        let mut next_look = Instant::now() + LONGEST_SLEEP;
         while !stop.load(Ordering::Relaxed) && !shared.stop.load(Ordering::Acquire) {
             let channels = std::mem::take(&mut *ready.queue.lock());
             let idle = channels.is_empty();
             for channel in channels {
                 channel.drain(&shared);
             }
+            let of_this = |all: bool| {
+                let mut channels = shared.channels.list();
+                channels.retain(|channel| channel.large == large && (all || channel.holds_history()));
+                channels
+            };
             if idle {
                 thread::park_timeout(LONGEST_SLEEP);
                 if ready.queue.lock().is_empty() {
-                    for channel in shared.channels.list().iter().filter(|channel| channel.large == large) {
+                    for channel in of_this(true) {
                         channel.drain(&shared);
                     }
+                }
+            }
+            // Where others are never idle, nobody else looks for writers that have become quiet.
+            let now = Instant::now();
+            if now >= next_look {
+                next_look = now + LONGEST_SLEEP;
+                for channel in of_this(false) {
+                    channel.drain(&shared);
                 }
             }
         }

@@ -1,24 +1,23 @@
 //! From a DDS sample to the subscriptions of its channel.
 
 use std::collections::HashMap;
-use std::time::{Duration, Instant};
+use std::sync::atomic::Ordering;
+use std::time::Instant;
 
 use rustdds::Timestamp;
 use rustdds::no_key::DeserializedCacheChange;
 
 use super::channel::Channel;
 use super::kept::History;
+use super::seen::{Moment, Seen};
 use super::shared::{Shared, WriterFacts};
 use crate::dds::EndpointId;
-use crate::dds::participant::prefix_of;
 use crate::dds::sample::Octets;
 use crate::dds::writer::endpoint_of;
 use crate::port::{Content, Received};
 
 /// Writers of one channel whose progress is remembered; those that are gone are forgotten first.
 const MAX_WRITERS: usize = 4096;
-/// How much older than the subscription a sample may seem and count as live: clocks are compared over the network.
-const CLOCK_SLACK: Duration = Duration::from_millis(20);
 
 /// Which of the two readers of a channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,24 +29,21 @@ pub(super) enum Kind {
 /// How far the readers of a channel have come.
 pub(super) struct Progress<'a> {
     pub(super) opened: Timestamp,
-    pub(super) last: &'a mut HashMap<EndpointId, i64>,
+    pub(super) seen: &'a mut HashMap<EndpointId, Seen>,
     pub(super) history: &'a mut History,
 }
 
 impl Progress<'_> {
-    /// Notes a sample; false when it was delivered before. A topic's samples lie in one cache for both readers.
-    fn is_new(&mut self, shared: &Shared, writer: EndpointId, sequence: i64) -> bool {
-        if self.last.len() >= MAX_WRITERS && !self.last.contains_key(&writer) {
+    /// What was seen of a writer.
+    fn of_writer(&mut self, shared: &Shared, writer: EndpointId) -> &mut Seen {
+        if self.seen.len() >= MAX_WRITERS && !self.seen.contains_key(&writer) {
             let known = shared.writers.read();
-            self.last.retain(|id, _| known.contains_key(id));
-            if self.last.len() >= MAX_WRITERS {
-                self.last.clear();
+            self.seen.retain(|id, _| known.contains_key(id));
+            if self.seen.len() >= MAX_WRITERS {
+                self.seen.clear();
             }
         }
-        let last = self.last.entry(writer).or_insert(i64::MIN);
-        let is_new = sequence > *last;
-        *last = sequence.max(*last);
-        is_new
+        self.seen.entry(writer).or_default()
     }
 }
 
@@ -59,24 +55,32 @@ pub(super) fn deliver(
     progress: &mut Progress<'_>,
     sample: DeserializedCacheChange<Octets>,
 ) {
-    let now = Timestamp::now();
     let writer = endpoint_of(sample.writer_guid());
     let facts = shared.writers.read().get(&writer).copied();
     if kind == Kind::BestEffort && facts.is_some_and(|facts| facts.reliable) {
         // The reliable reader has it, in order and complete.
         return;
     }
-    if !progress.is_new(shared, writer, i64::from(sample.sequence_number)) {
+    let opened = progress.opened;
+    let since_opened = sample.receive_instant >= opened;
+    let seen = progress.of_writer(shared, writer);
+    // A topic's samples lie in one cache for both readers.
+    let Some(missing) = seen.take(i64::from(sample.sequence_number), since_opened) else {
         return;
-    }
+    };
     let own = facts.is_some_and(|facts| facts.own);
-    let age = age_of(shared, facts, &sample, now);
-    let is_old = age > since(progress.opened, now) + if own { Duration::ZERO } else { CLOCK_SLACK };
+    let moment = moment_of(shared, facts, writer, &sample);
+    let is_old = moment.is_some_and(|moment| moment.is_old(nanos(opened), own, seen));
+    if missing > 0 && !own && !is_old && facts.is_some_and(|facts| facts.reliable) {
+        // RustDDS acknowledges what it takes in, and drops the oldest that were not read in time.
+        shared.counters.overrun.fetch_add(missing, Ordering::Relaxed);
+        channel.note_lost(missing);
+    }
     if channel.with_kept {
         if own && !is_old {
             return;
         }
-    } else if own || is_old || sample.receive_instant < progress.opened {
+    } else if own || is_old || !since_opened {
         return;
     }
     let bytes = sample.into_value().0;
@@ -90,41 +94,36 @@ pub(super) fn deliver(
     };
     let at = Instant::now();
     let mut received = Received::live(content, at);
-    if is_old {
-        received.kept = true;
-        received.broker_age_us = u64::try_from(age.as_micros()).unwrap_or(u64::MAX);
-        if let Some(received) = progress.history.hold(at, writer, received) {
+    match moment {
+        Some(moment) if is_old => {
+            received.kept = true;
+            if let Some(received) = progress.history.hold(at, writer, received, moment) {
+                channel.send(received);
+            }
+        }
+        _ => {
+            // One that is written now tells how far an unknown clock is behind.
+            let behind_ns = moment.map(|moment| moment.clock.behind_ns().unwrap_or(moment.lag_ns()));
+            channel.send_kept(progress.history.of_writer(writer, behind_ns));
             channel.send(received);
         }
-        return;
     }
-    for kept in progress.history.of_writer(writer) {
-        channel.send(kept);
-    }
-    channel.send(received);
 }
 
-/// How long ago a sample that its writer keeps for late joiners was written; zero for all others.
-fn age_of(
+/// When a sample was written and came. `None` for those that nobody keeps, or whose writer does not tell.
+fn moment_of(
     shared: &Shared,
     facts: Option<WriterFacts>,
+    writer: EndpointId,
     sample: &DeserializedCacheChange<Octets>,
-    now: Timestamp,
-) -> Duration {
-    if !facts.is_some_and(|facts| facts.durable) {
-        return Duration::ZERO;
-    }
-    let Some(written) = sample.write_options.source_timestamp() else {
-        return Duration::ZERO;
-    };
-    let behind = shared.clocks.read().behind_ns(prefix_of(sample.writer_guid()));
-    let age_ns = nanos(now) - (nanos(written) + behind);
-    Duration::from_nanos(u64::try_from(age_ns.max(0)).unwrap_or(u64::MAX))
-}
-
-fn since(earlier: Timestamp, now: Timestamp) -> Duration {
-    let passed = (nanos(now) - nanos(earlier)).max(0);
-    Duration::from_nanos(u64::try_from(passed).unwrap_or(u64::MAX))
+) -> Option<Moment> {
+    let facts = facts.filter(|facts| facts.durable)?;
+    Some(Moment {
+        written_ns: nanos(sample.write_options.source_timestamp()?),
+        received_ns: nanos(sample.receive_instant),
+        taken_ns: nanos(Timestamp::now()),
+        clock: shared.clock_of(writer, Some(facts)),
+    })
 }
 
 /// Nanoseconds since 1970.
@@ -144,8 +143,5 @@ mod tests {
             .unwrap()
             .as_nanos();
         assert!(i128::try_from(system).unwrap() - now < 1_000_000_000);
-        let later = Timestamp::from_ticks(Timestamp::now().to_ticks() + (3 << 31));
-        assert!(since(Timestamp::now(), later) > Duration::from_millis(1_490));
-        assert_eq!(since(later, Timestamp::now()), Duration::ZERO);
     }
 }

@@ -2,6 +2,7 @@
 
 use std::collections::{HashMap, HashSet};
 use std::io;
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -14,14 +15,17 @@ use serde_json::{Value, json};
 use super::channel::{Channel, RawReader};
 use super::deliver::nanos;
 use super::names::ALIVE;
+use super::near::Near;
 use super::presence::Presence;
 use super::probe::Probe;
 use super::shared::{Shared, WriterFacts};
 use super::slot::Slot;
 use crate::dds::farewell::Farewell;
 use crate::dds::participant::prefix_of;
+use crate::dds::writer::participant_of;
 use crate::dds::{
-    DdsError, EndpointWatch, Endpoints, GuidPrefix, Illness, Participant, ParticipantConfig, Profile, Pulse, Writer,
+    DdsError, EndpointWatch, Endpoints, FoundWriter, GuidPrefix, Illness, Participant, ParticipantConfig, Profile,
+    Pulse, Writer,
 };
 
 /// Between two signs of life.
@@ -42,7 +46,7 @@ pub(super) struct Generation {
     signs: RawReader,
     sign: Writer,
     next_sign: Instant,
-    probes: HashMap<GuidPrefix, Probe>,
+    probes: HashMap<GuidPrefix, (SocketAddr, Probe)>,
     next_probe: Instant,
     farewell: Farewell,
     pub(super) presence: Arc<parking_lot::Mutex<Presence>>,
@@ -64,7 +68,8 @@ impl Generation {
                 what: "socket",
                 error: error.to_string(),
             })?;
-        let presence = Arc::<parking_lot::Mutex<Presence>>::default();
+        let near = Near::of_interface(shared.address);
+        let presence = Arc::new(parking_lot::Mutex::new(Presence::new(near)));
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
         Ok(Self {
             watch: participant.watch_endpoints(Box::new(move |endpoints| {
@@ -100,6 +105,7 @@ impl Generation {
             reliable: profile.reliable,
             durable: profile.transient_local,
             own: true,
+            signs: true,
         };
         shared.writers.write().insert(writer.id(), facts);
         slot.put(writer, now);
@@ -188,21 +194,19 @@ impl Generation {
 
     /// Those on whose port nothing listens.
     fn refused(&mut self, shared: &Shared) -> Vec<GuidPrefix> {
-        let presence = self.presence.lock();
-        let known: HashMap<GuidPrefix, _> = presence.sockets().collect();
-        self.probes.retain(|prefix, _| known.contains_key(prefix));
-        for (prefix, sockets) in known {
+        let known: HashMap<GuidPrefix, SocketAddr> = self.presence.lock().sockets().collect();
+        // Whoever takes its data elsewhere now is asked there.
+        self.probes
+            .retain(|prefix, (socket, _)| known.get(prefix) == Some(&*socket));
+        for (prefix, socket) in known {
             if self.probes.contains_key(&prefix) {
                 continue;
             }
-            // Loopback addresses of another host are not its own here.
-            let near = |is_loopback: bool| sockets.iter().find(|socket| socket.ip().is_loopback() == is_loopback);
-            let socket = near(shared.address.is_loopback());
-            if let Some(probe) = socket.and_then(|socket| Probe::new(shared.address, *socket).ok()) {
-                self.probes.insert(prefix, probe);
+            if let Ok(probe) = Probe::new(shared.address, socket) {
+                self.probes.insert(prefix, (socket, probe));
             }
         }
-        let refused = self.probes.iter().filter(|(_, probe)| probe.is_refused());
+        let refused = self.probes.iter().filter(|(_, (_, probe))| probe.is_refused());
         refused.map(|(prefix, _)| *prefix).collect()
     }
 }
@@ -211,6 +215,8 @@ impl Generation {
 fn note_endpoints(shared: &Shared, presence: &parking_lot::Mutex<Presence>, endpoints: &Endpoints) {
     presence.lock().set_readers(&endpoints.readers);
     let mut best_effort = HashSet::new();
+    let sign = |writer: &FoundWriter| (writer.topic == ALIVE).then(|| participant_of(&writer.id));
+    let alive: HashSet<GuidPrefix> = endpoints.writers.iter().filter_map(sign).collect();
     {
         let mut writers = shared.writers.write();
         writers.retain(|_, facts| facts.own);
@@ -219,6 +225,7 @@ fn note_endpoints(shared: &Shared, presence: &parking_lot::Mutex<Presence>, endp
                 reliable: writer.reliable,
                 durable: writer.durable,
                 own: false,
+                signs: alive.contains(&participant_of(&writer.id)),
             };
             writers.insert(writer.id, facts);
             if !writer.reliable {

@@ -17,8 +17,10 @@ mod kept;
 mod life;
 mod make;
 mod names;
+mod near;
 mod presence;
 mod probe;
+mod seen;
 mod send;
 mod shared;
 mod slot;
@@ -74,6 +76,9 @@ pub struct DdsCounts {
     pub expelled: u64,
     /// Writers of transient_local origins that gave way to others.
     pub writers_forgotten: u64,
+    /// Samples of reliable writers that were acknowledged and gave way before this process read them; each subscription counts
+    /// its own among those that it dropped.
+    pub overrun: u64,
 }
 
 /// A participant of the layer's DDS domain.

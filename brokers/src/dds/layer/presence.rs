@@ -3,7 +3,7 @@
 //! | sign | verdict |
 //! |---|---|
 //! | their host says that nothing listens on their port | dead |
-//! | a newer participant has their port | dead |
+//! | a newer participant has their port, at each of their addresses that mean the same here (`near`) | dead |
 //! | a writer's window is full, and they have been silent for 2 s (those that send signs of life) | given up |
 //! | a writer's window has been full for 2 s, they read its topic and never send signs of life | given up |
 
@@ -11,6 +11,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
+use super::near::Near;
 use crate::dds::{FoundReader, GuidPrefix};
 
 /// Signs of life come every 500 ms.
@@ -28,6 +29,7 @@ const MAX_GONE: usize = 64;
 struct Peer {
     /// Order in which they were found.
     number: u64,
+    /// Where it takes its data, as far as that means the same here.
     sockets: BTreeSet<SocketAddr>,
     /// Topics that it reads and acknowledges.
     acknowledges: BTreeSet<String>,
@@ -35,14 +37,24 @@ struct Peer {
 }
 
 /// The other participants of one domain.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Presence {
+    near: Near,
     peers: BTreeMap<GuidPrefix, Peer>,
     next: u64,
     gone: VecDeque<(GuidPrefix, Instant)>,
 }
 
 impl Presence {
+    pub(super) fn new(near: Near) -> Self {
+        Self {
+            near,
+            peers: BTreeMap::new(),
+            next: 0,
+            gone: VecDeque::new(),
+        }
+    }
+
     /// Takes over which readers there are.
     pub(super) fn set_readers(&mut self, readers: &[FoundReader]) {
         let mut found: BTreeMap<GuidPrefix, (BTreeSet<SocketAddr>, BTreeSet<String>)> = BTreeMap::new();
@@ -55,6 +67,7 @@ impl Presence {
         }
         self.peers.retain(|prefix, _| found.contains_key(prefix));
         for (prefix, (sockets, acknowledges)) in found {
+            let sockets = self.near.select(&sockets);
             if let Some(peer) = self.peers.get_mut(&prefix) {
                 peer.sockets = sockets;
                 peer.acknowledges = acknowledges;
@@ -89,12 +102,16 @@ impl Presence {
         self.peers.len()
     }
 
-    /// Where each takes its data.
-    pub(super) fn sockets(&self) -> impl Iterator<Item = (GuidPrefix, &BTreeSet<SocketAddr>)> {
-        self.peers.iter().map(|(prefix, peer)| (*prefix, &peer.sockets))
+    /// Where each certainly takes its data; one of which that is not known is left out.
+    pub(super) fn sockets(&self) -> impl Iterator<Item = (GuidPrefix, SocketAddr)> {
+        let near = self.near;
+        self.peers
+            .iter()
+            .filter_map(move |(prefix, peer)| Some((*prefix, near.certain(&peer.sockets)?)))
     }
 
-    /// Those whose port a newer one has.
+    /// Those whose port a newer one has. One that shares but some addresses with others is another host's, or has one of
+    /// its own beside theirs.
     pub(super) fn superseded(&self) -> Vec<GuidPrefix> {
         let mut newest: HashMap<SocketAddr, u64> = HashMap::new();
         for peer in self.peers.values() {
@@ -104,9 +121,9 @@ impl Presence {
             }
         }
         let is_superseded = |peer: &Peer| {
-            peer.sockets
-                .iter()
-                .any(|socket| newest.get(socket) > Some(&peer.number))
+            let mut owners = peer.sockets.iter().map(|socket| newest.get(socket));
+            let Some(owner) = owners.next() else { return false };
+            owner > Some(&peer.number) && owners.all(|other| other == owner)
         };
         let old = self.peers.iter().filter(|(_, peer)| is_superseded(peer));
         old.map(|(prefix, _)| *prefix).collect()
@@ -172,9 +189,30 @@ impl Clocks {
         }
     }
 
-    /// What must be added to a participant's time of day; 0 where that is not known.
-    pub(super) fn behind_ns(&self, prefix: GuidPrefix) -> i128 {
-        self.behind.get(&prefix).map_or(0, |(behind, _)| *behind)
+    /// What must be added to a participant's time of day; `None` where no sign of life has told.
+    pub(super) fn behind_ns(&self, prefix: GuidPrefix) -> Option<i128> {
+        self.behind.get(&prefix).map(|(behind, _)| *behind)
+    }
+}
+
+/// What is known of a writer's clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Clock {
+    /// So many nanoseconds behind ours.
+    Behind(i128),
+    /// Nothing yet, but its participant sends signs of life.
+    Awaited,
+    /// Nothing: a plain DDS program.
+    Unknown,
+}
+
+impl Clock {
+    /// How far it is behind ours, where that is known.
+    pub(super) fn behind_ns(self) -> Option<i128> {
+        match self {
+            Self::Behind(behind) => Some(behind),
+            Self::Awaited | Self::Unknown => None,
+        }
     }
 }
 
@@ -186,19 +224,40 @@ mod tests {
         GuidPrefix([number; 12])
     }
 
+    fn presence(address: [u8; 4], mask: [u8; 4]) -> Presence {
+        Presence::new(Near::new(address.into(), mask.into()))
+    }
+
+    fn on_loopback() -> Presence {
+        presence([127, 0, 0, 1], [255, 0, 0, 0])
+    }
+
     fn reader(participant: u8, topic: &str, port: u16) -> FoundReader {
+        reader_at(participant, topic, vec![([127, 0, 0, 1], port).into()])
+    }
+
+    fn reader_at(participant: u8, topic: &str, sockets: Vec<SocketAddr>) -> FoundReader {
         FoundReader {
             participant: prefix(participant),
             topic: topic.to_owned(),
             reliable: true,
-            sockets: vec![([127, 0, 0, 1], port).into()],
+            sockets,
         }
+    }
+
+    /// Announced by a program in the second slot that uses all its interfaces.
+    fn everywhere(addresses: &[[u8; 4]]) -> Vec<SocketAddr> {
+        let all = [[127, 0, 0, 1], [172, 17, 0, 1], [10, 42, 0, 1]];
+        all.iter()
+            .chain(addresses)
+            .map(|address| SocketAddr::from((*address, 7413)))
+            .collect()
     }
 
     #[test]
     fn silence_matters_only_where_a_window_is_full() {
         let now = Instant::now();
-        let mut presence = Presence::default();
+        let mut presence = on_loopback();
         presence.set_readers(&[
             reader(1, "a", 1),
             reader(2, "a", 2),
@@ -224,7 +283,7 @@ mod tests {
 
     #[test]
     fn a_port_belongs_to_the_newest() {
-        let mut presence = Presence::default();
+        let mut presence = on_loopback();
         presence.set_readers(&[reader(9, "a", 1), reader(5, "a", 2)]);
         assert_eq!(presence.superseded(), []);
         presence.set_readers(&[reader(9, "a", 1), reader(5, "a", 2), reader(1, "b", 1)]);
@@ -234,9 +293,40 @@ mod tests {
     }
 
     #[test]
+    fn addresses_that_each_host_has_make_nobody_another() {
+        let mut presence = presence([192, 168, 1, 4], [255, 255, 255, 0]);
+        let hosts = [[192, 168, 1, 5], [192, 168, 1, 6]].map(|address| everywhere(&[address]));
+        let [first, second] = &hosts;
+        presence.set_readers(&[reader_at(1, "a", first.clone())]);
+        presence.set_readers(&[reader_at(1, "a", first.clone()), reader_at(2, "a", second.clone())]);
+        assert_eq!(presence.superseded(), []);
+        let asked: Vec<_> = presence.sockets().map(|(_, socket)| socket.to_string()).collect();
+        assert_eq!(asked, ["192.168.1.5:7413", "192.168.1.6:7413"]);
+        // The first host's program is started again.
+        presence.set_readers(&[
+            reader_at(1, "a", first.clone()),
+            reader_at(2, "a", second.clone()),
+            reader_at(3, "a", first.clone()),
+        ]);
+        assert_eq!(presence.superseded(), [prefix(1)]);
+    }
+
+    #[test]
+    fn behind_a_router_all_addresses_must_be_another_s() {
+        let mut presence = presence([192, 168, 1, 4], [255, 255, 255, 0]);
+        let [first, second] = [[10, 1, 0, 5], [10, 1, 0, 6]].map(|address| everywhere(&[address]));
+        presence.set_readers(&[reader_at(1, "a", first.clone())]);
+        presence.set_readers(&[reader_at(1, "a", first.clone()), reader_at(2, "a", second)]);
+        assert_eq!(presence.superseded(), []);
+        assert_eq!(presence.sockets().count(), 0, "which one leads there is not known");
+        presence.set_readers(&[reader_at(1, "a", first.clone()), reader_at(3, "a", first)]);
+        assert_eq!(presence.superseded(), [prefix(1)]);
+    }
+
+    #[test]
     fn those_that_were_given_up_are_told_for_a_minute_and_are_bounded() {
         let now = Instant::now();
-        let mut presence = Presence::default();
+        let mut presence = on_loopback();
         for number in 0..=255 {
             presence.note_gone(now, prefix(number));
         }
@@ -248,12 +338,12 @@ mod tests {
     fn the_shortest_way_tells_the_time_best() {
         let now = Instant::now();
         let mut clocks = Clocks::default();
-        assert_eq!(clocks.behind_ns(prefix(1)), 0);
+        assert_eq!(clocks.behind_ns(prefix(1)), None);
         clocks.compare(now, prefix(1), 1_000, 6_000);
         clocks.compare(now, prefix(1), 2_000, 6_500);
         clocks.compare(now, prefix(1), 3_000, 9_000);
-        assert_eq!(clocks.behind_ns(prefix(1)), 4_500);
+        assert_eq!(clocks.behind_ns(prefix(1)), Some(4_500));
         clocks.compare(now + COMPARE_EVERY, prefix(1), 3_000, 9_000);
-        assert_eq!(clocks.behind_ns(prefix(1)), 6_000);
+        assert_eq!(clocks.behind_ns(prefix(1)), Some(6_000));
     }
 }

@@ -13,10 +13,11 @@ use tokio::sync::watch;
 
 use super::DdsCounts;
 use super::channel::Channels;
-use super::presence::Clocks;
+use super::presence::{Clock, Clocks};
 use super::send::Target;
 use super::slot::Slots;
 use crate::dds::EndpointId;
+use crate::dds::writer::participant_of;
 use crate::outbox::{Outbox, OutboxLimits};
 use crate::port::{BrokerStatus, Health};
 
@@ -39,6 +40,8 @@ pub(super) struct WriterFacts {
     pub(super) durable: bool,
     /// Of this participant.
     pub(super) own: bool,
+    /// Its participant sends signs of life.
+    pub(super) signs: bool,
 }
 
 /// Counters of [`DdsCounts`].
@@ -48,6 +51,7 @@ pub(super) struct Counters {
     pub(super) rebuilds: AtomicU64,
     pub(super) expelled: AtomicU64,
     pub(super) writers_forgotten: AtomicU64,
+    pub(super) overrun: AtomicU64,
 }
 
 impl Counters {
@@ -58,6 +62,7 @@ impl Counters {
             rebuilds: get(&self.rebuilds),
             expelled: get(&self.expelled),
             writers_forgotten: get(&self.writers_forgotten),
+            overrun: get(&self.overrun),
         }
     }
 }
@@ -114,6 +119,18 @@ impl Shared {
             fault: Mutex::default(),
             changing: Mutex::default(),
         })
+    }
+
+    /// What is known of a writer's clock.
+    pub(super) fn clock_of(&self, writer: EndpointId, facts: Option<WriterFacts>) -> Clock {
+        if facts.is_some_and(|facts| facts.own) {
+            return Clock::Behind(0);
+        }
+        match self.clocks.read().behind_ns(participant_of(&writer)) {
+            Some(behind_ns) => Clock::Behind(behind_ns),
+            None if facts.is_some_and(|facts| facts.signs) => Clock::Awaited,
+            None => Clock::Unknown,
+        }
     }
 
     pub(super) fn wake_lifecycle(&self) {

@@ -7,6 +7,7 @@ use std::task::{Context, Waker};
 use std::time::Instant;
 
 use blaze_domain::TopicName;
+use bytes::Bytes;
 use rdkafka::ClientConfig;
 use rdkafka::message::{BorrowedMessage, Message as _};
 use rdkafka::mocking::MockCluster;
@@ -14,7 +15,7 @@ use rdkafka::producer::{BaseProducer, BaseRecord, DefaultProducerContext, Produc
 
 use super::*;
 use crate::kafka::settings::tests::section_at;
-use crate::port::{SubscribeOptions, Subscription, subscription};
+use crate::port::{Content, Place, SubscribeOptions, Subscription, subscription};
 
 const TOPIC: &str = "fog.imu.data";
 const INFO: TopicInfo = TopicInfo {
@@ -137,6 +138,26 @@ fn a_record_that_was_polled_after_a_reader_came_is_not_lost() {
     bench.hand_out_until(&mut second, 5);
     assert_eq!(second.take(), [1, 2, 3, 4, 5]);
     assert_eq!(first.take(), [0, 1, 2, 3, 4, 5]);
+}
+
+#[test]
+fn a_reader_gets_all_that_is_kept_though_it_is_more_than_may_wait() {
+    let bench = Bench::new(1);
+    let kept_records = i64::try_from(SubscribeOptions::default().max_messages).unwrap() + 100;
+    let received = |offset: i64| Received {
+        place: Some(Place {
+            partition: 0,
+            offset,
+            appended_ms: None,
+        }),
+        kept: true,
+        ..Received::live(Content::from_bytes(Bytes::from_static(b"kept")), Instant::now())
+    };
+    let mut kept = || -> Vec<Received> { (0..kept_records).map(received).collect() };
+    let mut reader = bench.add(1, Join::AfterKept(&mut kept));
+    while reader.take().last() != Some(&(kept_records - 1)) {}
+    assert_eq!(reader.take(), (0..kept_records).collect::<Vec<i64>>());
+    assert_eq!(reader.subscription.take_dropped(), 0);
 }
 
 #[test]

@@ -56,9 +56,7 @@ const MOST_PATIENCE: Duration = Duration::from_secs(60);
 impl TopicState {
     pub(super) fn take_in(&mut self, sender: SubscriptionSender, starts: Vec<i64>, join: Join<'_>) {
         if let Join::AfterKept(kept) = join {
-            for received in kept() {
-                sender.send(received);
-            }
+            sender.send_kept(kept());
         }
         self.readers.push(Reader { sender, starts });
     }

@@ -3,6 +3,7 @@
 mod alone;
 mod crowd;
 mod gone;
+mod plain;
 mod support;
 
 /// The rules for all adapters, each in a domain of its own.
