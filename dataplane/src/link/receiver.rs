@@ -198,9 +198,15 @@ impl ReceiveClass {
         if header.records == 0 {
             self.feedback_due = true;
         }
-        // Floors only rise, so those of a sample that came before are as good.
+        // Floors only rise, so those of a sample that came before are as good, and so are those of one that is refused: where too
+        // much is missing, they alone make room again.
         self.give_up_below(inbox, u64::from(header.message_floor));
         let sequence = header.link_sequence;
+        let floor = sequence.saturating_sub(u64::from(header.unsettled));
+        if floor > self.sequence_floor {
+            self.sequence_floor = floor;
+            self.sequences.remove_through(floor);
+        }
         if sequence <= self.sequence_floor || self.sequences.contains(sequence) {
             return Admission::Repeated;
         }
@@ -212,11 +218,6 @@ impl ReceiveClass {
         self.echo = Some((header.send_ns, now));
         if header.records > 0 {
             self.samples += 1;
-        }
-        let floor = sequence.saturating_sub(u64::from(header.unsettled));
-        if floor > self.sequence_floor {
-            self.sequence_floor = floor;
-            self.sequences.remove_through(floor);
         }
         if self.samples >= FEEDBACK_SAMPLES {
             self.feedback_due = true;

@@ -267,6 +267,30 @@ fn waiting_messages_of_a_hostile_peer_stay_within_bounds() {
 }
 
 #[test]
+fn a_class_with_too_many_gaps_goes_on_once_its_sender_settles_them() {
+    let mut hostile = Hostile::new(1);
+    let frame = sim::frame(Post::small(1), 1);
+    let length = u32::try_from(frame.wire_len()).unwrap();
+    // Every other sample is lost, and the sender knows of none what became of it. The last one says that all before are settled.
+    for message in 1..=9_001u32 {
+        hostile.sequence += 1;
+        let mut header = hostile.header(Priority::State);
+        if message <= 9_000 {
+            header.unsettled = u32::try_from(header.link_sequence).unwrap();
+        }
+        let mut out = DatagramBuilder::new(1300);
+        out.put_part(&part(message, length, 0, length, 0), &frame);
+        hostile.send(out.finish(&header), Priority::State);
+    }
+    hostile.sim.run_ms(1);
+    let refused = hostile.sim.nodes[1].engine.counters().overrun;
+    assert!(refused > 0, "there were too many gaps");
+    let delivered = hostile.sim.nodes[1].delivered.len() as u64;
+    assert_eq!(delivered + refused, 9_001);
+    assert_eq!(refused, 9_000 - 8_192, "the last one is taken");
+}
+
+#[test]
 fn jumping_sequences_and_floors_do_no_harm() {
     let mut hostile = Hostile::new(1);
     let mut random = Random::new(5);
