@@ -29,6 +29,7 @@ use super::wire::{LinkHeader, Record};
 
 /// An unfinished message is given up that long after its last part, and so is the one that another waits for. Time in
 /// which nothing of the class comes does not count: the sender may have been cut off, or have more urgent things to send.
+/// Nor does time in which more is missing than a Feedback can tell: nobody repairs what it was not asked for.
 const PATIENCE: Duration = Duration::from_secs(2);
 /// … but that long at most.
 const LONGEST_PATIENCE: Duration = Duration::from_secs(30);
@@ -39,7 +40,11 @@ const SWEEP: Duration = Duration::from_millis(100);
 const FEEDBACK_EVERY: Duration = Duration::from_millis(50);
 const FEEDBACK_IDLE: Duration = Duration::from_millis(500);
 const FEEDBACK_SAMPLES: u32 = 64;
-const MISSING_RANGES: usize = 32;
+/// Missing ranges in one Feedback, by their sequences. Flows of the first version take no more.
+pub(crate) const MISSING_RANGES: usize = 32;
+/// Missing ranges that a Feedback tells beyond those, by their distances, as far as its datagram has room. All that is lost in
+/// a round trip should fit: what does not waits for the next one.
+pub(crate) const MORE_RANGES: usize = 512;
 /// Gaps in the sequence that are kept; a sample that would make more is refused.
 const MAX_SEQUENCE_RANGES: usize = 8_192;
 /// Gaps between settled messages that are kept; the oldest is given up.
@@ -123,6 +128,8 @@ pub(crate) struct ReceiveClass {
     last_feedback: Option<Instant>,
     feedback_at: Option<Instant>,
     feedback_due: bool,
+    /// More was missing than the last Feedback could tell.
+    untold: bool,
     /// Messages below are settled.
     message_floor: u64,
     settled: RangeSet,
@@ -133,7 +140,7 @@ pub(crate) struct ReceiveClass {
     reserved: usize,
     /// No held message has to be handed out before.
     hand_out_at: Option<Instant>,
-    /// Time in which samples came.
+    /// Time in which samples came and all that was missing could be told.
     active: Duration,
     last_sample: Option<Instant>,
     sweep_at: Option<Instant>,
@@ -154,6 +161,7 @@ impl ReceiveClass {
             last_feedback: None,
             feedback_at: None,
             feedback_due: false,
+            untold: false,
             message_floor: 1,
             settled: RangeSet::default(),
             assemblies: HashMap::new(),
@@ -191,7 +199,9 @@ impl ReceiveClass {
             self.link_epoch = link_epoch;
         }
         let now = inbox.now;
-        if let Some(last) = self.last_sample {
+        if let Some(last) = self.last_sample
+            && !self.untold
+        {
             self.active += now.saturating_duration_since(last).min(ACTIVE_GAP);
         }
         self.last_sample = Some(now);

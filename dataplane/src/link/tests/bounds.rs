@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use blaze_domain::{DropReason, Priority};
+use blaze_proto::Frame;
 use bytes::{BufMut, Bytes, BytesMut};
 
 use super::super::event::LaneId;
@@ -204,6 +205,20 @@ impl Hostile {
         }
     }
 
+    /// Sends a whole message in a sample of its own, after `lost` samples that never come. `settled`: of all samples before it
+    /// the sender knows what became of them.
+    fn post(&mut self, message: u32, behind: u16, frame: &Frame, lost: u64, settled: bool) {
+        self.sequence += lost;
+        let mut header = self.header(Priority::State);
+        if !settled {
+            header.unsettled = u32::try_from(header.link_sequence).unwrap();
+        }
+        let length = u32::try_from(frame.wire_len()).unwrap();
+        let mut out = DatagramBuilder::new(1300);
+        out.put_part(&part(message, length, 0, length, behind), frame);
+        self.send(out.finish(&header), Priority::State);
+    }
+
     fn send(&mut self, datagram: Bytes, class: Priority) {
         self.sim.nodes[1].engine.receive(self.sim.now, datagram, class);
         let reserved = self.sim.nodes[1].engine.reassembly_bytes();
@@ -270,17 +285,9 @@ fn waiting_messages_of_a_hostile_peer_stay_within_bounds() {
 fn a_class_with_too_many_gaps_goes_on_once_its_sender_settles_them() {
     let mut hostile = Hostile::new(1);
     let frame = sim::frame(Post::small(1), 1);
-    let length = u32::try_from(frame.wire_len()).unwrap();
     // Every other sample is lost, and the sender knows of none what became of it. The last one says that all before are settled.
-    for message in 1..=9_001u32 {
-        hostile.sequence += 1;
-        let mut header = hostile.header(Priority::State);
-        if message <= 9_000 {
-            header.unsettled = u32::try_from(header.link_sequence).unwrap();
-        }
-        let mut out = DatagramBuilder::new(1300);
-        out.put_part(&part(message, length, 0, length, 0), &frame);
-        hostile.send(out.finish(&header), Priority::State);
+    for message in 1..=9_001 {
+        hostile.post(message, 0, &frame, 1, message > 9_000);
     }
     hostile.sim.run_ms(1);
     let refused = hostile.sim.nodes[1].engine.counters().overrun;
@@ -288,6 +295,28 @@ fn a_class_with_too_many_gaps_goes_on_once_its_sender_settles_them() {
     let delivered = hostile.sim.nodes[1].delivered.len() as u64;
     assert_eq!(delivered + refused, 9_001);
     assert_eq!(refused, 9_000 - 8_192, "the last one is taken");
+}
+
+#[test]
+fn nothing_is_given_up_while_more_is_missing_than_can_be_told() {
+    let mut hostile = Hostile::new(1);
+    let filler = sim::frame(Post::small(1), 1);
+    // Waits for the first message, which may be in any of the samples that are missing.
+    hostile.post(2, 1, &sim::frame(Post::reliable(77), 1), 1, false);
+    for message in 3..2_003 {
+        hostile.post(message, 0, &filler, 1, false);
+        hostile.sim.run_ms(2);
+    }
+    assert!(hostile.sim.sequences(1, 77).is_empty(), "it waits for longer than 2 s");
+    for message in 2_003..3_003 {
+        hostile.post(message, 0, &filler, 0, true);
+        hostile.sim.run_ms(2);
+    }
+    assert_eq!(
+        hostile.sim.sequences(1, 77),
+        [1],
+        "all that is missing is told: it waits no longer"
+    );
 }
 
 #[test]

@@ -120,6 +120,29 @@ fn large_frames_are_repaired() {
 }
 
 #[test]
+fn many_losses_in_one_round_trip_are_repaired_in_the_next() {
+    let mut sim = Sim::new(1, Weather::delay(150), &["edge/a", "fog/b"]);
+    sim.run_ms(2_000);
+    let (a, b) = (sim.id(0), sim.id(1));
+    let weather = Weather {
+        loss: 0.2,
+        ..Weather::delay(150)
+    };
+    sim.network.set_path(&a, &b, weather);
+    // Each in a sample of its own: about 70 gaps in the time from a loss to its repair.
+    for _ in 0..6_000 {
+        sim.publish(0, 1, Post::reliable(1)).unwrap();
+        sim.run_ms(1);
+    }
+    sim.run_ms(10_000);
+    sim.check_deliveries();
+    sim.check_accounts();
+    let delivered = sim.sequences(1, 1).len();
+    // One that is lost six times running is given up, and so rare is that.
+    assert!(delivered > 5_990, "{delivered} of 6000");
+}
+
+#[test]
 fn the_last_message_is_repaired_by_a_probe() {
     let mut sim = Sim::new(1, Weather::delay(20), &["edge/a", "fog/b"]);
     sim.run_ms(1_000);
