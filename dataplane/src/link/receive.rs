@@ -11,7 +11,7 @@ use prost::Message as _;
 use super::engine::Engine;
 use super::event::{DownReason, LinkEvent};
 use super::peer::{Echo, HELLO_EVERY, Peer, Phase};
-use super::receiver::{Admission, Inbox, MISSING_RANGES, MORE_RANGES, ReceiveClass};
+use super::receiver::{Admission, GIVEN_UP_TOLD, Inbox, MISSING_RANGES, MORE_RANGES, ReceiveClass};
 use super::sender::{FeedbackView, SendContext};
 use super::transport::Endpoint;
 use super::wire::{Datagram, LinkHeader, SenderId, VERSION, class_code, class_index};
@@ -22,6 +22,8 @@ struct Told {
     missing: Vec<u64>,
     /// What it speaks for.
     highest_sequence: u64,
+    /// Messages, ascending.
+    given_up: Vec<u32>,
 }
 
 impl Told {
@@ -29,8 +31,17 @@ impl Told {
     fn read(feedback: &Feedback) -> Option<Self> {
         let are_pairs = |length: usize, most: usize| length.is_multiple_of(2) && length <= 2 * most;
         let (some, more) = (&feedback.missing, &feedback.more_missing);
-        if !are_pairs(some.len(), MISSING_RANGES) || !are_pairs(more.len(), MORE_RANGES) {
+        let distances = &feedback.given_up;
+        if !are_pairs(some.len(), MISSING_RANGES)
+            || !are_pairs(more.len(), MORE_RANGES)
+            || distances.len() > GIVEN_UP_TOLD
+        {
             return None;
+        }
+        let (mut given_up, mut number) = (Vec::with_capacity(distances.len()), 0u32);
+        for distance in distances {
+            number = number.checked_add(*distance)?;
+            given_up.push(number);
         }
         let (mut missing, mut end) = (some.clone(), feedback.highest_sequence);
         for pair in more.chunks_exact(2) {
@@ -49,6 +60,7 @@ impl Told {
         (is_ascending && end <= highest_sequence).then_some(Self {
             missing,
             highest_sequence,
+            given_up,
         })
     }
 }
@@ -285,6 +297,7 @@ impl Engine {
             link_epoch: feedback.link_epoch,
             highest_sequence: told.highest_sequence,
             missing: &told.missing,
+            given_up: &told.given_up,
             received_bytes: feedback.received_bytes,
             window_bytes: feedback.window_bytes,
             delivered_message: feedback.delivered_message,
@@ -361,5 +374,20 @@ mod tests {
         assert!(more(&[1; 2 * MORE_RANGES + 2], u64::MAX, 4).is_none(), "too many");
         assert!(Told::read(&feedback(&[3, 2, 4, 1], 20)).is_none(), "they overlap");
         assert!(Told::read(&feedback(&[1; 2 * MISSING_RANGES + 2], 20)).is_none());
+    }
+
+    #[test]
+    fn messages_that_were_given_up_are_told_by_distances() {
+        let given_up = |distances: &[u32]| {
+            let told = Told::read(&Feedback {
+                given_up: distances.to_vec(),
+                ..feedback(&[], 20)
+            });
+            told.map(|told| told.given_up)
+        };
+        assert_eq!(given_up(&[]), Some(vec![]));
+        assert_eq!(given_up(&[1_000, 1, 20]), Some(vec![1_000, 1_001, 1_021]));
+        assert_eq!(given_up(&[u32::MAX, 1]), None);
+        assert_eq!(given_up(&[1; GIVEN_UP_TOLD + 1]), None);
     }
 }

@@ -6,12 +6,13 @@
 //!             └→ Feedback: highest sequence, what is missing
 //! ```
 //!
-//! Each message is settled once: delivered, dropped or given up. A settled one is never looked at again.
+//! Each message is settled once: delivered, dropped or given up. A settled one is never looked at again. What is dropped is counted
+//! here; of what is given up before anything of it came the sender is told, which counts it: here it has no name.
 
 mod settle;
 mod timing;
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::hash::{BuildHasher, RandomState};
 use std::time::{Duration, Instant};
 
@@ -45,6 +46,10 @@ pub(crate) const MISSING_RANGES: usize = 32;
 /// Missing ranges that a Feedback tells beyond those, by their distances, as far as its datagram has room. All that is lost in
 /// a round trip should fit: what does not waits for the next one.
 pub(crate) const MORE_RANGES: usize = 512;
+/// Messages in one Feedback that were given up although nothing of them came.
+pub(crate) const GIVEN_UP_TOLD: usize = 64;
+/// Such messages that are kept until their sender has settled them; more are counted here.
+const MAX_GIVEN_UP: usize = 1_024;
 /// Gaps in the sequence that are kept; a sample that would make more is refused.
 const MAX_SEQUENCE_RANGES: usize = 8_192;
 /// Gaps between settled messages that are kept; the oldest is given up.
@@ -133,6 +138,8 @@ pub(crate) struct ReceiveClass {
     /// Messages below are settled.
     message_floor: u64,
     settled: RangeSet,
+    /// Given up although nothing of them came, and not settled by the sender yet.
+    given_up: BTreeSet<u32>,
     assemblies: HashMap<u32, Assembly>,
     held: BTreeMap<u32, Held>,
     /// Who waits for a message.
@@ -164,6 +171,7 @@ impl ReceiveClass {
             untold: false,
             message_floor: 1,
             settled: RangeSet::default(),
+            given_up: BTreeSet::new(),
             assemblies: HashMap::new(),
             held: BTreeMap::new(),
             waiters: HashMap::new(),
@@ -211,6 +219,9 @@ impl ReceiveClass {
         // Floors only rise, so those of a sample that came before are as good, and so are those of one that is refused: where too
         // much is missing, they alone make room again.
         self.give_up_below(inbox, u64::from(header.message_floor));
+        if self.given_up.first().is_some_and(|first| *first < header.message_floor) {
+            self.given_up = self.given_up.split_off(&header.message_floor);
+        }
         let sequence = header.link_sequence;
         let floor = sequence.saturating_sub(u64::from(header.unsettled));
         if floor > self.sequence_floor {

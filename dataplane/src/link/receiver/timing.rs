@@ -6,7 +6,10 @@ use blaze_domain::DropReason;
 use blaze_proto::link::link_control::Feedback;
 use prost::{Message as _, length_delimiter_len};
 
-use super::{FEEDBACK_IDLE, Held, Inbox, LONGEST_PATIENCE, MISSING_RANGES, MORE_RANGES, PATIENCE, ReceiveClass, SWEEP};
+use super::{
+    FEEDBACK_IDLE, GIVEN_UP_TOLD, Held, Inbox, LONGEST_PATIENCE, MISSING_RANGES, MORE_RANGES, PATIENCE, ReceiveClass,
+    SWEEP,
+};
 
 /// What the lists of a Feedback that fill its datagram take besides their numbers, at most: tags and lengths, that of the
 /// Feedback itself included, and `more_highest`.
@@ -116,8 +119,21 @@ impl ReceiveClass {
             echo_held_ns,
             more_missing: Vec::new(),
             more_highest: 0,
+            given_up: Vec::new(),
         };
         let mut room = room.saturating_sub(feedback.encoded_len() + FRAMING_BYTES);
+        let mut before = 0u32;
+        for &number in &self.given_up {
+            let bytes = length_delimiter_len((number - before) as usize);
+            if bytes > room || feedback.given_up.len() >= GIVEN_UP_TOLD {
+                // Until it is told its sender must not take it for delivered.
+                feedback.delivered_message = feedback.delivered_message.min(number.saturating_sub(1));
+                break;
+            }
+            room -= bytes;
+            feedback.given_up.push(number - before);
+            before = number;
+        }
         while let Some(&(first, last)) = gaps.peek() {
             let (Ok(came), Ok(count)) = (u32::try_from(first - end - 1), u32::try_from(last - first + 1)) else {
                 break;

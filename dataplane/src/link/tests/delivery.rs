@@ -246,6 +246,85 @@ fn lifespan_ends_at_both_ends() {
     sim.check_accounts();
 }
 
+/// Loses all user datagrams of the first flow that hold a message of 700 bytes or more.
+fn lose_large_ones(sim: &mut Sim) {
+    sim.network.censor = Some(Box::new(|from, _, class, datagram| {
+        class == Priority::State && from.flow.layer.as_str() == "edge" && datagram.len() >= 700
+    }));
+}
+
+#[test]
+fn a_reliable_message_of_which_nothing_came_is_counted_once() {
+    for lifespan in [None, Some(Duration::from_millis(300))] {
+        let mut sim = Sim::new(1, Weather::delay(20), &["edge/a", "fog/b"]);
+        sim.run_ms(1_500);
+        let post = Post {
+            lifespan,
+            ..Post::reliable(1)
+        };
+        sim.publish(0, 1, post).unwrap();
+        sim.run_ms(200);
+        lose_large_ones(&mut sim);
+        sim.publish(0, 1, Post { bytes: 700, ..post }).unwrap();
+        sim.run_ms(1);
+        sim.publish(0, 1, post).unwrap();
+        // Others go on, so that the class is active.
+        for _ in 0..60 {
+            sim.publish(0, 1, Post::small(2)).unwrap();
+            sim.run_ms(50);
+        }
+        assert_eq!(sim.sequences(1, 1), [1, 3], "{lifespan:?}");
+        let lane = &sim.nodes[0].lanes[&LaneId(1)];
+        let reason = if lifespan.is_some() {
+            DropReason::Lifespan
+        } else {
+            DropReason::ReassemblyTimeout
+        };
+        assert_eq!(lane.out, 2, "{lifespan:?}: what did not arrive is not out");
+        assert_eq!(
+            lane.dropped.iter().collect::<Vec<_>>(),
+            [(&reason, &1)],
+            "{lifespan:?}: counted by its sender"
+        );
+        assert!(
+            sim.nodes[1].receiver_dropped.is_empty(),
+            "{lifespan:?}: and by nobody else"
+        );
+        sim.check_accounts();
+    }
+}
+
+#[test]
+fn a_repair_that_comes_after_all_does_not_make_a_message_out_that_was_given_up() {
+    let mut sim = Sim::new(1, Weather::delay(20), &["edge/a", "fog/b"]);
+    sim.run_ms(1_500);
+    lose_large_ones(&mut sim);
+    let start = sim.now;
+    sim.publish(
+        0,
+        1,
+        Post {
+            bytes: 700,
+            ..Post::reliable(1)
+        },
+    )
+    .unwrap();
+    sim.run_ms(1);
+    sim.publish(0, 1, Post::reliable(1)).unwrap();
+    while sim.sequences(1, 1).is_empty() {
+        assert!(sim.now - start < Duration::from_secs(5), "it is given up");
+        let _ = sim.publish(0, 1, Post::small(2));
+        sim.run_ms(1);
+    }
+    // From now on nothing is lost, and the sender does not know yet.
+    sim.network.censor = None;
+    sim.run_ms(1_000);
+    assert_eq!(sim.sequences(1, 1), [2]);
+    let lane = &sim.nodes[0].lanes[&LaneId(1)];
+    assert_eq!((lane.out, lane.dropped[&DropReason::ReassemblyTimeout]), (1, 1));
+    sim.check_accounts();
+}
+
 #[test]
 fn age_counts_residence_half_the_round_trip_and_repair() {
     let mut sim = Sim::new(1, Weather::delay(30), &["edge/a", "fog/b"]);
