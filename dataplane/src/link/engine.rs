@@ -9,7 +9,7 @@
 //! Who drives it takes all events after each call, and calls [`Engine::handle_timeout`] when
 //! [`Engine::next_timeout`] has come.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::hash::RandomState;
 use std::time::{Duration, Instant};
 
@@ -22,6 +22,7 @@ use prost::Message as _;
 use super::addresses::Addresses;
 use super::clock::Clocks;
 use super::event::{LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit};
+use super::lifecycle::Missed;
 use super::peer::{FORGET_AFTER, HELLO_EVERY, MAX_CONTROLS, Peer, Phase};
 use super::sender::SendClass;
 use super::transport::Endpoint;
@@ -96,6 +97,8 @@ pub struct Engine {
     pub(super) peers: Vec<Option<Peer>>,
     pub(super) by_flow: HashMap<FlowId, usize>,
     pub(super) by_sender: HashMap<SenderId, usize>,
+    /// Flows that were heard before a new life began, here or there, and not since.
+    pub(super) missed: BTreeMap<FlowId, Missed>,
     pub(super) next_link_epoch: u32,
     /// Peer that was served last, for LinkControl and per class.
     pub(super) cursors: [usize; 4],
@@ -123,6 +126,7 @@ impl Engine {
             peers: Vec::new(),
             by_flow: HashMap::new(),
             by_sender: HashMap::new(),
+            missed: BTreeMap::new(),
             next_link_epoch: 1,
             cursors: [0; 4],
             ledger: Ledger::default(),
@@ -269,7 +273,10 @@ impl Engine {
     /// When [`Engine::handle_timeout`] has something to do next.
     #[must_use]
     pub fn next_timeout(&self) -> Option<Instant> {
-        self.peers.iter().flatten().filter_map(Peer::next_timeout).min()
+        let peers = self.peers.iter().flatten().filter_map(Peer::next_timeout);
+        // One that can be written to again has as long as that.
+        let missed = self.missed.iter().filter(|(flow, _)| !self.by_flow.contains_key(*flow));
+        peers.chain(missed.map(|(_, missed)| missed.until)).min()
     }
 
     /// Drops what a lane has waiting; what is on its way goes on and ends in an event. The caller counts what is returned.

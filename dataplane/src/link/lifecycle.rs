@@ -2,13 +2,27 @@
 
 use std::time::Instant;
 
+use blaze_domain::FlowId;
+
 use super::engine::Engine;
 use super::event::{DownReason, LinkEvent};
-use super::peer::{HELLO_EVERY, Peer, Phase};
+use super::peer::{FORGET_AFTER, HELLO_EVERY, Peer, Phase};
 use super::receiver::Inbox;
 use super::sender::{SendContext, SendLimits};
 use super::transport::Endpoint;
 use super::wire::SenderId;
+
+/// Missed flows that are kept; beyond that the one that is due next is forgotten.
+const MAX_MISSED: usize = 1_024;
+
+/// A flow that was heard, until a new life began, here or there. Without this nobody would tell that it did not come back.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Missed {
+    /// The life in which it was heard.
+    epoch: u64,
+    /// When it is forgotten, unless it says Hello before.
+    pub(super) until: Instant,
+}
 
 impl Engine {
     /// The transport can write to an endpoint.
@@ -53,8 +67,7 @@ impl Engine {
                 self.counters.stale += 1;
                 return None;
             }
-            self.take_down(now, at, DownReason::NewEpoch);
-            self.remove(at);
+            self.replace(now, at, DownReason::NewEpoch);
         }
         let at = self.free_place()?;
         let limits = [0, 1, 2].map(|class| SendLimits {
@@ -90,14 +103,64 @@ impl Engine {
         Some(at)
     }
 
-    /// This flow begins a new life: peers are dropped and have to be found again.
+    /// This flow begins a new life: peers are dropped and have to be found again. Those that are not heard again are forgotten as
+    /// if it had gone on.
     pub fn restart(&mut self, now: Instant, epoch: u64) {
+        for at in 0..self.peers.len() {
+            self.replace(now, at, DownReason::Restarted);
+        }
+        self.config.epoch = epoch;
+        self.sender = SenderId::of(&self.config.me, epoch);
+    }
+
+    /// This flow leaves the inter scope on purpose: it waits for nobody there.
+    pub fn leave(&mut self, now: Instant) {
         for at in 0..self.peers.len() {
             self.take_down(now, at, DownReason::Restarted);
             self.remove(at);
         }
-        self.config.epoch = epoch;
-        self.sender = SenderId::of(&self.config.me, epoch);
+        self.missed.clear();
+    }
+
+    /// Removes a peer because a new life begins, here or there. If it was heard, it is missed.
+    fn replace(&mut self, now: Instant, at: usize, reason: DownReason) {
+        let peer = self.peers.get(at).and_then(Option::as_ref);
+        if let Some(peer) = peer.filter(|peer| peer.is_connected() || peer.phase == Phase::Down) {
+            let missed = Missed {
+                epoch: peer.endpoint.epoch,
+                until: peer.last_hello.unwrap_or(peer.since) + FORGET_AFTER,
+            };
+            let flow = peer.endpoint.flow.clone();
+            self.miss(flow, missed);
+        }
+        self.take_down(now, at, reason);
+        self.remove(at);
+    }
+
+    fn miss(&mut self, flow: FlowId, missed: Missed) {
+        if self.missed.len() >= MAX_MISSED && !self.missed.contains_key(&flow) {
+            let next = self.missed.iter().min_by_key(|(_, missed)| missed.until);
+            if let Some(next) = next.map(|(flow, _)| flow.clone()) {
+                self.forget_missed(next);
+            }
+        }
+        self.missed.insert(flow, missed);
+    }
+
+    fn forget_missed(&mut self, flow: FlowId) {
+        if let Some(Missed { epoch, .. }) = self.missed.remove(&flow) {
+            self.ledger.events.push_back(LinkEvent::PeerForgotten { flow, epoch });
+        }
+    }
+
+    /// Forgets the missed flows that did not come back in time.
+    fn forget_silent(&mut self, now: Instant) {
+        let missed = self.missed.iter();
+        let due = missed.filter(|(flow, missed)| missed.until <= now && !self.by_flow.contains_key(*flow));
+        let due: Vec<FlowId> = due.map(|(flow, _)| flow.clone()).collect();
+        for flow in due {
+            self.forget_missed(flow);
+        }
     }
 
     /// Drops what waits for a peer, hands out what waits from it, and says so if it was up.
@@ -163,6 +226,7 @@ impl Engine {
             self.advance_phase(now, at);
             self.advance_classes(now, at);
         }
+        self.forget_silent(now);
     }
 
     fn advance_phase(&mut self, now: Instant, at: usize) {

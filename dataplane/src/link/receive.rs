@@ -261,6 +261,7 @@ impl Engine {
         if !peer.is_connected() {
             peer.phase = Phase::Up;
             peer.since = now;
+            self.missed.remove(&flow);
             peer.hello_due = true;
             peer.hello_at = now + HELLO_EVERY;
             self.ledger.events.push_back(LinkEvent::PeerUp {
