@@ -9,7 +9,7 @@
 //! Who drives it takes all events after each call, and calls [`Engine::handle_timeout`] when
 //! [`Engine::next_timeout`] has come.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::RandomState;
 use std::time::{Duration, Instant};
 
@@ -30,6 +30,9 @@ use super::wire::{HEADER_BYTES, RECORD_BYTES, SenderId, class_index};
 
 /// Smallest datagram size that an engine uses, in bytes.
 pub const MIN_DATAGRAM_BYTES: usize = 1024;
+/// Peers of one flow, at most. Each takes six file descriptors (RustDDS has two per writer), twelve for as long as a dead
+/// participant is laid aside, up to 3.3 MiB in DDS, and a look at each datagram that is sent; and all flows know all writers of all.
+pub const MAX_PEERS: usize = 128;
 /// Most GUID prefixes that a Hello announces.
 const MAX_GUID_PREFIXES: usize = 4;
 
@@ -53,7 +56,7 @@ impl Default for Limits {
         Self {
             queue_bytes: [MIB, 4 * MIB, 16 * MIB],
             reassembly_bytes: 64 * MIB,
-            peers: 64,
+            peers: MAX_PEERS,
             streams: 16_384,
         }
     }
@@ -99,6 +102,10 @@ pub struct Engine {
     pub(super) by_sender: HashMap<SenderId, usize>,
     /// Flows that were heard before a new life began, here or there, and not since.
     pub(super) missed: BTreeMap<FlowId, Missed>,
+    /// Flows that found no place, those first that wait longest.
+    pub(super) waiting: VecDeque<Endpoint>,
+    /// When it was last told that one found none.
+    pub(super) refusal_told: Option<Instant>,
     pub(super) next_link_epoch: u32,
     /// Peer that was served last, for LinkControl and per class.
     pub(super) cursors: [usize; 4],
@@ -127,6 +134,8 @@ impl Engine {
             by_flow: HashMap::new(),
             by_sender: HashMap::new(),
             missed: BTreeMap::new(),
+            waiting: VecDeque::new(),
+            refusal_told: None,
             next_link_epoch: 1,
             cursors: [0; 4],
             ledger: Ledger::default(),
@@ -306,6 +315,12 @@ impl Engine {
     pub fn peer(&self, flow: &FlowId) -> Option<PeerInfo> {
         let peer = self.peers[*self.by_flow.get(flow)?].as_ref()?;
         (peer.phase != Phase::Gone).then(|| peer.info())
+    }
+
+    /// Flows that found no place among the peers, and wait for one.
+    #[must_use]
+    pub fn waiting_peers(&self) -> usize {
+        self.waiting.len()
     }
 
     /// Counts since the start.

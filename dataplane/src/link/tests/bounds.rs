@@ -6,7 +6,7 @@ use blaze_domain::{DropReason, Priority};
 use blaze_proto::Frame;
 use bytes::{BufMut, Bytes, BytesMut};
 
-use super::super::event::LaneId;
+use super::super::event::{LaneId, LinkEvent, PeerState};
 use super::super::sim::{Post, Random, Sim, Weather};
 use super::super::wire::{DatagramBuilder, HEADER_BYTES, LinkHeader, Record, SenderId};
 use super::super::{Limits, sim};
@@ -412,6 +412,55 @@ fn more_peers_than_there_is_room_for() {
     sim.publish(0, 1, Post::reliable(1)).unwrap();
     sim.run_ms(100);
     assert_eq!(sim.sequences(1, 1), [1], "one that is up keeps its place");
+}
+
+#[test]
+fn who_finds_no_place_is_told_of_and_gets_one_when_it_is_free() {
+    let limits = Limits {
+        peers: 2,
+        ..Limits::default()
+    };
+    let mut sim = Sim::with_limits(1, Weather::delay(5), &["edge/a", "fog/b", "cloud/c"], limits);
+    sim.run_ms(1_000);
+    let late = sim.join("edge/d");
+    // It says Hello for a minute and gives up.
+    sim.run_ms(65_000);
+    let of = |sim: &Sim, wanted: fn(&LinkEvent) -> bool| {
+        let events = sim.nodes[0].events.iter();
+        events.filter(|(_, event)| wanted(event)).count()
+    };
+    assert_eq!(sim.nodes[0].engine.peers().len(), 2);
+    assert_eq!(sim.nodes[0].engine.waiting_peers(), 1);
+    assert!(sim.nodes[0].engine.counters().peers_refused > 100);
+    let told = of(&sim, |event| matches!(event, LinkEvent::PeerRefused { peers: 2, .. }));
+    assert!((1..=2).contains(&told), "once a minute: {told}");
+    sim.nodes[2].alive = false;
+    sim.run_ms(65_000);
+    assert_eq!(sim.nodes[0].engine.waiting_peers(), 0);
+    let admitted = of(&sim, |event| matches!(event, LinkEvent::PeerAdmitted { .. }));
+    assert_eq!(admitted, 1);
+    let peer = sim.nodes[0].engine.peer(&sim.id(late)).unwrap();
+    assert_eq!(peer.state, PeerState::Up);
+    sim.publish(0, late, Post::reliable(1)).unwrap();
+    sim.run_ms(100);
+    assert_eq!(sim.sequences(late, 1), [1]);
+}
+
+#[test]
+fn one_that_waits_for_a_place_and_goes_gets_none() {
+    let limits = Limits {
+        peers: 1,
+        ..Limits::default()
+    };
+    let mut sim = Sim::with_limits(1, Weather::delay(5), &["edge/a", "fog/b"], limits);
+    sim.run_ms(1_000);
+    let late = sim.join("edge/d");
+    sim.run_ms(100);
+    assert_eq!(sim.nodes[0].engine.waiting_peers(), 1);
+    sim.nodes[late].alive = false;
+    let endpoint = sim.endpoint(late);
+    sim.nodes[0].engine.peer_lost(sim.now, &endpoint);
+    assert_eq!(sim.nodes[0].engine.waiting_peers(), 0);
 }
 
 #[test]
