@@ -12,6 +12,7 @@ use tokio_util::sync::CancellationToken;
 use super::inter::InterScope;
 use super::{LocalBrokers, Shared};
 use crate::control::Stage;
+use crate::link::{Engine, MAX_PEERS};
 use crate::world::FlowState;
 
 /// `why` looks at what happened during the last one to two of these.
@@ -81,6 +82,22 @@ pub(super) async fn watch_health(shared: Arc<Shared>, ready: Arc<Notify>, stop: 
     }
 }
 
+/// What the transport says, and how many flows found no place among the peers.
+fn with_refused(shared: &Shared, detail: String) -> String {
+    let waiting = shared
+        .plane
+        .read(|state| state.engine.as_ref().map_or(0, Engine::waiting_peers));
+    if waiting == 0 {
+        return detail;
+    }
+    let refused = format!("{waiting} more flows are not reached: {MAX_PEERS} peers are the most");
+    if detail.is_empty() {
+        refused
+    } else {
+        format!("{detail}; {refused}")
+    }
+}
+
 /// Whether flows of other groups are reached, on the inter scope or over a gateway.
 fn inter_check(shared: &Shared, inter: &InterScope, listened: bool) -> (CheckStatus, String) {
     let (stage, state, gateways) = {
@@ -90,7 +107,7 @@ fn inter_check(shared: &Shared, inter: &InterScope, listened: bool) -> (CheckSta
     };
     let apart = !matches!(stage, Stage::Gateway | Stage::Leaving { .. });
     match inter.status().filter(|_| !apart) {
-        Some(status) if status.ready && listened => (CheckStatus::Ok, status.detail),
+        Some(status) if status.ready && listened => (CheckStatus::Ok, with_refused(shared, status.detail)),
         Some(status) if status.ready => (CheckStatus::Failed, "listening for other flows".to_owned()),
         Some(status) => (CheckStatus::Failed, status.detail),
         None if state == FlowState::Starting && stage == Stage::Listening => (

@@ -252,7 +252,12 @@ impl InterScope {
             News::Rebuilt(_) | News::Joined | News::Lost | News::Left => return,
         };
         match event {
-            LinkEvent::PeerUp { flow, epoch } => self.connect(&endpoint(flow, *epoch)),
+            LinkEvent::PeerUp { flow, epoch } | LinkEvent::PeerAdmitted { flow, epoch } => {
+                self.connect(&endpoint(flow, *epoch));
+            }
+            LinkEvent::PeerRefused { flow, peers } => {
+                tracing::warn!(%flow, peers, "no place for another flow among the peers on the inter scope");
+            }
             LinkEvent::PeerDown {
                 flow,
                 epoch,

@@ -51,7 +51,7 @@ pub struct DestinationTraffic {
     pub rate: RateMeter,
 }
 
-/// Destinations that are counted one by one; the table is small because a layer has at most 16 flows on the inter scope.
+/// Destinations that are counted one by one. At a time there are no more than [`MAX_PEERS`](crate::link::MAX_PEERS).
 const MAX_DESTINATIONS: usize = 1024;
 
 impl Egress {

@@ -312,12 +312,7 @@ impl Plane {
 
     /// The link knows nobody any more.
     pub fn drop_peers(&self) {
-        self.with(|state| {
-            let engine = state.engine.as_mut()?;
-            let epoch = engine.endpoint().epoch;
-            engine.restart(Instant::now(), epoch);
-            Some(())
-        });
+        self.with(|state| state.engine.as_mut().map(|engine| engine.leave(Instant::now())));
     }
 
     /// Something else has news for the control task.

@@ -31,6 +31,7 @@ use wire::Wire;
 
 /// Most endpoints that are written to at a time.
 const MAX_ENDPOINTS: usize = 1024;
+const _: () = assert!(MAX_ENDPOINTS >= 2 * super::MAX_PEERS, "each peer, and its life before");
 /// Most participants whose last datagram is remembered.
 const MAX_HEARD: usize = 1024;
 /// First part of all link topics.

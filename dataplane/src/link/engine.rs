@@ -9,7 +9,7 @@
 //! Who drives it takes all events after each call, and calls [`Engine::handle_timeout`] when
 //! [`Engine::next_timeout`] has come.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::RandomState;
 use std::time::{Duration, Instant};
 
@@ -22,6 +22,7 @@ use prost::Message as _;
 use super::addresses::Addresses;
 use super::clock::Clocks;
 use super::event::{LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit};
+use super::lifecycle::Missed;
 use super::peer::{FORGET_AFTER, HELLO_EVERY, MAX_CONTROLS, Peer, Phase};
 use super::sender::SendClass;
 use super::transport::Endpoint;
@@ -29,6 +30,9 @@ use super::wire::{HEADER_BYTES, RECORD_BYTES, SenderId, class_index};
 
 /// Smallest datagram size that an engine uses, in bytes.
 pub const MIN_DATAGRAM_BYTES: usize = 1024;
+/// Peers of one flow, at most. Each takes six file descriptors (RustDDS has two per writer), twelve for as long as a dead
+/// participant is laid aside, up to 3.3 MiB in DDS, and a look at each datagram that is sent; and all flows know all writers of all.
+pub const MAX_PEERS: usize = 128;
 /// Most GUID prefixes that a Hello announces.
 const MAX_GUID_PREFIXES: usize = 4;
 
@@ -52,7 +56,7 @@ impl Default for Limits {
         Self {
             queue_bytes: [MIB, 4 * MIB, 16 * MIB],
             reassembly_bytes: 64 * MIB,
-            peers: 64,
+            peers: MAX_PEERS,
             streams: 16_384,
         }
     }
@@ -97,6 +101,12 @@ pub struct Engine {
     pub(super) peers: Vec<Option<Peer>>,
     pub(super) by_flow: HashMap<FlowId, usize>,
     pub(super) by_sender: HashMap<SenderId, usize>,
+    /// Flows that were heard before a new life began, here or there, and not since.
+    pub(super) missed: BTreeMap<FlowId, Missed>,
+    /// Flows that found no place, those first that wait longest.
+    pub(super) waiting: VecDeque<Endpoint>,
+    /// When it was last told that one found none.
+    pub(super) refusal_told: Option<Instant>,
     pub(super) next_link_epoch: u32,
     /// Peer that was served last, for LinkControl and per class.
     pub(super) cursors: [usize; 4],
@@ -125,6 +135,9 @@ impl Engine {
             peers: Vec::new(),
             by_flow: HashMap::new(),
             by_sender: HashMap::new(),
+            missed: BTreeMap::new(),
+            waiting: VecDeque::new(),
+            refusal_told: None,
             next_link_epoch: 1,
             cursors: [0; 4],
             ledger: Ledger::default(),
@@ -279,7 +292,10 @@ impl Engine {
     /// When [`Engine::handle_timeout`] has something to do next.
     #[must_use]
     pub fn next_timeout(&self) -> Option<Instant> {
-        self.peers.iter().flatten().filter_map(Peer::next_timeout).min()
+        let peers = self.peers.iter().flatten().filter_map(Peer::next_timeout);
+        // One that can be written to again has as long as that.
+        let missed = self.missed.iter().filter(|(flow, _)| !self.by_flow.contains_key(*flow));
+        peers.chain(missed.map(|(_, missed)| missed.until)).min()
     }
 
     /// Drops what a lane has waiting; what is on its way goes on and ends in an event. The caller counts what is returned.
@@ -309,6 +325,12 @@ impl Engine {
     pub fn peer(&self, flow: &FlowId) -> Option<PeerInfo> {
         let peer = self.peers[*self.by_flow.get(flow)?].as_ref()?;
         (peer.phase != Phase::Gone).then(|| peer.info())
+    }
+
+    /// Flows that found no place among the peers, and wait for one.
+    #[must_use]
+    pub fn waiting_peers(&self) -> usize {
+        self.waiting.len()
     }
 
     /// Counts since the start.

@@ -157,6 +157,20 @@ pub enum LinkEvent {
         /// Its life.
         epoch: u64,
     },
+    /// There was no place for a flow; told once in a while, however many there are.
+    PeerRefused {
+        /// One of them.
+        flow: FlowId,
+        /// The peers that there are, which is the most.
+        peers: usize,
+    },
+    /// A flow that was refused has a place now: writers to it are to be made.
+    PeerAdmitted {
+        /// The flow.
+        flow: FlowId,
+        /// Its life.
+        epoch: u64,
+    },
     /// Addresses that were not known before.
     Addresses(Vec<String>),
     /// The last byte of a message was sent for the first time: for rates. Each message has at most one of these.
@@ -346,7 +360,7 @@ pub struct LinkCounters {
     pub reassembly_evicted: u64,
     /// Samples that were refused because too many before them are missing.
     pub overrun: u64,
-    /// Peers that found no place.
+    /// Times that a flow was found, or said Hello, and found no place.
     pub peers_refused: u64,
     /// LinkControl that found no place in its queue.
     pub control_refused: u64,

@@ -1,14 +1,32 @@
 //! Peers come and go: found, up, suspect, down, forgotten, replaced by a newer life.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
+
+use blaze_domain::FlowId;
 
 use super::engine::Engine;
 use super::event::{DownReason, LinkEvent};
-use super::peer::{HELLO_EVERY, Peer, Phase};
+use super::peer::{FORGET_AFTER, HELLO_EVERY, Peer, Phase};
 use super::receiver::Inbox;
 use super::sender::{SendContext, SendLimits};
 use super::transport::Endpoint;
 use super::wire::SenderId;
+
+/// Missed flows that are kept; beyond that the one that is due next is forgotten.
+const MAX_MISSED: usize = 1_024;
+/// Flows without a place that are kept, so that they get one when it is free; beyond that the oldest gives way.
+const MAX_WAITING: usize = 256;
+/// How often it is told that a flow found no place.
+const REFUSAL_TOLD_EVERY: Duration = Duration::from_secs(60);
+
+/// A flow that was heard, until a new life began, here or there. Without this nobody would tell that it did not come back.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Missed {
+    /// The life in which it was heard.
+    epoch: u64,
+    /// When it is forgotten, unless it says Hello before.
+    pub(super) until: Instant,
+}
 
 impl Engine {
     /// The transport can write to an endpoint.
@@ -28,13 +46,15 @@ impl Engine {
     }
 
     /// The transport no longer sees an endpoint. One that says Hello stays; one that never did is forgotten.
-    pub fn peer_lost(&mut self, _now: Instant, endpoint: &Endpoint) {
+    pub fn peer_lost(&mut self, now: Instant, endpoint: &Endpoint) {
+        self.waiting.retain(|waiting| waiting != endpoint);
         if let Some(&at) = self.by_flow.get(&endpoint.flow)
             && let Some(peer) = &self.peers[at]
             && peer.endpoint == *endpoint
             && peer.phase == Phase::Connecting
         {
             self.remove(at);
+            self.admit_waiting(now);
         }
     }
 
@@ -53,10 +73,13 @@ impl Engine {
                 self.counters.stale += 1;
                 return None;
             }
-            self.take_down(now, at, DownReason::NewEpoch);
-            self.remove(at);
+            self.replace(now, at, DownReason::NewEpoch);
         }
-        let at = self.free_place()?;
+        let Some(at) = self.free_place() else {
+            self.refuse(now, endpoint);
+            return None;
+        };
+        self.waiting.retain(|waiting| waiting.flow != endpoint.flow);
         let limits = [0, 1, 2].map(|class| SendLimits {
             queue_bytes: self.config.limits.queue_bytes[class],
             streams: self.config.limits.streams,
@@ -90,14 +113,103 @@ impl Engine {
         Some(at)
     }
 
-    /// This flow begins a new life: peers are dropped and have to be found again.
+    /// Notes a flow that found no place. It will not be found a second time, and stops saying Hello if it gets no answer.
+    fn refuse(&mut self, now: Instant, endpoint: Endpoint) {
+        let told = self.refusal_told;
+        if told.is_none_or(|told| now.saturating_duration_since(told) >= REFUSAL_TOLD_EVERY) {
+            self.refusal_told = Some(now);
+            self.ledger.events.push_back(LinkEvent::PeerRefused {
+                flow: endpoint.flow.clone(),
+                peers: self.config.limits.peers,
+            });
+        }
+        if let Some(known) = self.waiting.iter_mut().find(|known| known.flow == endpoint.flow) {
+            known.epoch = known.epoch.max(endpoint.epoch);
+            return;
+        }
+        if self.waiting.len() >= MAX_WAITING {
+            self.waiting.pop_front();
+        }
+        self.waiting.push_back(endpoint);
+    }
+
+    /// Gives places that are free to flows that found none.
+    fn admit_waiting(&mut self, now: Instant) {
+        while self.has_place()
+            && let Some(endpoint) = self.waiting.pop_front()
+        {
+            let Endpoint { flow, epoch } = endpoint.clone();
+            if self.peer_discovered(now, endpoint) {
+                self.ledger.events.push_back(LinkEvent::PeerAdmitted { flow, epoch });
+            }
+        }
+    }
+
+    fn has_place(&self) -> bool {
+        self.peers.len() < self.config.limits.peers || self.peers.iter().any(Option::is_none)
+    }
+
+    /// This flow begins a new life: peers are dropped and have to be found again. Those that are not heard again are forgotten as
+    /// if it had gone on.
     pub fn restart(&mut self, now: Instant, epoch: u64) {
+        // The transport finds all of them anew.
+        self.waiting.clear();
+        for at in 0..self.peers.len() {
+            self.replace(now, at, DownReason::Restarted);
+        }
+        self.config.epoch = epoch;
+        self.sender = SenderId::of(&self.config.me, epoch);
+    }
+
+    /// This flow leaves the inter scope on purpose: it waits for nobody there.
+    pub fn leave(&mut self, now: Instant) {
         for at in 0..self.peers.len() {
             self.take_down(now, at, DownReason::Restarted);
             self.remove(at);
         }
-        self.config.epoch = epoch;
-        self.sender = SenderId::of(&self.config.me, epoch);
+        self.missed.clear();
+        self.waiting.clear();
+    }
+
+    /// Removes a peer because a new life begins, here or there. If it was heard, it is missed.
+    fn replace(&mut self, now: Instant, at: usize, reason: DownReason) {
+        let peer = self.peers.get(at).and_then(Option::as_ref);
+        if let Some(peer) = peer.filter(|peer| peer.is_connected() || peer.phase == Phase::Down) {
+            let missed = Missed {
+                epoch: peer.endpoint.epoch,
+                until: peer.last_hello.unwrap_or(peer.since) + FORGET_AFTER,
+            };
+            let flow = peer.endpoint.flow.clone();
+            self.miss(flow, missed);
+        }
+        self.take_down(now, at, reason);
+        self.remove(at);
+    }
+
+    fn miss(&mut self, flow: FlowId, missed: Missed) {
+        if self.missed.len() >= MAX_MISSED && !self.missed.contains_key(&flow) {
+            let next = self.missed.iter().min_by_key(|(_, missed)| missed.until);
+            if let Some(next) = next.map(|(flow, _)| flow.clone()) {
+                self.forget_missed(next);
+            }
+        }
+        self.missed.insert(flow, missed);
+    }
+
+    fn forget_missed(&mut self, flow: FlowId) {
+        if let Some(Missed { epoch, .. }) = self.missed.remove(&flow) {
+            self.ledger.events.push_back(LinkEvent::PeerForgotten { flow, epoch });
+        }
+    }
+
+    /// Forgets the missed flows that did not come back in time.
+    fn forget_silent(&mut self, now: Instant) {
+        let missed = self.missed.iter();
+        let due = missed.filter(|(flow, missed)| missed.until <= now && !self.by_flow.contains_key(*flow));
+        let due: Vec<FlowId> = due.map(|(flow, _)| flow.clone()).collect();
+        for flow in due {
+            self.forget_missed(flow);
+        }
     }
 
     /// Drops what waits for a peer, hands out what waits from it, and says so if it was up.
@@ -162,6 +274,10 @@ impl Engine {
         for at in 0..self.peers.len() {
             self.advance_phase(now, at);
             self.advance_classes(now, at);
+        }
+        self.forget_silent(now);
+        if !self.waiting.is_empty() {
+            self.admit_waiting(now);
         }
     }
 

@@ -37,6 +37,6 @@ pub(crate) mod sim;
 #[cfg(test)]
 mod tests;
 
-pub use engine::{Engine, EngineConfig, Limits, MIN_DATAGRAM_BYTES, PeerIndex};
+pub use engine::{Engine, EngineConfig, Limits, MAX_PEERS, MIN_DATAGRAM_BYTES, PeerIndex};
 pub use event::{DownReason, LaneId, LinkCounters, LinkEvent, PeerInfo, PeerState, StreamKey, Submit, Tally, Transmit};
 pub use wire::{HEADER_BYTES, RECORD_BYTES};

@@ -11,13 +11,59 @@ use prost::Message as _;
 use super::engine::Engine;
 use super::event::{DownReason, LinkEvent};
 use super::peer::{Echo, HELLO_EVERY, Peer, Phase};
-use super::receiver::{Admission, Inbox, ReceiveClass};
+use super::receiver::{Admission, GIVEN_UP_TOLD, Inbox, MISSING_RANGES, MORE_RANGES, ReceiveClass};
 use super::sender::{FeedbackView, SendContext};
 use super::transport::Endpoint;
 use super::wire::{Datagram, LinkHeader, SenderId, VERSION, class_code, class_index};
 
-/// Missing ranges in one Feedback.
-const MAX_MISSING: usize = 32;
+/// What a Feedback lists, checked for form.
+struct Told {
+    /// First and count, ascending.
+    missing: Vec<u64>,
+    /// What it speaks for.
+    highest_sequence: u64,
+    /// Messages, ascending.
+    given_up: Vec<u32>,
+}
+
+impl Told {
+    /// `None`: no such Feedback.
+    fn read(feedback: &Feedback) -> Option<Self> {
+        let are_pairs = |length: usize, most: usize| length.is_multiple_of(2) && length <= 2 * most;
+        let (some, more) = (&feedback.missing, &feedback.more_missing);
+        let distances = &feedback.given_up;
+        if !are_pairs(some.len(), MISSING_RANGES)
+            || !are_pairs(more.len(), MORE_RANGES)
+            || distances.len() > GIVEN_UP_TOLD
+        {
+            return None;
+        }
+        let (mut given_up, mut number) = (Vec::with_capacity(distances.len()), 0u32);
+        for distance in distances {
+            number = number.checked_add(*distance)?;
+            given_up.push(number);
+        }
+        let (mut missing, mut end) = (some.clone(), feedback.highest_sequence);
+        for pair in more.chunks_exact(2) {
+            let (came, count) = (u64::from(pair[0]), u64::from(pair[1]));
+            let first = end.checked_add(came)?.checked_add(1)?;
+            missing.extend([first, count]);
+            end = first.checked_add(count)?.checked_sub(1)?;
+        }
+        let highest_sequence = if more.is_empty() { end } else { feedback.more_highest };
+        let pairs = missing.chunks_exact(2);
+        let is_ascending = pairs.clone().all(|pair| pair[1] > 0)
+            && pairs
+                .clone()
+                .zip(pairs.skip(1))
+                .all(|(a, b)| a[0].saturating_add(a[1]) <= b[0]);
+        (is_ascending && end <= highest_sequence).then_some(Self {
+            missing,
+            highest_sequence,
+            given_up,
+        })
+    }
+}
 
 fn class_of(code: u32) -> Option<Priority> {
     Priority::ALL
@@ -215,6 +261,7 @@ impl Engine {
         if !peer.is_connected() {
             peer.phase = Phase::Up;
             peer.since = now;
+            self.missed.remove(&flow);
             peer.hello_due = true;
             peer.hello_at = now + HELLO_EVERY;
             self.ledger.events.push_back(LinkEvent::PeerUp {
@@ -232,16 +279,7 @@ impl Engine {
     fn feedback_received(&mut self, now: Instant, at: usize, feedback: &Feedback) {
         let now_ns = self.clocks.monotonic_ns(now);
         let Some(peer) = self.peers[at].as_mut() else { return };
-        let missing = &feedback.missing;
-        let pairs = missing.chunks_exact(2);
-        let ascending = pairs.clone().all(|pair| pair[1] > 0)
-            && missing.len().is_multiple_of(2)
-            && missing.len() <= 2 * MAX_MISSING
-            && pairs
-                .clone()
-                .zip(pairs.skip(1))
-                .all(|(a, b)| a[0].saturating_add(a[1]) <= b[0]);
-        let Some(class) = class_of(feedback.link_class).filter(|_| ascending) else {
+        let (Some(class), Some(told)) = (class_of(feedback.link_class), Told::read(feedback)) else {
             self.counters.decode_errors += 1;
             return;
         };
@@ -258,8 +296,9 @@ impl Engine {
         };
         let view = FeedbackView {
             link_epoch: feedback.link_epoch,
-            highest_sequence: feedback.highest_sequence,
-            missing,
+            highest_sequence: told.highest_sequence,
+            missing: &told.missing,
+            given_up: &told.given_up,
             received_bytes: feedback.received_bytes,
             window_bytes: feedback.window_bytes,
             delivered_message: feedback.delivered_message,
@@ -288,5 +327,68 @@ impl Engine {
             flow: peer.endpoint.flow.clone(),
             epoch: peer.endpoint.epoch,
         });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn feedback(missing: &[u64], highest_sequence: u64) -> Feedback {
+        Feedback {
+            highest_sequence,
+            missing: missing.to_vec(),
+            ..Feedback::default()
+        }
+    }
+
+    #[test]
+    fn missing_ranges_go_on_where_the_first_ones_end() {
+        let short = Told::read(&feedback(&[3, 2, 9, 1], 20)).unwrap();
+        assert_eq!((short.missing, short.highest_sequence), (vec![3, 2, 9, 1], 20));
+        let long = Feedback {
+            more_missing: vec![5, 1, 1, 10],
+            more_highest: 40,
+            ..feedback(&[3, 2, 9, 1], 9)
+        };
+        let long = Told::read(&long).unwrap();
+        assert_eq!(
+            (long.missing, long.highest_sequence),
+            (vec![3, 2, 9, 1, 15, 1, 17, 10], 40)
+        );
+    }
+
+    #[test]
+    fn ranges_that_contradict_one_another_are_refused() {
+        let more = |more_missing: &[u32], more_highest: u64, highest_sequence: u64| {
+            Told::read(&Feedback {
+                more_missing: more_missing.to_vec(),
+                more_highest,
+                ..feedback(&[3, 2], highest_sequence)
+            })
+        };
+        assert!(more(&[5, 1], 10, 4).is_some());
+        assert!(more(&[5, 1], 9, 4).is_none(), "speaks for less than it lists");
+        assert!(more(&[5, 0], 40, 4).is_none(), "an empty range");
+        assert!(more(&[5], 40, 4).is_none(), "half a pair");
+        assert!(more(&[5, 1], u64::MAX, u64::MAX - 3).is_none(), "beyond all numbers");
+        assert!(more(&[1; 2 * MORE_RANGES + 2], u64::MAX, 4).is_none(), "too many");
+        assert!(Told::read(&feedback(&[3, 2, 4, 1], 20)).is_none(), "they overlap");
+        assert!(Told::read(&feedback(&[1; 2 * MISSING_RANGES + 2], 20)).is_none());
+    }
+
+    #[test]
+    fn messages_that_were_given_up_are_told_by_distances() {
+        let given_up = |distances: &[u32]| {
+            let told = Told::read(&Feedback {
+                given_up: distances.to_vec(),
+                ..feedback(&[], 20)
+            });
+            told.map(|told| told.given_up)
+        };
+        assert_eq!(given_up(&[]), Some(vec![]));
+        assert_eq!(given_up(&[1_000, 1, 20]), Some(vec![1_000, 1_001, 1_021]));
+        assert_eq!(given_up(&[u32::MAX, 1]), None);
+        assert_eq!(given_up(&[1; GIVEN_UP_TOLD + 1]), None);
     }
 }

@@ -6,12 +6,13 @@
 //!             └→ Feedback: highest sequence, what is missing
 //! ```
 //!
-//! Each message is settled once: delivered, dropped or given up. A settled one is never looked at again.
+//! Each message is settled once: delivered, dropped or given up. A settled one is never looked at again. What is dropped is counted
+//! here; of what is given up before anything of it came the sender is told, which counts it: here it has no name.
 
 mod settle;
 mod timing;
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::hash::{BuildHasher, RandomState};
 use std::time::{Duration, Instant};
 
@@ -29,6 +30,7 @@ use super::wire::{LinkHeader, Record};
 
 /// An unfinished message is given up that long after its last part, and so is the one that another waits for. Time in
 /// which nothing of the class comes does not count: the sender may have been cut off, or have more urgent things to send.
+/// Nor does time in which more is missing than a Feedback can tell: nobody repairs what it was not asked for.
 const PATIENCE: Duration = Duration::from_secs(2);
 /// … but that long at most.
 const LONGEST_PATIENCE: Duration = Duration::from_secs(30);
@@ -39,7 +41,15 @@ const SWEEP: Duration = Duration::from_millis(100);
 const FEEDBACK_EVERY: Duration = Duration::from_millis(50);
 const FEEDBACK_IDLE: Duration = Duration::from_millis(500);
 const FEEDBACK_SAMPLES: u32 = 64;
-const MISSING_RANGES: usize = 32;
+/// Missing ranges in one Feedback, by their sequences. Flows of the first version take no more.
+pub(crate) const MISSING_RANGES: usize = 32;
+/// Missing ranges that a Feedback tells beyond those, by their distances, as far as its datagram has room. All that is lost in
+/// a round trip should fit: what does not waits for the next one.
+pub(crate) const MORE_RANGES: usize = 512;
+/// Messages in one Feedback that were given up although nothing of them came.
+pub(crate) const GIVEN_UP_TOLD: usize = 64;
+/// Such messages that are kept until their sender has settled them; more are counted here.
+const MAX_GIVEN_UP: usize = 1_024;
 /// Gaps in the sequence that are kept; a sample that would make more is refused.
 const MAX_SEQUENCE_RANGES: usize = 8_192;
 /// Gaps between settled messages that are kept; the oldest is given up.
@@ -123,9 +133,13 @@ pub(crate) struct ReceiveClass {
     last_feedback: Option<Instant>,
     feedback_at: Option<Instant>,
     feedback_due: bool,
+    /// More was missing than the last Feedback could tell.
+    untold: bool,
     /// Messages below are settled.
     message_floor: u64,
     settled: RangeSet,
+    /// Given up although nothing of them came, and not settled by the sender yet.
+    given_up: BTreeSet<u32>,
     assemblies: HashMap<u32, Assembly>,
     held: BTreeMap<u32, Held>,
     /// Who waits for a message.
@@ -133,7 +147,7 @@ pub(crate) struct ReceiveClass {
     reserved: usize,
     /// No held message has to be handed out before.
     hand_out_at: Option<Instant>,
-    /// Time in which samples came.
+    /// Time in which samples came and all that was missing could be told.
     active: Duration,
     last_sample: Option<Instant>,
     sweep_at: Option<Instant>,
@@ -154,8 +168,10 @@ impl ReceiveClass {
             last_feedback: None,
             feedback_at: None,
             feedback_due: false,
+            untold: false,
             message_floor: 1,
             settled: RangeSet::default(),
+            given_up: BTreeSet::new(),
             assemblies: HashMap::new(),
             held: BTreeMap::new(),
             waiters: HashMap::new(),
@@ -191,16 +207,27 @@ impl ReceiveClass {
             self.link_epoch = link_epoch;
         }
         let now = inbox.now;
-        if let Some(last) = self.last_sample {
+        if let Some(last) = self.last_sample
+            && !self.untold
+        {
             self.active += now.saturating_duration_since(last).min(ACTIVE_GAP);
         }
         self.last_sample = Some(now);
         if header.records == 0 {
             self.feedback_due = true;
         }
-        // Floors only rise, so those of a sample that came before are as good.
+        // Floors only rise, so those of a sample that came before are as good, and so are those of one that is refused: where too
+        // much is missing, they alone make room again.
         self.give_up_below(inbox, u64::from(header.message_floor));
+        if self.given_up.first().is_some_and(|first| *first < header.message_floor) {
+            self.given_up = self.given_up.split_off(&header.message_floor);
+        }
         let sequence = header.link_sequence;
+        let floor = sequence.saturating_sub(u64::from(header.unsettled));
+        if floor > self.sequence_floor {
+            self.sequence_floor = floor;
+            self.sequences.remove_through(floor);
+        }
         if sequence <= self.sequence_floor || self.sequences.contains(sequence) {
             return Admission::Repeated;
         }
@@ -212,11 +239,6 @@ impl ReceiveClass {
         self.echo = Some((header.send_ns, now));
         if header.records > 0 {
             self.samples += 1;
-        }
-        let floor = sequence.saturating_sub(u64::from(header.unsettled));
-        if floor > self.sequence_floor {
-            self.sequence_floor = floor;
-            self.sequences.remove_through(floor);
         }
         if self.samples >= FEEDBACK_SAMPLES {
             self.feedback_due = true;

@@ -292,31 +292,43 @@ impl Sim {
             sequences: HashMap::new(),
         };
         for name in names {
-            let config = EngineConfig {
-                me: flow(name),
-                kind: LayerKind::Edge,
-                epoch: 1,
-                layer_scope: (LayerScope::None, 0),
-                max_datagram: 1300,
-                limits,
-            };
-            sim.nodes.push(Node {
-                engine: Engine::new(config, start, 1_700_000_000_000_000_000),
-                alive: true,
-                rate: None,
-                free_at: start,
-                delivered: Vec::new(),
-                lanes: BTreeMap::new(),
-                events: Vec::new(),
-                receiver_dropped: BTreeMap::new(),
-                sent_bytes: 0,
-                sent_datagrams: 0,
-            });
+            sim.add(name, limits);
         }
         for at in 0..sim.nodes.len() {
             sim.announce(at);
         }
         sim
+    }
+
+    fn add(&mut self, name: &str, limits: Limits) {
+        let config = EngineConfig {
+            me: flow(name),
+            kind: LayerKind::Edge,
+            epoch: 1,
+            layer_scope: (LayerScope::None, 0),
+            max_datagram: 1300,
+            limits,
+        };
+        self.nodes.push(Node {
+            engine: Engine::new(config, self.now, 1_700_000_000_000_000_000),
+            alive: true,
+            rate: None,
+            free_at: self.now,
+            delivered: Vec::new(),
+            lanes: BTreeMap::new(),
+            events: Vec::new(),
+            receiver_dropped: BTreeMap::new(),
+            sent_bytes: 0,
+            sent_datagrams: 0,
+        });
+    }
+
+    /// One more flow, now. It and all others discover one another. Returns its place.
+    pub(crate) fn join(&mut self, name: &str) -> usize {
+        self.add(name, Limits::default());
+        let at = self.nodes.len() - 1;
+        self.announce(at);
+        at
     }
 
     /// Lets a flow and all others discover one another.

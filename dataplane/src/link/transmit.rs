@@ -16,8 +16,10 @@ use super::receiver::ReceiveClass;
 use super::sender::{FIRST_WINDOW, SendContext};
 use super::wire::{DatagramBuilder, LinkHeader, VERSION, class_code};
 
-/// Bytes of a Feedback with all its ranges.
+/// Bytes of a Feedback with all ranges that it tells by their sequences.
 const LARGEST_FEEDBACK: usize = 760;
+/// Bytes of any LinkControl, at most.
+const LARGEST_CONTROL: usize = 1_200;
 
 impl Engine {
     /// LinkControl or a probe, for the next peer that has any.
@@ -133,10 +135,9 @@ impl Engine {
         for (index, class) in peer.receive.iter_mut().enumerate() {
             // One with all its ranges fits an empty datagram; those for which there is no room go with the next.
             if class.feedback_due() && out.fits(LARGEST_FEEDBACK) {
-                put(
-                    out,
-                    Body::Feedback(class.feedback(now, class_code(Priority::ALL[index]), share)),
-                );
+                let room = out.room().min(LARGEST_CONTROL);
+                let feedback = class.feedback(now, class_code(Priority::ALL[index]), share, room);
+                put(out, Body::Feedback(feedback));
             }
         }
     }

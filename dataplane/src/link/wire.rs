@@ -229,6 +229,11 @@ impl DatagramBuilder {
         self.content
     }
 
+    /// Bytes that one more record may have.
+    pub(crate) fn room(&self) -> usize {
+        self.limit.saturating_sub(self.bytes.len() + RECORD_BYTES)
+    }
+
     pub(crate) fn fits(&self, length: usize) -> bool {
         self.records < u16::MAX && self.bytes.len() + RECORD_BYTES + length <= self.limit
     }

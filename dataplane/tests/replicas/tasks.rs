@@ -267,7 +267,7 @@ impl World {
             && let Some(engine) = &mut flow.plane.engine
         {
             (flow.inside, flow.leaves) = (false, None);
-            engine.restart(now, flow.epoch);
+            engine.leave(now);
             flow.plane.pump(now, |_| {});
             flow.control.left(now);
         }

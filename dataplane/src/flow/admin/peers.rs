@@ -11,14 +11,17 @@ use serde_json::{Value, json};
 use super::super::inter::InterScope;
 use super::{App, answer, rounded};
 use crate::control::ControlCore;
-use crate::link::{Engine, PeerState};
+use crate::link::{MAX_PEERS, PeerState};
 use crate::world::{Carrying, FlowState, Reach};
 
 pub(super) async fn peers(State(shared): App) -> Json<Value> {
     let now = Instant::now();
-    let peers = shared
-        .plane
-        .read(|state| state.engine.as_ref().map(Engine::peers).unwrap_or_default());
+    let (peers, refused) = shared.plane.read(|state| {
+        let engine = state.engine.as_ref();
+        engine
+            .map(|engine| (engine.peers(), engine.waiting_peers()))
+            .unwrap_or_default()
+    });
     let control = shared.control.lock();
     let rows: Vec<Value> = peers
         .iter()
@@ -51,7 +54,10 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
     drop(control);
     let status = shared.inter.as_ref().and_then(InterScope::status);
     let link = status.map(|status| {
-        json!({"endpoints": status.endpoints, "addresses": status.addresses, "participants_rebuilt": status.rebuilds})
+        json!({
+            "endpoints": status.endpoints, "addresses": status.addresses, "participants_rebuilt": status.rebuilds,
+            "most_peers": MAX_PEERS, "refused": refused,
+        })
     });
     answer(
         &shared,

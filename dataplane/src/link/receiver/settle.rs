@@ -3,7 +3,7 @@
 use blaze_domain::DropReason;
 use smallvec::SmallVec;
 
-use super::{Inbox, MAX_MESSAGE_RANGES, ReceiveClass};
+use super::{Inbox, MAX_GIVEN_UP, MAX_MESSAGE_RANGES, ReceiveClass};
 
 impl ReceiveClass {
     /// Notes that a message is delivered or given up, and hands out what waited for it.
@@ -110,8 +110,22 @@ impl ReceiveClass {
             at = held.before;
         }
         if at != number {
-            self.drop_assembly(inbox, at, DropReason::ReassemblyTimeout);
+            if self.assemblies.contains_key(&at) {
+                self.drop_assembly(inbox, at, DropReason::ReassemblyTimeout);
+            } else {
+                self.note_given_up(inbox, at, number);
+            }
             self.settle(inbox, at);
+        }
+    }
+
+    /// Nothing of a message came that a held one `waited` for. Its sender is told, and counts it: counted here it would be there
+    /// twice where its lifespan has ended on both sides.
+    fn note_given_up(&mut self, inbox: &mut Inbox<'_>, number: u32, waited: u32) {
+        if self.given_up.len() < MAX_GIVEN_UP {
+            self.given_up.insert(number);
+        } else if let Some(held) = self.held.get(&waited) {
+            inbox.dropped(held.message.frame.topic(), DropReason::ReassemblyTimeout);
         }
     }
 

@@ -4,8 +4,16 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::DropReason;
 use blaze_proto::link::link_control::Feedback;
+use prost::{Message as _, length_delimiter_len};
 
-use super::{FEEDBACK_IDLE, Held, Inbox, LONGEST_PATIENCE, MISSING_RANGES, PATIENCE, ReceiveClass, SWEEP};
+use super::{
+    FEEDBACK_IDLE, GIVEN_UP_TOLD, Held, Inbox, LONGEST_PATIENCE, MISSING_RANGES, MORE_RANGES, PATIENCE, ReceiveClass,
+    SWEEP,
+};
+
+/// What the lists of a Feedback that fill its datagram take besides their numbers, at most: tags and lengths, that of the
+/// Feedback itself included, and `more_highest`.
+const FRAMING_BYTES: usize = 24;
 
 impl ReceiveClass {
     /// When something has to be done: report, or give up.
@@ -73,38 +81,76 @@ impl ReceiveClass {
         self.feedback_due && self.link_epoch != 0
     }
 
-    /// What to report now. `share` is how much memory this peer may still take.
-    pub(crate) fn feedback(&mut self, now: Instant, class_code: u8, share: u64) -> Feedback {
+    /// What to report now. `share` is how much memory this peer may still take, `room` how many bytes the Feedback may take
+    /// as a `LinkControl`; those of its first ranges are taken in any case.
+    pub(crate) fn feedback(&mut self, now: Instant, class_code: u8, share: u64, room: usize) -> Feedback {
         self.feedback_due = false;
         self.feedback_at = None;
         self.samples = 0;
         self.last_feedback = Some(now);
-        let mut highest = self.sequences.last().unwrap_or(self.sequence_floor);
-        let mut missing = Vec::new();
-        let mut gaps = self.sequences.gaps(self.sequence_floor);
+        let (feedback, untold) = self.report(now, class_code, share, room);
+        self.untold = untold;
+        feedback
+    }
+
+    /// The Feedback, and whether more is missing than it tells.
+    fn report(&self, now: Instant, class_code: u8, share: u64, room: usize) -> (Feedback, bool) {
+        let newest = self.sequences.last().unwrap_or(self.sequence_floor);
+        let mut gaps = self.sequences.gaps(self.sequence_floor).peekable();
+        let (mut missing, mut end) = (Vec::new(), self.sequence_floor);
         for (first, last) in gaps.by_ref().take(MISSING_RANGES) {
             missing.extend([first, last - first + 1]);
-        }
-        // What lies beyond the last range that fits is not told yet.
-        if let (Some((next, _)), true) = (gaps.next(), missing.len() >= 2) {
-            let end = missing[missing.len() - 2] + missing[missing.len() - 1] - 1;
-            debug_assert!(end < next);
-            highest = end;
+            end = last;
         }
         let (echo_send_ns, echo_held_ns) = self.echo.map_or((0, 0), |(sent, at)| {
             let held = now.saturating_duration_since(at);
             (sent, u64::try_from(held.as_nanos()).unwrap_or(u64::MAX))
         });
-        Feedback {
+        let mut feedback = Feedback {
             link_epoch: self.link_epoch,
             link_class: u32::from(class_code),
-            highest_sequence: highest,
+            // What lies beyond the last range that fits is not told yet.
+            highest_sequence: if gaps.peek().is_some() { end } else { newest },
             missing,
             received_bytes: self.received_bytes,
             window_bytes: share + self.expected() as u64,
             delivered_message: u32::try_from(self.message_floor - 1).unwrap_or(u32::MAX),
             echo_send_ns,
             echo_held_ns,
+            more_missing: Vec::new(),
+            more_highest: 0,
+            given_up: Vec::new(),
+        };
+        let mut room = room.saturating_sub(feedback.encoded_len() + FRAMING_BYTES);
+        let mut before = 0u32;
+        for &number in &self.given_up {
+            let bytes = length_delimiter_len((number - before) as usize);
+            if bytes > room || feedback.given_up.len() >= GIVEN_UP_TOLD {
+                // Until it is told its sender must not take it for delivered.
+                feedback.delivered_message = feedback.delivered_message.min(number.saturating_sub(1));
+                break;
+            }
+            room -= bytes;
+            feedback.given_up.push(number - before);
+            before = number;
         }
+        while let Some(&(first, last)) = gaps.peek() {
+            let (Ok(came), Ok(count)) = (u32::try_from(first - end - 1), u32::try_from(last - first + 1)) else {
+                break;
+            };
+            let bytes = length_delimiter_len(came as usize) + length_delimiter_len(count as usize);
+            if bytes > room || feedback.more_missing.len() >= 2 * MORE_RANGES {
+                break;
+            }
+            room -= bytes;
+            feedback.more_missing.extend([came, count]);
+            end = last;
+            gaps.next();
+        }
+        let untold = gaps.peek().is_some();
+        if !feedback.more_missing.is_empty() {
+            feedback.more_highest = if untold { end } else { newest };
+        }
+        (feedback, untold)
     }
 }

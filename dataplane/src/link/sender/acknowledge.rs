@@ -13,6 +13,8 @@ impl SendClass {
         if view.link_epoch != self.link_epoch || view.highest_sequence >= self.next_sequence() {
             return false;
         }
+        // First: the repair of one may have come since, and counts for nothing there.
+        self.drop_given_up(ctx, view.given_up);
         if view.highest_sequence >= self.highest_reported {
             self.highest_reported = view.highest_sequence;
             self.window = view.window_bytes;
@@ -119,6 +121,25 @@ impl SendClass {
                 ctx.ledger
                     .out(message.lane, message.payload_bytes(), message.waited(ctx.now));
             }
+        }
+    }
+
+    /// Drops what the receiver has given up without having seen any of it. It counts nothing of that.
+    fn drop_given_up(&mut self, ctx: &mut SendContext<'_>, numbers: &[u32]) {
+        for number in numbers {
+            let Ok(at) = self.started.binary_search_by_key(number, |started| started.0) else {
+                continue;
+            };
+            let key = self.started[at].1;
+            let Some(message) = self.messages.get(key) else {
+                continue;
+            };
+            let reason = if message.is_expired(ctx.now) {
+                DropReason::Lifespan
+            } else {
+                DropReason::ReassemblyTimeout
+            };
+            self.drop_message(key, reason, ctx.ledger);
         }
     }
 

@@ -3,9 +3,10 @@
 use std::time::Duration;
 
 use blaze_domain::{DropReason, Priority};
+use blaze_proto::Frame;
 use bytes::{BufMut, Bytes, BytesMut};
 
-use super::super::event::LaneId;
+use super::super::event::{LaneId, LinkEvent, PeerState};
 use super::super::sim::{Post, Random, Sim, Weather};
 use super::super::wire::{DatagramBuilder, HEADER_BYTES, LinkHeader, Record, SenderId};
 use super::super::{Limits, sim};
@@ -204,6 +205,20 @@ impl Hostile {
         }
     }
 
+    /// Sends a whole message in a sample of its own, after `lost` samples that never come. `settled`: of all samples before it
+    /// the sender knows what became of them.
+    fn post(&mut self, message: u32, behind: u16, frame: &Frame, lost: u64, settled: bool) {
+        self.sequence += lost;
+        let mut header = self.header(Priority::State);
+        if !settled {
+            header.unsettled = u32::try_from(header.link_sequence).unwrap();
+        }
+        let length = u32::try_from(frame.wire_len()).unwrap();
+        let mut out = DatagramBuilder::new(1300);
+        out.put_part(&part(message, length, 0, length, behind), frame);
+        self.send(out.finish(&header), Priority::State);
+    }
+
     fn send(&mut self, datagram: Bytes, class: Priority) {
         self.sim.nodes[1].engine.receive(self.sim.now, datagram, class);
         let reserved = self.sim.nodes[1].engine.reassembly_bytes();
@@ -263,6 +278,44 @@ fn waiting_messages_of_a_hostile_peer_stay_within_bounds() {
         hostile.sim.nodes[1].delivered.len(),
         4_998,
         "complete ones are handed out all the same"
+    );
+}
+
+#[test]
+fn a_class_with_too_many_gaps_goes_on_once_its_sender_settles_them() {
+    let mut hostile = Hostile::new(1);
+    let frame = sim::frame(Post::small(1), 1);
+    // Every other sample is lost, and the sender knows of none what became of it. The last one says that all before are settled.
+    for message in 1..=9_001 {
+        hostile.post(message, 0, &frame, 1, message > 9_000);
+    }
+    hostile.sim.run_ms(1);
+    let refused = hostile.sim.nodes[1].engine.counters().overrun;
+    assert!(refused > 0, "there were too many gaps");
+    let delivered = hostile.sim.nodes[1].delivered.len() as u64;
+    assert_eq!(delivered + refused, 9_001);
+    assert_eq!(refused, 9_000 - 8_192, "the last one is taken");
+}
+
+#[test]
+fn nothing_is_given_up_while_more_is_missing_than_can_be_told() {
+    let mut hostile = Hostile::new(1);
+    let filler = sim::frame(Post::small(1), 1);
+    // Waits for the first message, which may be in any of the samples that are missing.
+    hostile.post(2, 1, &sim::frame(Post::reliable(77), 1), 1, false);
+    for message in 3..2_003 {
+        hostile.post(message, 0, &filler, 1, false);
+        hostile.sim.run_ms(2);
+    }
+    assert!(hostile.sim.sequences(1, 77).is_empty(), "it waits for longer than 2 s");
+    for message in 2_003..3_003 {
+        hostile.post(message, 0, &filler, 0, true);
+        hostile.sim.run_ms(2);
+    }
+    assert_eq!(
+        hostile.sim.sequences(1, 77),
+        [1],
+        "all that is missing is told: it waits no longer"
     );
 }
 
@@ -359,6 +412,55 @@ fn more_peers_than_there_is_room_for() {
     sim.publish(0, 1, Post::reliable(1)).unwrap();
     sim.run_ms(100);
     assert_eq!(sim.sequences(1, 1), [1], "one that is up keeps its place");
+}
+
+#[test]
+fn who_finds_no_place_is_told_of_and_gets_one_when_it_is_free() {
+    let limits = Limits {
+        peers: 2,
+        ..Limits::default()
+    };
+    let mut sim = Sim::with_limits(1, Weather::delay(5), &["edge/a", "fog/b", "cloud/c"], limits);
+    sim.run_ms(1_000);
+    let late = sim.join("edge/d");
+    // It says Hello for a minute and gives up.
+    sim.run_ms(65_000);
+    let of = |sim: &Sim, wanted: fn(&LinkEvent) -> bool| {
+        let events = sim.nodes[0].events.iter();
+        events.filter(|(_, event)| wanted(event)).count()
+    };
+    assert_eq!(sim.nodes[0].engine.peers().len(), 2);
+    assert_eq!(sim.nodes[0].engine.waiting_peers(), 1);
+    assert!(sim.nodes[0].engine.counters().peers_refused > 100);
+    let told = of(&sim, |event| matches!(event, LinkEvent::PeerRefused { peers: 2, .. }));
+    assert!((1..=2).contains(&told), "once a minute: {told}");
+    sim.nodes[2].alive = false;
+    sim.run_ms(65_000);
+    assert_eq!(sim.nodes[0].engine.waiting_peers(), 0);
+    let admitted = of(&sim, |event| matches!(event, LinkEvent::PeerAdmitted { .. }));
+    assert_eq!(admitted, 1);
+    let peer = sim.nodes[0].engine.peer(&sim.id(late)).unwrap();
+    assert_eq!(peer.state, PeerState::Up);
+    sim.publish(0, late, Post::reliable(1)).unwrap();
+    sim.run_ms(100);
+    assert_eq!(sim.sequences(late, 1), [1]);
+}
+
+#[test]
+fn one_that_waits_for_a_place_and_goes_gets_none() {
+    let limits = Limits {
+        peers: 1,
+        ..Limits::default()
+    };
+    let mut sim = Sim::with_limits(1, Weather::delay(5), &["edge/a", "fog/b"], limits);
+    sim.run_ms(1_000);
+    let late = sim.join("edge/d");
+    sim.run_ms(100);
+    assert_eq!(sim.nodes[0].engine.waiting_peers(), 1);
+    sim.nodes[late].alive = false;
+    let endpoint = sim.endpoint(late);
+    sim.nodes[0].engine.peer_lost(sim.now, &endpoint);
+    assert_eq!(sim.nodes[0].engine.waiting_peers(), 0);
 }
 
 #[test]

@@ -120,6 +120,29 @@ fn large_frames_are_repaired() {
 }
 
 #[test]
+fn many_losses_in_one_round_trip_are_repaired_in_the_next() {
+    let mut sim = Sim::new(1, Weather::delay(150), &["edge/a", "fog/b"]);
+    sim.run_ms(2_000);
+    let (a, b) = (sim.id(0), sim.id(1));
+    let weather = Weather {
+        loss: 0.2,
+        ..Weather::delay(150)
+    };
+    sim.network.set_path(&a, &b, weather);
+    // Each in a sample of its own: about 70 gaps in the time from a loss to its repair.
+    for _ in 0..6_000 {
+        sim.publish(0, 1, Post::reliable(1)).unwrap();
+        sim.run_ms(1);
+    }
+    sim.run_ms(10_000);
+    sim.check_deliveries();
+    sim.check_accounts();
+    let delivered = sim.sequences(1, 1).len();
+    // One that is lost six times running is given up, and so rare is that.
+    assert!(delivered > 5_990, "{delivered} of 6000");
+}
+
+#[test]
 fn the_last_message_is_repaired_by_a_probe() {
     let mut sim = Sim::new(1, Weather::delay(20), &["edge/a", "fog/b"]);
     sim.run_ms(1_000);
@@ -220,6 +243,85 @@ fn lifespan_ends_at_both_ends() {
     sim.publish(0, 1, span(200)).unwrap();
     sim.run_ms(45);
     assert_eq!(sim.sequences(1, 1), [4], "those that were given up hold nobody back");
+    sim.check_accounts();
+}
+
+/// Loses all user datagrams of the first flow that hold a message of 700 bytes or more.
+fn lose_large_ones(sim: &mut Sim) {
+    sim.network.censor = Some(Box::new(|from, _, class, datagram| {
+        class == Priority::State && from.flow.layer.as_str() == "edge" && datagram.len() >= 700
+    }));
+}
+
+#[test]
+fn a_reliable_message_of_which_nothing_came_is_counted_once() {
+    for lifespan in [None, Some(Duration::from_millis(300))] {
+        let mut sim = Sim::new(1, Weather::delay(20), &["edge/a", "fog/b"]);
+        sim.run_ms(1_500);
+        let post = Post {
+            lifespan,
+            ..Post::reliable(1)
+        };
+        sim.publish(0, 1, post).unwrap();
+        sim.run_ms(200);
+        lose_large_ones(&mut sim);
+        sim.publish(0, 1, Post { bytes: 700, ..post }).unwrap();
+        sim.run_ms(1);
+        sim.publish(0, 1, post).unwrap();
+        // Others go on, so that the class is active.
+        for _ in 0..60 {
+            sim.publish(0, 1, Post::small(2)).unwrap();
+            sim.run_ms(50);
+        }
+        assert_eq!(sim.sequences(1, 1), [1, 3], "{lifespan:?}");
+        let lane = &sim.nodes[0].lanes[&LaneId(1)];
+        let reason = if lifespan.is_some() {
+            DropReason::Lifespan
+        } else {
+            DropReason::ReassemblyTimeout
+        };
+        assert_eq!(lane.out, 2, "{lifespan:?}: what did not arrive is not out");
+        assert_eq!(
+            lane.dropped.iter().collect::<Vec<_>>(),
+            [(&reason, &1)],
+            "{lifespan:?}: counted by its sender"
+        );
+        assert!(
+            sim.nodes[1].receiver_dropped.is_empty(),
+            "{lifespan:?}: and by nobody else"
+        );
+        sim.check_accounts();
+    }
+}
+
+#[test]
+fn a_repair_that_comes_after_all_does_not_make_a_message_out_that_was_given_up() {
+    let mut sim = Sim::new(1, Weather::delay(20), &["edge/a", "fog/b"]);
+    sim.run_ms(1_500);
+    lose_large_ones(&mut sim);
+    let start = sim.now;
+    sim.publish(
+        0,
+        1,
+        Post {
+            bytes: 700,
+            ..Post::reliable(1)
+        },
+    )
+    .unwrap();
+    sim.run_ms(1);
+    sim.publish(0, 1, Post::reliable(1)).unwrap();
+    while sim.sequences(1, 1).is_empty() {
+        assert!(sim.now - start < Duration::from_secs(5), "it is given up");
+        let _ = sim.publish(0, 1, Post::small(2));
+        sim.run_ms(1);
+    }
+    // From now on nothing is lost, and the sender does not know yet.
+    sim.network.censor = None;
+    sim.run_ms(1_000);
+    assert_eq!(sim.sequences(1, 1), [2]);
+    let lane = &sim.nodes[0].lanes[&LaneId(1)];
+    assert_eq!((lane.out, lane.dropped[&DropReason::ReassemblyTimeout]), (1, 1));
     sim.check_accounts();
 }
 

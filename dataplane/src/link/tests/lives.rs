@@ -219,6 +219,41 @@ fn one_that_never_answers_is_forgotten() {
 }
 
 #[test]
+fn a_new_life_forgets_those_who_are_not_heard_again() {
+    // Down before, and up before; and one that the transport finds again although it says nothing.
+    for (silent_ms, found) in [(3_000, false), (100, false), (100, true)] {
+        let mut sim = Sim::new(1, Weather::delay(10), &["edge/a", "fog/b", "cloud/c"]);
+        sim.run_ms(1_500);
+        sim.nodes[1].alive = false;
+        sim.run_ms(silent_ms);
+        sim.rebuild(0);
+        if found {
+            let endpoint = sim.endpoint(1);
+            sim.nodes[0].engine.peer_discovered(sim.now, endpoint);
+        }
+        let forgotten = |sim: &Sim| {
+            let names = names(sim, 0).into_iter();
+            names.filter(|name| name.starts_with("forgotten")).collect::<Vec<_>>()
+        };
+        sim.run_ms(50_000);
+        assert!(forgotten(&sim).is_empty(), "{silent_ms}, {found}: it may come back");
+        sim.run_ms(12_000);
+        assert_eq!(forgotten(&sim), ["forgotten fog/b"], "{silent_ms}, {found}");
+        assert_eq!(sim.nodes[0].engine.peers().len(), 1);
+    }
+}
+
+#[test]
+fn whoever_leaves_the_inter_scope_waits_for_nobody() {
+    let mut sim = Sim::new(1, Weather::delay(10), &["edge/a", "fog/b"]);
+    sim.run_ms(1_000);
+    sim.nodes[1].alive = false;
+    sim.nodes[0].engine.leave(sim.now);
+    assert_eq!(sim.nodes[0].engine.next_timeout(), None);
+    assert!(sim.nodes[0].engine.peers().is_empty());
+}
+
+#[test]
 fn registry_messages_pass_and_are_bounded() {
     let mut sim = Sim::new(1, Weather::delay(10), &["edge/a", "fog/b"]);
     sim.run_ms(1_000);
