@@ -179,7 +179,11 @@ fn lease_hints(shared: &Shared, control: &ControlCore, topic: &TopicName) -> Vec
             LapseReason::Expired => WhyCode::LeaseExpired,
             LapseReason::Denied => WhyCode::AccessDenied,
             LapseReason::TooMany => WhyCode::TooManyLeases,
+            LapseReason::SourceMismatch => WhyCode::SourceMismatch,
+            LapseReason::NameNotExpressible => WhyCode::NameNotExpressible,
+            LapseReason::NameCollision => WhyCode::NameCollision,
         },
+        detail: lapsed.detail.clone(),
     };
     lapsed.map(hint).collect()
 }

@@ -125,6 +125,8 @@ pub struct LeaseHint {
     pub service: String,
     /// `lease_expired`, `source_mismatch`, `access_denied`, `name_not_expressible`, `name_collision`, …
     pub code: WhyCode,
+    /// The facts, for people; empty where the code says all.
+    pub detail: String,
 }
 
 impl FromStr for WhyTarget {

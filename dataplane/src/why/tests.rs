@@ -89,6 +89,7 @@ impl Setup {
             kind,
             service: "driver".to_owned(),
             code,
+            detail: String::new(),
         });
     }
 
@@ -333,6 +334,17 @@ fn a_broker_that_is_another_s_or_away_is_described() {
     setup.node_broker.health = BrokerHealth::Down;
     setup.node_broker.detail = "connection refused".to_owned();
     assert_eq!(detail(&setup), "redis does not answer: connection refused");
+}
+
+#[test]
+fn a_refused_lease_is_named_with_the_facts() {
+    let mut setup = Setup::new(world(&["e/a node-"]));
+    setup.hint(StepKind::Advertise, WhyCode::NameCollision);
+    setup.leases[0].detail = "is one name with imu_data".to_owned();
+    setup.hint(StepKind::Advertise, WhyCode::LeaseExpired);
+    let step = setup.why().steps.remove(0);
+    assert_eq!(step.code, WhyCode::NameCollision, "the first is the newest");
+    assert_eq!(step.detail, "name_collision of driver: is one name with imu_data");
 }
 
 #[test]
