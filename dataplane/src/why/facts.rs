@@ -58,8 +58,10 @@ pub struct BridgeFacts {
     pub received: u64,
     /// Messages that it wrote during the same time.
     pub sent: u64,
-    /// Messages that it dropped during the same time.
+    /// Messages that it, or the way to it, dropped during the same time.
     pub dropped: BTreeMap<DropReason, u64>,
+    /// Messages that the rules of `flow.access` kept from it during the same time; not among those of `dropped`.
+    pub denied: u64,
 }
 
 /// Whether a bridge works.

@@ -52,6 +52,7 @@ impl Setup {
             received: 10,
             sent: 10,
             dropped: BTreeMap::new(),
+            denied: 0,
         };
         self.bridges = self.plan.bridges.iter().map(up).collect();
     }

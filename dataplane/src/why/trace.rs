@@ -416,6 +416,15 @@ fn drops(trace: &mut Trace, hop: &Hop<'_>, facts: &BridgeFacts) {
     };
     let none_passed = facts.sent == 0;
     let mut found = Vec::new();
+    if facts.denied > 0 {
+        let detail = format!(
+            "{} dropped by the rules flow.access ({}), {}",
+            facts.denied,
+            DropReason::ForeignOrigin,
+            counts(facts)
+        );
+        found.push((StepKind::Admit, WhyCode::AccessDenied, detail));
+    }
     for (reason, count) in facts.dropped.iter().filter(|(_, count)| **count > 0) {
         let (step, code) = match reason {
             DropReason::RateLimit if none_passed => (StepKind::Admit, WhyCode::BudgetStarved),
