@@ -208,8 +208,8 @@ impl<'w> Explainer<'_, 'w> {
     /// Requesters that are asked about, of all flows, each scope once; or what is wrong.
     fn request_side(&self) -> Result<Vec<Requester<'w>>, Trace> {
         let mut found: Vec<Requester<'w>> = Vec::new();
-        let living = &self.view.requesters;
-        let all: Vec<Requester<'w>> = living.iter().copied().chain(self.silent_requesters()).collect();
+        let living = self.view.requesters.iter().chain(&self.view.refused).copied();
+        let all: Vec<Requester<'w>> = living.chain(self.silent_requesters()).collect();
         for requester in all.iter().filter(|requester| self.is_asked(requester, &all)) {
             let shared = |other: &Requester<'_>| {
                 requester.scope != Scope::Node && other.scope == requester.scope && other.group == requester.group
