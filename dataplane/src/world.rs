@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::node_file::AutoBool;
+use blaze_domain::node_file::{AccessRules, AutoBool};
 use blaze_domain::{Durability, FlowId, LayerKind, LayerName, Priority, Reliability, TopicName};
 use sha2::{Digest, Sha256};
 
@@ -17,6 +17,8 @@ pub struct World {
     pub me: FlowId,
     /// Every known flow, dead ones until they are forgotten.
     pub flows: BTreeMap<FlowId, FlowView>,
+    /// Who may advertise and request what, as the node file of `me` says.
+    pub access: AccessRules,
 }
 
 /// One flow as another sees it.

@@ -176,7 +176,8 @@ impl ControlCore {
         self.touch(now, BTreeSet::from([topic]));
     }
 
-    /// Changes who may advertise and request what. Leases that are no longer allowed end.
+    /// Changes who may advertise and request what. Leases that are no longer allowed end; every topic is planned anew, because
+    /// the rules hold for requesters of other flows, too.
     pub fn set_access(&mut self, now: Instant, wall_ms: u64, access: AccessRules) {
         let ended = self.registry.set_access(now, access);
         for event in &ended.events {
@@ -187,6 +188,7 @@ impl ControlCore {
         }
         self.save_leases();
         self.touch(now, ended.changed);
+        self.touch_all(now);
     }
 
     /// Takes in nothing more: every bridge drains.

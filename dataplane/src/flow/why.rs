@@ -8,7 +8,7 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use blaze_brokers::{Broker, BrokerKind, Health};
 use blaze_domain::control::LeaseKind;
-use blaze_domain::{DropReason, Scope, TopicName, WhyCode};
+use blaze_domain::{DropReason, TopicName, WhyCode};
 use blaze_proto::link::link_control::RouteState;
 use serde_json::{Value, json};
 
@@ -80,15 +80,13 @@ fn bridge_facts(shared: &Shared, topic: &TopicName) -> Vec<BridgeFacts> {
         let id = state.core.find(topic.as_str())?;
         let path = state.core.path_mut(id);
         let live = |bridge: &&mut Bridge| matches!(bridge.phase, Phase::Up { .. } | Phase::Failed { .. });
-        let refused = path.ingress_lately();
         let mut facts: Vec<BridgeFacts> = path.bridges.iter_mut().filter(live).map(facts_of).collect();
-        // What came from a local scope and could not be taken never reached a bridge, and yet is missing behind it.
-        for fact in facts.iter_mut().filter(|fact| fact.from != Scope::Inter) {
-            let named =
-                |(reason, _): &&(DropReason, u64)| matches!(reason, DropReason::TooLarge | DropReason::ForeignOrigin);
-            for (reason, count) in refused.iter().filter(named) {
-                *fact.dropped.entry(*reason).or_default() += count;
-            }
+        // What was refused on the way in never reached a bridge, and yet is missing behind those that read its scope.
+        for fact in &mut facts {
+            let refused = path.refused_lately(fact.from);
+            *fact.dropped.entry(DropReason::TooLarge).or_default() += refused.too_large;
+            *fact.dropped.entry(DropReason::ForeignOrigin).or_default() += refused.foreign;
+            fact.denied = refused.denied;
         }
         Some((id, facts))
     });
@@ -118,6 +116,7 @@ fn facts_of(bridge: &mut Bridge) -> BridgeFacts {
         received: lately.taken,
         sent: lately.out,
         dropped: lately.dropped.into_iter().collect(),
+        denied: 0,
     }
 }
 
@@ -179,7 +178,11 @@ fn lease_hints(shared: &Shared, control: &ControlCore, topic: &TopicName) -> Vec
             LapseReason::Expired => WhyCode::LeaseExpired,
             LapseReason::Denied => WhyCode::AccessDenied,
             LapseReason::TooMany => WhyCode::TooManyLeases,
+            LapseReason::SourceMismatch => WhyCode::SourceMismatch,
+            LapseReason::NameNotExpressible => WhyCode::NameNotExpressible,
+            LapseReason::NameCollision => WhyCode::NameCollision,
         },
+        detail: lapsed.detail.clone(),
     };
     lapsed.map(hint).collect()
 }

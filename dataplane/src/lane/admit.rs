@@ -13,6 +13,32 @@ use super::path::TopicId;
 use super::reading::For;
 use super::window::DuplicateWindow;
 
+/// Why a message is not taken in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Refusal {
+    /// It counts under this reason.
+    Dropped(DropReason),
+    /// The rules of `flow.access` do not let its origin publish it. It counts as one of a foreign origin; whoever asks why is told which
+    /// of the two it was.
+    Denied,
+}
+
+impl Refusal {
+    /// What it counts as.
+    pub(super) fn reason(self) -> DropReason {
+        match self {
+            Self::Dropped(reason) => reason,
+            Self::Denied => DropReason::ForeignOrigin,
+        }
+    }
+}
+
+impl From<DropReason> for Refusal {
+    fn from(reason: DropReason) -> Self {
+        Self::Dropped(reason)
+    }
+}
+
 /// Where a message stands when it reaches the bridges.
 pub(super) struct Admitted {
     /// As a broker gets it: with the hop that writing it is, and its age.
@@ -53,11 +79,11 @@ impl DataCore {
         from: Scope,
         received: Received,
         meant: For,
-    ) -> Result<Admitted, DropReason> {
+    ) -> Result<Admitted, Refusal> {
         let (at, kept) = (received.at, received.kept);
         let waited_us = received.broker_age_us + micros(now.saturating_duration_since(at));
         let (frame, bare) = match received.content {
-            Content::Malformed { .. } => return Err(DropReason::DecodeError),
+            Content::Malformed { .. } => return Err(DropReason::DecodeError.into()),
             Content::Frame(frame) => (frame, false),
             Content::Bare { payload, identity } => (
                 self.wrap(wall_ns.saturating_sub(waited_us * 1000), topic, from, payload, identity)?,
@@ -65,12 +91,12 @@ impl DataCore {
             ),
         };
         if frame.topic() != self.path(topic).name.as_str() {
-            return Err(DropReason::DecodeError);
+            return Err(DropReason::DecodeError.into());
         }
         let born_here = frame.hops() == 0;
         if from == Scope::Node && !born_here {
             // Only this flow writes to its node scope, and what it writes carries hops.
-            return Err(DropReason::Echo);
+            return Err(DropReason::Echo.into());
         }
         let me = &self.config.me;
         let own_layer = frame.origin_layer() == me.layer.as_str();
@@ -80,17 +106,21 @@ impl DataCore {
             Scope::Layer | Scope::Inter => born_here && !own_layer,
         };
         // Before the window takes the number: a foreign message must not silence the writer whose name it bears.
-        if foreign || !self.path(topic).info.takes(&frame) {
-            return Err(DropReason::ForeignOrigin);
+        if foreign {
+            return Err(DropReason::ForeignOrigin.into());
+        }
+        if !self.path(topic).info.takes(&frame) {
+            return Err(Refusal::Denied);
         }
         // What is read again was noted the first time; the flow that gets it drops what it had.
         if meant != For::Outside && !self.is_new(topic, &frame) {
             // What a flow has written carries hops; a publisher that repeats itself does not.
-            return Err(if born_here {
+            let repeat = if born_here {
                 DropReason::Duplicate
             } else {
                 DropReason::Echo
-            });
+            };
+            return Err(repeat.into());
         }
         let mut age_us = frame.age_us().saturating_add(waited_us);
         if from == Scope::Node && !bare {

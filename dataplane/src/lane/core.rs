@@ -18,7 +18,7 @@ use blaze_proto::Frame;
 use blaze_proto::link::link_control::Body;
 use lru::LruCache;
 
-use super::admit::Admitted;
+use super::admit::{Admitted, Refusal};
 use super::early::Early;
 use super::kept::KeptMessages;
 use super::measure::micros;
@@ -246,8 +246,8 @@ impl DataCore {
             match self.check_local(now, wall_ns, topic, from, received, meant) {
                 Ok(admitted) => self.fan_out(now, topic, from, &admitted, link),
                 // What a broker keeps is read again with each subscription.
-                Err(DropReason::Duplicate | DropReason::Echo) if kept => {}
-                Err(reason) => self.topics[topic.0 as usize].ingress_drops.add(reason, 1),
+                Err(Refusal::Dropped(DropReason::Duplicate | DropReason::Echo)) if kept => {}
+                Err(refusal) => self.path_mut(topic).refuse(from, refusal),
             }
         }
     }
@@ -273,16 +273,16 @@ impl DataCore {
         };
         let own_layer = frame.origin_layer() == self.config.me.layer.as_str();
         let refused = if own_layer && frame.origin_node() == self.config.me.node.as_str() {
-            Some(DropReason::Echo)
+            Some(Refusal::Dropped(DropReason::Echo))
         } else if !self.path(topic).info.takes(&frame) {
-            Some(DropReason::ForeignOrigin)
+            Some(Refusal::Denied)
         } else if !self.is_new_here(now, topic, &frame) {
-            Some(DropReason::Duplicate)
+            Some(Refusal::Dropped(DropReason::Duplicate))
         } else {
             None
         };
-        if let Some(reason) = refused {
-            self.topics[topic.0 as usize].ingress_drops.add(reason, 1);
+        if let Some(refusal) = refused {
+            self.path_mut(topic).refuse(Scope::Inter, refusal);
             return;
         }
         let age_us = frame.age_us();

@@ -8,6 +8,7 @@ use blaze_domain::node_file::TopicAccess;
 use blaze_domain::{DropReason, FlowId, LayerName, Priority, Scope, TopicName, WriterId};
 use blaze_proto::Frame;
 
+use super::admit::Refusal;
 use super::core::FORGET;
 use super::load::LoadMeter;
 use super::measure::RateMeter;
@@ -71,6 +72,39 @@ impl TopicInfo {
         match from {
             Scope::Node => &self.node,
             Scope::Layer | Scope::Inter => &self.layer,
+        }
+    }
+}
+
+/// Scopes that messages come from.
+const SCOPES: usize = Scope::ALL.len();
+
+/// Messages that were refused before any bridge, by causes that somebody can cure.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Refused {
+    /// Larger than is carried.
+    pub too_large: u64,
+    /// Born in another layer or node than the scope that they came from.
+    pub foreign: u64,
+    /// Of origins that the rules of `flow.access` do not let publish the topic.
+    pub denied: u64,
+}
+
+impl Refused {
+    fn add(&mut self, refusal: Refusal) {
+        match refusal {
+            Refusal::Denied => self.denied += 1,
+            Refusal::Dropped(DropReason::ForeignOrigin) => self.foreign += 1,
+            Refusal::Dropped(DropReason::TooLarge) => self.too_large += 1,
+            Refusal::Dropped(_) => {}
+        }
+    }
+
+    fn since(self, before: Self) -> Self {
+        Self {
+            too_large: self.too_large - before.too_large,
+            foreign: self.foreign - before.foreign,
+            denied: self.denied - before.denied,
         }
     }
 }
@@ -225,8 +259,10 @@ pub struct TopicPath {
     pub in_rate: RateMeter,
     /// Dropped before any bridge: echoes, duplicates, what could not be read.
     pub ingress_drops: Drops,
+    /// Those of them that people ask for, by the scope that they came from.
+    refused: [Refused; SCOPES],
     /// Those at two moments, so that what happened lately can be told.
-    ingress_marks: [Drops; 2],
+    refused_marks: [[Refused; SCOPES]; 2],
     /// Where the layer scope is read, if its broker keeps places.
     pub places: Places,
     /// Identity that the flow gives to bare messages, per source scope.
@@ -249,7 +285,8 @@ impl TopicPath {
             largest_bytes: 0,
             in_rate: RateMeter::new(now),
             ingress_drops: Drops::default(),
-            ingress_marks: Default::default(),
+            refused: Default::default(),
+            refused_marks: Default::default(),
             places: Places::default(),
             bare: BTreeMap::new(),
             idle: None,
@@ -259,18 +296,24 @@ impl TopicPath {
 
     /// Puts a mark into all counters.
     pub(super) fn mark(&mut self) {
-        let mark = self.ingress_drops.clone();
-        self.ingress_marks = [std::mem::take(&mut self.ingress_marks[1]), mark];
+        self.refused_marks = [self.refused_marks[1], self.refused];
         for bridge in &mut self.bridges {
             bridge.settle();
             bridge.stats.mark();
         }
     }
 
-    /// What was dropped before any bridge since the mark before the last, by reason.
+    /// Counts a message that is not taken in.
+    pub(super) fn refuse(&mut self, from: Scope, refusal: Refusal) {
+        self.ingress_drops.add(refusal.reason(), 1);
+        self.refused[from as usize].add(refusal);
+    }
+
+    /// What was refused of a scope since the mark before the last.
     #[must_use]
-    pub fn ingress_lately(&self) -> Vec<(DropReason, u64)> {
-        self.ingress_drops.since(&self.ingress_marks[0])
+    pub fn refused_lately(&self, from: Scope) -> Refused {
+        let at = from as usize;
+        self.refused[at].since(self.refused_marks[0][at])
     }
 
     /// Whether nothing goes through it and nothing waits.

@@ -132,7 +132,8 @@ impl DataCore {
             // What is kept is older than what another bridge has held for this one.
             let passed_on = bridge.held.as_mut().map(std::mem::take);
             for message in self.kept.of(now, topic, bridge.from) {
-                if bridge.takes() && bridge.wants(&message) {
+                // The rules may have changed since it came.
+                if bridge.takes() && path.info.takes(&message.frame) && bridge.wants(&message) {
                     bridge.pass(now, topic, &message, large, &mut self.succession, link);
                 }
             }

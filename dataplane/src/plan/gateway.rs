@@ -99,6 +99,8 @@ fn living(world: &World) -> impl Iterator<Item = (&FlowId, &FlowView)> {
 mod tests {
     use std::collections::BTreeMap;
 
+    use blaze_domain::node_file::AccessRules;
+
     use super::*;
     use crate::plan::tests::worlds::flow;
 
@@ -117,6 +119,7 @@ mod tests {
             choose(&World {
                 me: me.clone(),
                 flows: flows.clone(),
+                access: AccessRules::default(),
             })
         };
         flows.keys().map(|me| (me.clone(), choice(me))).collect()

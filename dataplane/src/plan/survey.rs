@@ -139,6 +139,8 @@ pub(super) fn carries(view: &FlowView) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use blaze_domain::node_file::AccessRules;
+
     use super::*;
     use crate::plan::tests::worlds::{flow, id};
     use crate::world::{Carrying, Part, TopicEntry};
@@ -150,6 +152,7 @@ mod tests {
         let mut world = World {
             me: id("x/1"),
             flows: names.map(|(name, scope)| (id(name), flow(scope))).into(),
+            access: AccessRules::default(),
         };
         let part = Part {
             carrying: Carrying::Carries,

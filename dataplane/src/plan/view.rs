@@ -1,11 +1,13 @@
 //! The world as one topic sees it: publishers, requesters, and who of them matches whom.
 
+mod access;
 mod successor;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::iter;
 use std::sync::Arc;
 
+use blaze_domain::node_file::TopicAccess;
 use blaze_domain::{FlowId, LayerName, Scope, TopicName, WhyCode};
 
 use super::survey::Holder;
@@ -120,10 +122,14 @@ pub(crate) struct TopicView<'w> {
     pub(crate) publishers: Vec<Publisher<'w>>,
     /// Of flows that carry topics.
     pub(crate) requesters: Vec<Requester<'w>>,
+    /// The same that the own rules refuse. Other flows do not know that.
+    pub(crate) refused: Vec<Requester<'w>>,
     /// Of flows that are down.
     lost_requesters: Vec<Requester<'w>>,
     /// Flows whose layer broker does not answer them.
     away: Vec<&'w FlowId>,
+    /// What the own rules say of the topic.
+    access: TopicAccess,
     /// Whether this flow is on the inter scope.
     role: Role,
     /// Flows of the own group that are on the inter scope for it and carry topics.
@@ -151,8 +157,10 @@ impl<'w> TopicView<'w> {
             group: Group::of(me, own),
             publishers: Vec::new(),
             requesters: Vec::new(),
+            refused: Vec::new(),
             lost_requesters: Vec::new(),
             away: Vec::new(),
+            access: world.access.of(topic),
             role: own.role,
             gateways: Arc::clone(&survey.gateways),
             members: Arc::clone(&survey.members),
@@ -199,8 +207,10 @@ impl<'w> TopicView<'w> {
                     scope,
                     request,
                 };
-                if carries {
+                if carries && self.may_request(&requester) {
                     self.requesters.push(requester);
+                } else if carries {
+                    self.refused.push(requester);
                 } else if !reachable {
                     self.lost_requesters.push(requester);
                 }
@@ -319,7 +329,8 @@ impl<'w> TopicView<'w> {
         publisher: &'p Publisher<'w>,
         group: Group<'w>,
     ) -> impl Iterator<Item = &'w FlowId> + use<'p, 'w> {
-        let in_group = self.requesters.iter().filter(move |requester| {
+        let known = self.requesters.iter().chain(self.refused_elsewhere(publisher, group));
+        let in_group = known.filter(move |requester| {
             requester.group == group && requester.scope != Scope::Inter && publisher.matches(requester)
         });
         let behind = |requester: &&Requester<'w>| self.members.contains(requester.flow);
@@ -439,7 +450,8 @@ impl<'w> TopicView<'w> {
     pub(crate) fn other_carrier(&self) -> Option<FlowId> {
         let on_layer = |publisher: &&Publisher<'_>| publisher.group == self.group && publisher.scope == Scope::Layer;
         let is_outside = |requester: &&Requester<'_>| requester.group != self.group || requester.scope == Scope::Inter;
-        let outside = || self.requesters.iter().filter(is_outside);
+        // Another flow does not know whom this one refuses.
+        let outside = || self.requesters.iter().chain(&self.refused).filter(is_outside);
         let published = self.publishers.iter().filter(on_layer).chain(self.relayed_publishers());
         self.pairs(published, outside()).next()?;
         self.owner().filter(|owner| *owner != self.me).cloned()
@@ -487,6 +499,8 @@ impl<'w> TopicView<'w> {
                 ));
             }
         }
+        let denied = self.denied().into_iter();
+        blocked.extend(denied.map(|(to, detail)| (to, WhyCode::AccessDenied, detail)));
         let entry = |(to, code, detail)| Blocked { to, code, detail };
         let mut blocked: Vec<_> = blocked.into_iter().map(entry).collect();
         blocked.dedup_by(|next, kept| next.to == kept.to && next.code == kept.code);

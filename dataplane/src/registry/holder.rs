@@ -26,6 +26,31 @@ pub(super) fn key_of(
     })
 }
 
+/// The same for a message that is refused: of one from elsewhere the key that it would have if it was from here, so that a right one
+/// takes its place.
+pub(super) fn key_here(scope: Scope, me: &FlowId, kind: LeaseKind, common: &Common) -> LeaseKey {
+    LeaseKey {
+        scope,
+        kind,
+        layer: me.layer.clone(),
+        node: match scope {
+            Scope::Node => Some(me.node.clone()),
+            Scope::Layer | Scope::Inter => common.node.clone(),
+        },
+        service: common.service.clone(),
+        instance: common.instance.clone(),
+    }
+}
+
+/// What a message asks for; a withdrawal asks for nothing.
+pub(super) fn kind_of(message: &ControlMessage) -> Option<LeaseKind> {
+    match message {
+        ControlMessage::Advertise(_) => Some(LeaseKind::Advertise),
+        ControlMessage::Request(_) => Some(LeaseKind::Request),
+        ControlMessage::Withdraw(_) => None,
+    }
+}
+
 /// The lease that a message grants or renews; a withdrawal has none.
 pub(super) fn lease_of<'m>(
     now: Instant,

@@ -159,6 +159,12 @@ pub enum LapseReason {
     Denied,
     /// The flow holds as many as it can.
     TooMany,
+    /// The message named another layer or node than the one where it came.
+    SourceMismatch,
+    /// The broker has no such names.
+    NameNotExpressible,
+    /// Another topic has its name on the broker.
+    NameCollision,
 }
 
 /// A lease that was not renewed, or that was refused.
@@ -172,6 +178,8 @@ pub struct LapsedLease {
     pub at: Instant,
     /// Why.
     pub reason: LapseReason,
+    /// The facts, for people; empty where the reason says all.
+    pub detail: String,
 }
 
 /// All leases of one flow, bounded.
@@ -281,17 +289,15 @@ impl LeaseTable {
                 held.terms != lease.terms
             }
             None if self.count >= self.limit => {
+                let detail = format!("the flow holds {} leases, its limit", self.limit);
                 self.remember(LapsedLease {
                     topic: topic.clone(),
                     key,
                     at: now,
                     reason: LapseReason::TooMany,
+                    detail: detail.clone(),
                 });
-                return Err(ControlError::new(
-                    ErrorCode::TooManyLeases,
-                    pointer,
-                    format!("the flow holds {} leases, its limit", self.limit),
-                ));
+                return Err(ControlError::new(ErrorCode::TooManyLeases, pointer, detail));
             }
             None => {
                 self.count += 1;
@@ -368,8 +374,13 @@ impl LeaseTable {
             }
             self.remove(&topic, &key);
             self.note_end(&topic, &key);
-            let reason = LapseReason::Expired;
-            lapsed.push(LapsedLease { topic, key, at, reason });
+            lapsed.push(LapsedLease {
+                topic,
+                key,
+                at,
+                reason: LapseReason::Expired,
+                detail: String::new(),
+            });
         }
         for lease in &lapsed {
             self.remember(lease.clone());
@@ -398,6 +409,7 @@ impl LeaseTable {
                 key: key.clone(),
                 at: now,
                 reason: LapseReason::Denied,
+                detail: String::new(),
             }));
         }
         // Who is allowed now only has to ask again.
@@ -415,9 +427,9 @@ impl LeaseTable {
         self.expiry.first().map(|(at, _, _)| *at)
     }
 
-    /// Leases that lapsed and were not made anew, oldest first.
+    /// Leases that lapsed or were refused and were not made anew, newest first: what is the matter now hides what was before.
     pub(super) fn lapsed(&self, topic: &TopicName) -> impl Iterator<Item = &LapsedLease> {
-        self.lapsed.iter().filter(move |lease| {
+        self.lapsed.iter().rev().filter(move |lease| {
             lease.topic == *topic
                 && !self
                     .topics

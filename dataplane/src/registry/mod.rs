@@ -30,9 +30,7 @@ mod wire;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Instant;
 
-use blaze_domain::control::{
-    Answer, ControlError, ControlMessage, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload,
-};
+use blaze_domain::control::{Answer, ControlError, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload};
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::AutoBool;
 use blaze_domain::{Durability, FlowId, Scope, TopicName};
@@ -112,7 +110,7 @@ pub struct Registry {
 impl Registry {
     /// A registry without leases that knows no other flow; the own flow is starting.
     #[must_use]
-    pub fn new(config: RegistryConfig) -> Self {
+    pub fn new(mut config: RegistryConfig) -> Self {
         let own = FlowView {
             kind: config.kind,
             epoch: config.epoch,
@@ -142,6 +140,7 @@ impl Registry {
             world: World {
                 me: config.me.clone(),
                 flows: BTreeMap::from([(config.me.clone(), own)]),
+                access: std::mem::take(&mut config.access),
             },
             outgoing: VecDeque::new(),
             layer_outgoing: Vec::new(),
@@ -267,15 +266,7 @@ impl Registry {
                 "is required here with reply_to, because answers share one channel",
             ));
         }
-        if !matches!(message, ControlMessage::Withdraw(_)) {
-            self.claim_name(scope, &common.topic).map_err(|fault| {
-                let code = match fault {
-                    NameFault::TooLong { .. } => ErrorCode::NameNotExpressible,
-                    NameFault::Collision { .. } => ErrorCode::NameCollision,
-                };
-                ControlError::new(code, format!("{}/topic", object.pointer), fault.to_string())
-            })?;
-        }
+        self.check_name(now, scope, message, &object.pointer)?;
         let applied = self
             .leases
             .apply(now, scope, &self.config.me, message, &object.pointer)?;
@@ -463,7 +454,7 @@ impl Registry {
             .filter(|lease| lease.key.kind == LeaseKind::Advertise)
     }
 
-    /// Leases of a topic that lapsed and were not made anew, oldest first, as far as remembered.
+    /// Leases of a topic that lapsed or were refused and were not made anew, newest first, as far as remembered.
     pub fn lapsed(&self, topic: &TopicName) -> impl Iterator<Item = &LapsedLease> {
         self.leases.lapsed(topic)
     }

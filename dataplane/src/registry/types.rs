@@ -34,7 +34,7 @@ pub struct RegistryConfig {
     pub layer_names: LayerNames,
     /// Scopes whose broker keeps leases; they are to be read.
     pub lease_stores: BTreeSet<Scope>,
-    /// Who may advertise and request what.
+    /// Who may advertise and request what, until it is changed.
     pub access: AccessRules,
     /// When the flow started.
     pub started: Instant,

@@ -58,8 +58,10 @@ pub struct BridgeFacts {
     pub received: u64,
     /// Messages that it wrote during the same time.
     pub sent: u64,
-    /// Messages that it dropped during the same time.
+    /// Messages that it, or the way to it, dropped during the same time.
     pub dropped: BTreeMap<DropReason, u64>,
+    /// Messages that the rules of `flow.access` kept from it during the same time; not among those of `dropped`.
+    pub denied: u64,
 }
 
 /// Whether a bridge works.
@@ -125,6 +127,8 @@ pub struct LeaseHint {
     pub service: String,
     /// `lease_expired`, `source_mismatch`, `access_denied`, `name_not_expressible`, `name_collision`, …
     pub code: WhyCode,
+    /// The facts, for people; empty where the code says all.
+    pub detail: String,
 }
 
 impl FromStr for WhyTarget {

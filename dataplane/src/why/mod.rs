@@ -208,8 +208,8 @@ impl<'w> Explainer<'_, 'w> {
     /// Requesters that are asked about, of all flows, each scope once; or what is wrong.
     fn request_side(&self) -> Result<Vec<Requester<'w>>, Trace> {
         let mut found: Vec<Requester<'w>> = Vec::new();
-        let living = &self.view.requesters;
-        let all: Vec<Requester<'w>> = living.iter().copied().chain(self.silent_requesters()).collect();
+        let living = self.view.requesters.iter().chain(&self.view.refused).copied();
+        let all: Vec<Requester<'w>> = living.chain(self.silent_requesters()).collect();
         for requester in all.iter().filter(|requester| self.is_asked(requester, &all)) {
             let shared = |other: &Requester<'_>| {
                 requester.scope != Scope::Node && other.scope == requester.scope && other.group == requester.group
@@ -278,8 +278,8 @@ impl<'w> Explainer<'_, 'w> {
         in_node(requester) && (to.node.is_none() || requester.scope == Scope::Node || !node_asks())
     }
 
-    /// Why a lease is missing: nobody is heard on a scope that is another flow's or whose broker is away, it lapsed, or there
-    /// never was one.
+    /// Why a lease is missing: nobody is heard on a scope that is another flow's or whose broker is away, it lapsed or was refused,
+    /// or there never was one.
     fn missing(&self, kind: StepKind, code: WhyCode, nobody: impl Fn() -> String) -> (&FlowId, WhyCode, String) {
         let me = self.view.me;
         let to = self.input.to.as_ref().filter(|_| kind == StepKind::Request);
@@ -295,7 +295,11 @@ impl<'w> Explainer<'_, 'w> {
             return (me, WhyCode::PeerDown, NO_GATEWAY.to_owned());
         }
         match self.hint(kind) {
-            Some(hint) => (&hint.flow, hint.code, format!("{} of {}", hint.code, hint.service)),
+            Some(hint) => {
+                let colon = if hint.detail.is_empty() { "" } else { ": " };
+                let detail = format!("{} of {}{colon}{}", hint.code, hint.service, hint.detail);
+                (&hint.flow, hint.code, detail)
+            }
             None if alone => (me, code, format!("{}, and {NO_GATEWAY}", nobody())),
             None => (me, code, nobody()),
         }

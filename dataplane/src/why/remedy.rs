@@ -41,7 +41,7 @@ pub(super) fn remedy(code: WhyCode) -> &'static str {
             "Rename one of the two topics, which the step names: the broker has one name for both."
         }
         WhyCode::AccessDenied => {
-            "Let the operator allow this service to use the topic; a service that was allowed since must ask again, as the SDK does by itself."
+            "Let the operator of the flow that the step names allow it in `flow.access`; a service that was refused must then ask again, as the SDK does by itself."
         }
         WhyCode::TooManyLeases => {
             "Find the service that makes up names (`blaze topics`) and let it withdraw them; then this one is taken when it asks again."

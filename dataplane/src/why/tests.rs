@@ -1,10 +1,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use blaze_domain::{DropReason, Durability, Reliability};
+use serde_json::json;
 
 use super::*;
 use crate::plan::tests::generate::{Dice, System};
-use crate::plan::tests::worlds::{ask, entry, filter, id, offer, topic, world};
+use crate::plan::tests::worlds::{ask, entry, filter, id, offer, rules, topic, world};
 use crate::plan::{PlanRules, TopicPlan, plan_topic};
 use crate::world::World;
 
@@ -52,6 +53,7 @@ impl Setup {
             received: 10,
             sent: 10,
             dropped: BTreeMap::new(),
+            denied: 0,
         };
         self.bridges = self.plan.bridges.iter().map(up).collect();
     }
@@ -59,6 +61,18 @@ impl Setup {
     fn drops(&mut self, reason: DropReason, sent: u64) {
         self.bridges[0].sent = sent;
         self.bridges[0].dropped.insert(reason, 10 - sent);
+    }
+
+    /// Messages that the rules keep from the first bridge.
+    fn denies(&mut self, sent: u64) {
+        self.bridges[0].sent = sent;
+        self.bridges[0].denied = 10 - sent;
+    }
+
+    /// The rules of the flow that is asked.
+    fn ruled(&mut self, rule: serde_json::Value) {
+        self.world.access = rules(rule);
+        self.replan();
     }
 
     fn route(&mut self, flow: &str, receiver: Option<&str>, step: StepKind, code: WhyCode) {
@@ -71,6 +85,12 @@ impl Setup {
             ok: code == WhyCode::Ok,
             code,
         });
+    }
+
+    /// What a flow says whose rules refuse the services of the layer of another flow.
+    fn denied_layer(&mut self, flow: &str, of: &str) {
+        self.route(flow, Some(of), StepKind::Plan, WhyCode::AccessDenied);
+        self.routes.iter_mut().for_each(|route| route.receiver = None);
     }
 
     fn block_layer(&mut self, code: WhyCode) {
@@ -89,6 +109,7 @@ impl Setup {
             kind,
             service: "driver".to_owned(),
             code,
+            detail: String::new(),
         });
     }
 
@@ -153,6 +174,24 @@ fn rows() -> Vec<Row> {
         "a name that the broker cannot express": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::NameNotExpressible) => NotFlowing NameNotExpressible Advertise;
         "two names that are one on the broker": &["e/a node+"], |s| s.hint(StepKind::Request, WhyCode::NameCollision) => NotFlowing NameCollision Request;
         "not allowed": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::AccessDenied) => NotFlowing AccessDenied Advertise;
+        "a requester that the rules refuse": PAIR, |s| s.ruled(json!({"request": {"deny": ["c"]}})) => NotFlowing AccessDenied Plan;
+        "one of two that the rules refuse": &["e/a node+", "c/b node-", "f/d node-"], |s| s.ruled(json!({"request": {"deny": ["c"]}})) => Degraded AccessDenied Plan;
+        "the other one is allowed": &["e/a node+", "c/b node-", "f/d node-"], |s| {
+            s.ruled(json!({"request": {"deny": ["c"]}}));
+            s.to = Some("f");
+        } => Flowing Ok;
+        "a refused one that gets what another node of its layer is sent": &["e/a node+", "c/b@1 node-", "c/d@1 node-"], |s| {
+            s.ruled(json!({"request": {"deny": ["c/b"]}}));
+            s.to = Some("c/b");
+        } => Flowing Ok;
+        "the rules are no matter of others": &["f/x", "e/a node+", "c/b node-"], |s| s.ruled(json!({"request": {"deny": ["c"]}})) => Flowing Ok;
+        "the sender says that its rules refuse a node": FROM_CLOUD, |s| s.route("e/a", Some("c/b"), StepKind::Plan, WhyCode::AccessDenied) => NotFlowing AccessDenied Plan;
+        "the sender says that its rules refuse a layer": &["c/b@1 layer-", "e/a@1 node+"], |s| s.denied_layer("e/a", "c/b") => NotFlowing AccessDenied Plan;
+        "a layer that is refused is not its nodes": FROM_CLOUD, |s| s.denied_layer("e/a", "c/b") => Flowing Ok;
+        "a publisher that the rules refuse": FROM_CLOUD, |s| s.ruled(json!({"advertise": {"deny": ["e"]}})) => NotFlowing AccessDenied Plan;
+        "the receiver says that its rules refuse who publishes": PAIR, |s| s.route("c/b", Some("c/b"), StepKind::Plan, WhyCode::AccessDenied) => NotFlowing AccessDenied Plan;
+        "all messages are refused by the rules": FROM_CLOUD, |s| s.denies(0) => NotFlowing AccessDenied Admit;
+        "some messages are refused by the rules": PAIR, |s| s.denies(4) => Degraded AccessDenied Admit;
         "no room for another lease": &["e/a node-"], |s| s.hint(StepKind::Advertise, WhyCode::TooManyLeases) => NotFlowing TooManyLeases Advertise;
         "no such origin": PAIR, |s| { ask(&mut s.world, "c/b", "node").from = vec![filter("x/*/*")]; s.replan(); } => NotFlowing NoMatchingOrigin Plan;
         "other types": PAIR, |s| {
@@ -333,6 +372,17 @@ fn a_broker_that_is_another_s_or_away_is_described() {
     setup.node_broker.health = BrokerHealth::Down;
     setup.node_broker.detail = "connection refused".to_owned();
     assert_eq!(detail(&setup), "redis does not answer: connection refused");
+}
+
+#[test]
+fn a_refused_lease_is_named_with_the_facts() {
+    let mut setup = Setup::new(world(&["e/a node-"]));
+    setup.hint(StepKind::Advertise, WhyCode::NameCollision);
+    setup.leases[0].detail = "is one name with imu_data".to_owned();
+    setup.hint(StepKind::Advertise, WhyCode::LeaseExpired);
+    let step = setup.why().steps.remove(0);
+    assert_eq!(step.code, WhyCode::NameCollision, "the first is the newest");
+    assert_eq!(step.detail, "name_collision of driver: is one name with imu_data");
 }
 
 #[test]

@@ -89,7 +89,7 @@ impl<'w> Tracer<'_, 'w> {
                 self.over_gateways(&mut trace, StepKind::Deliver);
             }
             for hop in self.hops(publisher, requester) {
-                self.hop(&mut trace, &hop);
+                self.hop(&mut trace, &hop, requester);
             }
             if requester.scope == Scope::Inter {
                 self.over_gateways(&mut trace, StepKind::Bridge);
@@ -128,6 +128,10 @@ impl<'w> Tracer<'_, 'w> {
                 StepKind::Plan
             };
             trace.add(requester.flow, step, false, absent(view), absence(requester.flow, view));
+            return false;
+        }
+        if let Some(detail) = self.view.denial(publisher, requester) {
+            trace.add(self.view.me, plan, false, WhyCode::AccessDenied, detail);
             return false;
         }
         if asks_too_much(publisher.advertise, requester.request) {
@@ -263,12 +267,27 @@ impl<'w> Tracer<'_, 'w> {
         self.view.receiver(publisher, requester.group, &kept)
     }
 
-    fn hop(&self, trace: &mut Trace, hop: &Hop<'w>) {
+    fn hop(&self, trace: &mut Trace, hop: &Hop<'w>, requester: &Requester<'w>) {
         if hop.flow == self.view.me {
             self.own_hop(trace, hop);
+        } else if self.denies(hop.flow, requester) {
+            let detail = format!("{} says so: its rules flow.access do not allow it", hop.flow);
+            trace.add(hop.flow, StepKind::Plan, false, WhyCode::AccessDenied, detail);
         } else {
             self.other_hop(trace, hop);
         }
+    }
+
+    /// Whether another flow says that its rules keep the topic from the requester.
+    fn denies(&self, flow: &FlowId, requester: &Requester<'w>) -> bool {
+        // Of services of a layer it names the layer alone.
+        let asks = (requester.scope != Scope::Layer).then_some(requester.flow);
+        let mut routes = self.input.routes.iter().filter(|route| route.flow == *flow);
+        routes.any(|route| {
+            route.code == WhyCode::AccessDenied
+                && route.to_layer == requester.flow.layer
+                && route.receiver.as_ref() == asks
+        })
     }
 
     /// What another flow says of its part.
@@ -416,6 +435,15 @@ fn drops(trace: &mut Trace, hop: &Hop<'_>, facts: &BridgeFacts) {
     };
     let none_passed = facts.sent == 0;
     let mut found = Vec::new();
+    if facts.denied > 0 {
+        let detail = format!(
+            "{} dropped by the rules flow.access ({}), {}",
+            facts.denied,
+            DropReason::ForeignOrigin,
+            counts(facts)
+        );
+        found.push((StepKind::Admit, WhyCode::AccessDenied, detail));
+    }
     for (reason, count) in facts.dropped.iter().filter(|(_, count)| **count > 0) {
         let (step, code) = match reason {
             DropReason::RateLimit if none_passed => (StepKind::Admit, WhyCode::BudgetStarved),

@@ -154,14 +154,23 @@ pub struct TopicAccess {
 }
 
 impl TopicAccess {
+    /// Whether a rule gives that side at all; without one everybody may.
+    #[must_use]
+    pub fn limits(&self, kind: LeaseKind) -> bool {
+        self.rules(kind).is_some()
+    }
+
     /// Whether an origin may. A part of the origin that is not known is empty.
     #[must_use]
     pub fn allows(&self, kind: LeaseKind, layer: &str, node: &str, service: &str) -> bool {
-        let rules = match kind {
-            LeaseKind::Advertise => &self.advertise,
-            LeaseKind::Request => &self.request,
-        };
-        rules.as_ref().is_none_or(|rules| rules.allows(layer, node, service))
+        self.rules(kind).is_none_or(|rules| rules.allows(layer, node, service))
+    }
+
+    fn rules(&self, kind: LeaseKind) -> Option<&OriginRules> {
+        match kind {
+            LeaseKind::Advertise => self.advertise.as_deref(),
+            LeaseKind::Request => self.request.as_deref(),
+        }
     }
 }
 
@@ -220,6 +229,7 @@ mod tests {
         assert!(other.allows(LeaseKind::Advertise, "edge", "robot-1", "imu-driver"));
         let ruled = open.of(&"cmd_vel".parse().unwrap());
         assert!(ruled.allows(LeaseKind::Request, "cloud", "c", "anybody"));
+        assert!(ruled.limits(LeaseKind::Advertise) && !ruled.limits(LeaseKind::Request));
         assert!(ruled.allows(LeaseKind::Advertise, "edge", "robot-1", "joystick"));
         assert!(!ruled.allows(LeaseKind::Advertise, "edge", "robot-1", "planner"));
     }

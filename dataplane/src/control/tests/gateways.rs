@@ -1,7 +1,7 @@
 //! A flow that is to be on the inter scope and cannot, and what stays of services that are only not named any more.
 
 use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Advertise, Channel, Delta, Entry, Gateway, Hello, Kind, Source};
+use blaze_proto::link::link_control::{Advertise, Channel, Delta, Entry, Gateway, Hello, Kind, Request, Source};
 
 use super::balance::said_by;
 use super::*;
@@ -62,7 +62,6 @@ impl Bench {
 
     /// The same in a life of its flow.
     fn robot_announces_in(&mut self, epoch: u64, version: u64, services: &[&str], more_sources: bool) {
-        let robot: FlowId = "edge/robot-1".parse().unwrap();
         let source = |service: &&str| Source {
             node: "robot-1".into(),
             service: (*service).into(),
@@ -78,6 +77,16 @@ impl Bench {
             node_advertise: Some(advertise),
             ..Entry::default()
         };
+        self.robot_says_in(epoch, version, entry);
+    }
+
+    /// The flow of a robot announces something.
+    fn robot_says(&mut self, version: u64, entry: Entry) {
+        self.robot_says_in(1, version, entry);
+    }
+
+    fn robot_says_in(&mut self, epoch: u64, version: u64, entry: Entry) {
+        let robot: FlowId = "edge/robot-1".parse().unwrap();
         let (hello, delta) = (
             Box::new(Hello {
                 epoch,
@@ -152,6 +161,34 @@ fn a_flow_without_a_group_stays_on_the_inter_scope() {
     });
     bench.core.lost(bench.now);
     assert_eq!(bench.core.stage(), Stage::Gateway);
+}
+
+#[test]
+fn rules_hold_for_requests_of_other_flows_and_change_while_the_flow_runs() {
+    let mut bench = Bench::inside();
+    let request = Entry {
+        topic: TOPIC.into(),
+        node_request: Some(Request::default()),
+        ..Entry::default()
+    };
+    bench.robot_says(1, request);
+    bench.send(Scope::Node, &lease("advertise", TOPIC));
+    bench.step(300);
+    assert_eq!(bench.bridges(TOPIC).len(), 1);
+    let refuse_edge = access(&json!([{"match": TOPIC, "request": {"deny": ["edge"]}}]));
+    bench.core.set_access(bench.now, 0, refuse_edge);
+    bench.step(300);
+    assert_eq!(bench.bridges(TOPIC), [""; 0]);
+    let told = ("plan".to_owned(), "access_denied".to_owned());
+    assert_eq!(bench.routes(TOPIC), [told], "the robot's flow hears why");
+    assert_eq!(
+        bench.core.registry().lease_count(),
+        1,
+        "the publisher is none of theirs"
+    );
+    bench.core.set_access(bench.now, 0, AccessRules::default());
+    bench.step(300);
+    assert_eq!(bench.bridges(TOPIC).len(), 1);
 }
 
 #[test]

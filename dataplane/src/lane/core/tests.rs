@@ -367,6 +367,83 @@ fn messages_of_origins_that_may_not_publish_are_dropped() {
     assert_eq!(bench.link.submitted.len(), 1, "without rules everybody may");
 }
 
+/// What the rules of a node file say of the topic that do not let these publish it.
+fn refusing(origins: &[&str]) -> TopicInfo {
+    let file = serde_json::json!({
+        "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "robot-1"}, "brokers": {"node": {"memory": {}}},
+        "flow": {"access": [{"match": "imu/**", "advertise": {"deny": origins}}]},
+    });
+    let (file, _) = blaze_domain::node_file::NodeFile::read(&file).unwrap();
+    TopicInfo {
+        access: file.flow.access.of(&"imu/data".parse().unwrap()),
+        ..TopicInfo::default()
+    }
+}
+
+/// As it comes over the link, for late joiners too if `depth` is above 0.
+fn from_fog(sequence: u64, depth: u32) -> Frame {
+    let origin = Origin {
+        layer: "fog".into(),
+        node: "fog-1".into(),
+        ..Origin::default()
+    };
+    let header = Header {
+        depth,
+        ..Header::new("imu/data", origin, WriterId([3; 16]), sequence, WALL)
+    };
+    Frame::new(&header, Bytes::new()).unwrap().with_hops_and_age(1, 0)
+}
+
+#[test]
+fn what_the_rules_refuse_is_told_apart_by_scope_and_from_what_is_of_elsewhere() {
+    let bridges = || vec![bridge(Scope::Node, to_cloud()), bridge(Scope::Inter, Target::Layer)];
+    let mut bench = Bench::new(bridges());
+    bench.apply(bridges(), refusing(&["edge/robot-1/imu", "fog"]));
+    let (denied, foreign) = (frame(1, 1, "robot-1", 0, 1), frame(2, 1, "edge-2", 0, 1));
+    bench.take(Scope::Node, vec![Content::Frame(denied), Content::Frame(foreign)]);
+    for sequence in 1..=3 {
+        bench.core.deliver(bench.now, from_fog(sequence, 0), &mut bench.link);
+    }
+    assert_eq!(
+        bench.drops(),
+        [(DropReason::ForeignOrigin, 5)],
+        "the contract has one reason for both"
+    );
+    let lately = |bench: &Bench, from| {
+        let refused = bench.core.path(bench.topic).refused_lately(from);
+        (refused.denied, refused.foreign)
+    };
+    assert_eq!(lately(&bench, Scope::Node), (1, 1));
+    assert_eq!(lately(&bench, Scope::Inter), (3, 0));
+    assert_eq!(lately(&bench, Scope::Layer), (0, 0));
+    bench.core.mark();
+    bench.core.mark();
+    assert_eq!(lately(&bench, Scope::Inter), (0, 0), "that was long ago");
+}
+
+#[test]
+fn what_is_kept_of_origins_that_may_not_publish_any_more_goes_nowhere() {
+    for (info, copies) in [(TopicInfo::default(), 2), (refusing(&["fog"]), 1)] {
+        let durable = |to| Bridge {
+            lane: crate::plan::LaneSpec {
+                durable: true,
+                ..lane_spec()
+            },
+            ..bridge(Scope::Inter, to)
+        };
+        let mut bench = Bench::new(vec![durable(Target::Layer)]);
+        bench.core.deliver_waiting(bench.now, bench.topic, &mut bench.link);
+        bench.core.deliver(bench.now, from_fog(1, 1), &mut bench.link);
+        assert_eq!(bench.out.frames.lock().len(), 1);
+        bench.apply(
+            vec![durable(Target::Layer), durable(Target::Node { bare: false })],
+            info,
+        );
+        bench.core.deliver_waiting(bench.now, bench.topic, &mut bench.link);
+        assert_eq!(bench.out.frames.lock().len(), copies);
+    }
+}
+
 #[test]
 fn garbage_is_counted() {
     let mut bench = Bench::new(vec![bridge(Scope::Node, to_cloud())]);

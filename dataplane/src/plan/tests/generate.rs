@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::{FlowId, LayerKind};
 
 use crate::plan::Survey;
@@ -74,7 +75,11 @@ impl System {
             .chain(["ghost".to_owned()])
             .collect();
         let me = flows.keys().next().unwrap().clone();
-        let world = World { me, flows };
+        let world = World {
+            me,
+            flows,
+            access: AccessRules::default(),
+        };
         let mut system = Self { world, nodes };
         for id in system.ids() {
             system.reroll_flow(dice, &id);

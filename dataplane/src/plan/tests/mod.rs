@@ -1,5 +1,6 @@
 //! The planner against tables of its rules, and against a simulated system of random shape.
 
+mod access;
 mod balance;
 pub(crate) mod generate;
 mod property;

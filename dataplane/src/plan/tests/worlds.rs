@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use blaze_domain::node_file::AutoBool;
+use blaze_domain::node_file::{AccessRules, AutoBool, NodeFile};
 use blaze_domain::{Durability, FlowId, LayerKind, Reliability, TopicName};
+use serde_json::{Value, json};
 
 use crate::world::{
     Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, Role, ScopeEntry,
@@ -52,6 +53,17 @@ pub(crate) fn request() -> Request {
         framed: true,
         bare: false,
     }
+}
+
+/// The rules of a node file with this one for all topics: `{"request": {"deny": ["cloud"]}}`.
+pub(crate) fn rules(mut rule: Value) -> AccessRules {
+    rule["match"] = "**".into();
+    let file = json!({
+        "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "robot-1"}, "brokers": {"node": {"memory": {}}},
+        "flow": {"access": [rule]},
+    });
+    let (file, _) = NodeFile::read(&file).unwrap();
+    file.flow.access
 }
 
 /// A filter written `layer/node/service`, where `*` is any.
@@ -134,7 +146,11 @@ pub(crate) fn world(lines: &[&str]) -> World {
         me.get_or_insert_with(|| id(name));
         flows.insert(id(name), view);
     }
-    World { me: me.unwrap(), flows }
+    World {
+        me: me.unwrap(),
+        flows,
+        access: AccessRules::default(),
+    }
 }
 
 /// What a flow says of the topic on one scope.

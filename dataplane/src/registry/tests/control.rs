@@ -212,6 +212,55 @@ fn leases_are_bounded() {
     assert_eq!(registry.lease_count(), 3);
 }
 
+/// Why leases of a topic are missing, newest first.
+fn missing(registry: &Registry, name: &str) -> Vec<LapseReason> {
+    registry.lapsed(&topic(name)).map(|lease| lease.reason).collect()
+}
+
+#[test]
+fn what_is_refused_is_remembered_until_it_is_granted() {
+    let now = Instant::now();
+    let mut registry = Registry::new(RegistryConfig {
+        layer_names: LayerNames::Kafka { prefix_bytes: 50 },
+        ..config("edge/robot-1", 1, now)
+    });
+    let mut elsewhere = json!({"op": "request", "topic": "imu/data", "service": "a", "layer": "fog"});
+    send(&mut registry, now, Scope::Node, &elsewhere);
+    assert_eq!(missing(&registry, "imu/data"), [LapseReason::SourceMismatch]);
+    elsewhere["layer"] = json!("edge");
+    send(&mut registry, now, Scope::Node, &elsewhere);
+    assert_eq!(missing(&registry, "imu/data"), [], "it has said where it is");
+
+    let advertise = |topic: &str| json!({"op": "advertise", "topic": topic, "service": "a"});
+    let long = "t".repeat(200);
+    for (name, reason, fact) in [
+        ("imu_data", LapseReason::NameCollision, "imu/data"),
+        (long.as_str(), LapseReason::NameNotExpressible, "250 bytes"),
+    ] {
+        send(&mut registry, now, Scope::Layer, &advertise("imu/data"));
+        send(&mut registry, now, Scope::Layer, &advertise(name));
+        assert_eq!(missing(&registry, name), [reason]);
+        let refused = registry.lapsed(&topic(name)).next().cloned().unwrap();
+        assert!(refused.detail.contains(fact), "{refused:?}");
+    }
+}
+
+#[test]
+fn what_is_the_matter_now_comes_before_what_was() {
+    let start = Instant::now();
+    let mut registry = Registry::new(RegistryConfig {
+        max_leases: 1,
+        ..config("edge/robot-1", 1, start)
+    });
+    let advertise = |topic: &str, service: &str| json!({"op": "advertise", "topic": topic, "service": service});
+    send(&mut registry, start, Scope::Node, &advertise("imu", "old"));
+    let later = start + Duration::from_secs(15);
+    registry.expire(later);
+    send(&mut registry, later, Scope::Node, &advertise("odom", "other"));
+    send(&mut registry, later, Scope::Node, &advertise("imu", "new"));
+    assert_eq!(missing(&registry, "imu"), [LapseReason::TooMany, LapseReason::Expired]);
+}
+
 #[test]
 fn answers_go_only_to_those_who_ask() {
     let now = Instant::now();
