@@ -231,6 +231,7 @@ impl Consumer {
                 .map(|start| Partition {
                     next: *start,
                     bare_writer: None,
+                    ahead_since: None,
                 })
                 .collect(),
             readers: Vec::new(),

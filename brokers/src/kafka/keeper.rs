@@ -285,7 +285,7 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
         });
         match looked {
             Ok((info, marks)) if resume => consumer.resume(&topic, &info, &marks, || inner.gate.lets(false)),
-            Ok((info, marks)) if lost_position => consumer.check_positions(&topic, &info, &marks),
+            Ok((info, marks)) if lost_position => consumer.check_positions(Instant::now(), &topic, &info, &marks),
             Ok((info, marks)) => consumer.watch(&topic, &info, &marks),
             Err(error) => {
                 tracing::debug!(%topic, %error, "could not be looked at");

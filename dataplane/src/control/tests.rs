@@ -166,8 +166,8 @@ fn others_are_told_of_a_layer_broker_that_does_not_answer_for_seconds() {
         });
         away.collect::<Vec<_>>()
     };
-    assert_eq!(told(&mut bench, ScopeHealth::Away, 2000), []);
-    assert_eq!(told(&mut bench, ScopeHealth::Up, 2000), []);
+    assert!(told(&mut bench, ScopeHealth::Away, 2000).is_empty());
+    assert!(told(&mut bench, ScopeHealth::Up, 2000).is_empty());
     assert_eq!(told(&mut bench, ScopeHealth::Away, 2600), [true]);
     assert_eq!(told(&mut bench, ScopeHealth::Up, 0), [false]);
 }

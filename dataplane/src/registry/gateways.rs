@@ -163,7 +163,7 @@ impl Registry {
     }
 
     /// Whether a flow that was heard there is not any more, and says on the inter scope that it has another layer broker, or none.
-    pub(super) fn has_left_layer(&self, flow: &FlowId, says: Option<LayerScopeId>) -> bool {
+    pub(super) fn has_left_layer(&self, flow: &FlowId, says: Option<crate::world::LayerScopeId>) -> bool {
         let own = self.world.own().and_then(|own| own.layer_scope);
         let sign = self.remotes.get(flow).and_then(|remote| remote.ways.layer);
         sign.is_some_and(|sign| sign.over) && says != own
@@ -182,7 +182,9 @@ impl Registry {
     pub fn is_cut_off(&self) -> bool {
         let gateway = |flow: &FlowId| {
             let view = self.world.flows.get(flow);
-            view.is_some_and(|view| view.role.is_gateway() && view.reach == Reach::Up && view.state == FlowState::Ready)
+            view.is_some_and(|view| {
+                view.role.is_gateway() && view.reach == crate::world::Reach::Up && view.state == FlowState::Ready
+            })
         };
         self.link_peers() == 0
             && self

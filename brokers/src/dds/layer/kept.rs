@@ -163,7 +163,7 @@ mod tests {
         let periods = u32::try_from(LONGEST.as_millis() / 50).unwrap();
         for number in 0..=periods {
             let at = now + Duration::from_millis(50) * number;
-            let frame = received(at, u64::from(number), 0);
+            let frame = received(at, u64::from(number) + 1, 0);
             assert!(history.hold(at, [1; 16], frame, moment(0, 0, Clock::Unknown)).is_none());
             assert!(found.is_empty(), "{number}");
             found = sequences(history.quiet(at, |_| Clock::Unknown));

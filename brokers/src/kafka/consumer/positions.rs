@@ -1,10 +1,14 @@
 //! What the server says of a topic, against where the client reads it.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use super::{Consumer, State};
 use crate::kafka::directory::{Marks, TopicInfo};
+
+/// An end before what was read already is believed after this time: a server that stood still for a moment, and begins to lead the
+/// partition again, names an earlier one first. To believe it would be to read the last records twice.
+const BELIEVED: Duration = Duration::from_secs(3);
 
 impl Consumer {
     /// A topic has so many partitions: those that are new are read from their beginning.
@@ -23,7 +27,7 @@ impl Consumer {
     }
 
     /// Looks whether the positions of a topic are on the server, and moves those that are not to what is nearest.
-    pub(in crate::kafka) fn check_positions(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
+    pub(in crate::kafka) fn check_positions(&self, now: Instant, topic: &str, info: &TopicInfo, marks: &[Marks]) {
         let Some(client) = self.client.lock().clone() else {
             return;
         };
@@ -36,6 +40,12 @@ impl Consumer {
             return;
         }
         for (number, (partition, mark)) in topic.partitions.iter_mut().zip(marks).enumerate() {
+            if mark.high.max(mark.low) >= partition.next {
+                partition.ahead_since = None;
+            } else if now.saturating_duration_since(*partition.ahead_since.get_or_insert(now)) < BELIEVED {
+                self.look_again();
+                continue;
+            }
             let at = partition.next.clamp(mark.low, mark.high.max(mark.low));
             if at != partition.next {
                 tracing::warn!(

@@ -14,6 +14,7 @@ use rdkafka::mocking::MockCluster;
 use rdkafka::producer::{BaseProducer, BaseRecord, DefaultProducerContext, Producer as _};
 
 use super::*;
+use crate::kafka::directory::Marks;
 use crate::kafka::settings::tests::section_at;
 use crate::port::{Content, Place, SubscribeOptions, Subscription, subscription};
 
@@ -196,4 +197,26 @@ fn a_client_that_is_made_anew_reads_on_where_the_old_one_stood() {
     bench.client = bench.consumer.client.lock().clone().unwrap();
     bench.hand_out_until(&mut reader, 19);
     assert!(reader.take().iter().copied().eq(0..20), "{:?}", reader.got);
+}
+
+/// It stood still, leads its partitions again, and names the end that it knew long ago.
+#[test]
+fn an_end_before_what_was_read_is_not_believed_at_once() {
+    let bench = Bench::new(20);
+    let mut reader = bench.add(0, Join::Following);
+    bench.hand_out_until(&mut reader, 9);
+    let next = || bench.consumer.state.lock().topics[TOPIC].partitions[0].next;
+    let begun = Instant::now();
+    let check = |after_ms: u64, high: i64| {
+        let now = begun + Duration::from_millis(after_ms);
+        bench
+            .consumer
+            .check_positions(now, TOPIC, &INFO, &[Marks { low: 0, high }]);
+        (next(), bench.consumer.take_lost_position())
+    };
+    assert_eq!(check(0, 7), (10, true), "it is asked again");
+    assert_eq!(check(2_900, 7), (10, true));
+    assert_eq!(check(2_950, 20), (10, false));
+    assert_eq!(check(3_100, 7), (10, true), "that is another time");
+    assert_eq!(check(6_200, 7), (7, false), "it says so for long");
 }

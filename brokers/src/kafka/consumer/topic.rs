@@ -17,6 +17,8 @@ pub(super) struct Partition {
     pub(super) next: i64,
     /// Writer of its bare records, where the topic has an identity.
     pub(super) bare_writer: Option<WriterId>,
+    /// Since when the server has named an end before `next`.
+    pub(super) ahead_since: Option<Instant>,
 }
 
 pub(super) struct Reader {
@@ -147,6 +149,7 @@ impl TopicState {
             self.partitions.push(Partition {
                 next: 0,
                 bare_writer: self.uuid.as_ref().map(|uuid| uuid.bare_writer(layer, number)),
+                ahead_since: None,
             });
         }
     }
