@@ -206,12 +206,16 @@ fn an_end_before_what_was_read_is_not_believed_at_once() {
     let mut reader = bench.add(0, Join::Following);
     bench.hand_out_until(&mut reader, 9);
     let next = || bench.consumer.state.lock().topics[TOPIC].partitions[0].next;
+    let info = TopicInfo {
+        uuid: bench.consumer.state.lock().topics[TOPIC].uuid.clone(),
+        ..INFO
+    };
     let begun = Instant::now();
     let check = |after_ms: u64, high: i64| {
         let now = begun + Duration::from_millis(after_ms);
         bench
             .consumer
-            .check_positions(now, TOPIC, &INFO, &[Marks { low: 0, high }]);
+            .check_positions(now, TOPIC, &info, &[Marks { low: 0, high }]);
         (next(), bench.consumer.take_lost_position())
     };
     assert_eq!(check(0, 7), (10, true), "it is asked again");
