@@ -140,7 +140,7 @@ impl Channel {
         };
         let quiet = progress.history.quiet(Instant::now(), clock);
         drop(readers);
-        self.send_kept(quiet);
+        self.send_kept(&quiet);
         if again {
             self.note_samples();
         }
@@ -158,7 +158,7 @@ impl Channel {
     }
 
     /// Hands messages that were kept to all who subscribed.
-    pub(super) fn send_kept(&self, kept: Vec<Received>) {
+    pub(super) fn send_kept(&self, kept: &[Received]) {
         if kept.is_empty() {
             return;
         }

@@ -104,7 +104,7 @@ pub(super) fn deliver(
         _ => {
             // One that is written now tells how far an unknown clock is behind.
             let behind_ns = moment.map(|moment| moment.clock.behind_ns().unwrap_or(moment.lag_ns()));
-            channel.send_kept(progress.history.of_writer(writer, behind_ns));
+            channel.send_kept(&progress.history.of_writer(writer, behind_ns));
             channel.send(received);
         }
     }
