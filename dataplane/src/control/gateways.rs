@@ -292,12 +292,18 @@ impl ControlCore {
             }
             return;
         };
-        // It is there, but of no use.
-        self.gateways.cannot = self.gateways.cut_off.is_some();
-        if self.gateways.cannot {
+        // It is there, but of no use. Whoever has just come reaches nobody for a moment: a flow that was ready meanwhile would send
+        // over the layer broker first, and its messages would take two ways when it becomes a gateway.
+        let listened = now.saturating_duration_since(there);
+        let cut_off = self.gateways.cut_off.is_some();
+        let cannot = cut_off && (self.gateways.cannot || listened >= CUT_OFF);
+        if cannot != self.gateways.cannot {
+            self.gateways.cannot = cannot;
+            self.enter(now, self.gateways.stage);
+        }
+        if cut_off {
             return;
         }
-        let listened = now.saturating_duration_since(there);
         if listened >= LISTEN && (self.registry.knows_link() || listened >= LISTEN + KNOW_OTHERS) {
             self.enter(now, Stage::Gateway);
         }

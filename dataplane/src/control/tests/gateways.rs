@@ -341,3 +341,43 @@ fn a_gateway_that_alone_reaches_nobody_leaves_the_work_to_others() {
     pass(&mut bench, 10, 1);
     assert_eq!(bench.own(), (AutoBool::Yes, Role::Gateway));
 }
+
+/// It comes to the inter scope, where others that were there before it reach flows that it has not heard yet.
+#[test]
+fn whoever_comes_is_ready_when_it_is_a_gateway_and_not_before() {
+    let robot: FlowId = "edge/robot-1".parse().unwrap();
+    for heard in [true, false] {
+        let mut bench = alone();
+        for _ in 0..4 {
+            fog_2_reaches(&mut bench, 1);
+            bench.wait(500);
+        }
+        assert_eq!(bench.wishes(), [true]);
+        bench.core.joined(bench.now);
+        for _ in 0..8 {
+            assert_eq!(
+                (bench.core.state(), bench.own().1),
+                (FlowState::Starting, Role::Member),
+                "what it sends would take two ways"
+            );
+            fog_2_reaches(&mut bench, 1);
+            bench.wait(500);
+        }
+        if heard {
+            bench.robot_announces(1, &["mapper"], false);
+            bench
+                .core
+                .link_event(bench.now, LinkEvent::PeerRecovered { flow: robot.clone() });
+        }
+        for _ in 0..6 {
+            fog_2_reaches(&mut bench, 1);
+            bench.wait(500);
+        }
+        let expected = if heard {
+            (AutoBool::Auto, Role::Gateway)
+        } else {
+            (AutoBool::No, Role::Member)
+        };
+        assert_eq!((bench.core.state(), bench.own()), (FlowState::Ready, expected));
+    }
+}
