@@ -186,9 +186,9 @@ impl DataCore {
         self.note_sequence(topic, frame, DuplicateWindow::insert)
     }
 
-    /// The same of a message that came over the link. One that is older than the first of its writer was not meant for this flow, unless it
-    /// is kept for late joiners: it comes when another flow begins to carry the topic, a second back so that nothing is missed, and this
-    /// one has begun a moment ago. It would be written behind newer ones.
+    /// The same of a message that came over the link. One that is older than the newest of its writer comes too late, seen or not: it would
+    /// be written behind newer ones. That is so where another flow begins to carry the topic, a second back so that nothing is missed, and
+    /// sends what the one before it could not. It is not so of what is kept for late joiners.
     pub(super) fn is_new_here(&mut self, now: Instant, topic: TopicId, frame: &Frame) -> bool {
         if frame.depth() > 0 {
             // Its flow was away for so long that it counted as gone: those who join late would never get what it sends again.
@@ -197,7 +197,7 @@ impl DataCore {
             }
             return self.is_new(topic, frame);
         }
-        self.note_sequence(topic, frame, DuplicateWindow::insert_since_first)
+        self.note_sequence(topic, frame, DuplicateWindow::insert_newer)
     }
 
     fn note_sequence(&mut self, topic: TopicId, frame: &Frame, insert: fn(&mut DuplicateWindow, u64) -> bool) -> bool {

@@ -8,8 +8,6 @@ const WORDS: usize = 16;
 #[derive(Debug, Clone, Default)]
 pub struct DuplicateWindow {
     highest: u64,
-    /// The first that was noted.
-    first: u64,
     /// Bit `sequence % 1024`: seen.
     seen: [u64; WORDS],
 }
@@ -17,9 +15,6 @@ pub struct DuplicateWindow {
 impl DuplicateWindow {
     /// Notes a sequence. Returns whether it is new.
     pub fn insert(&mut self, sequence: u64) -> bool {
-        if self.highest == 0 {
-            self.first = sequence;
-        }
         if sequence > self.highest {
             self.advance(sequence);
         } else if self.highest - sequence >= WINDOW || self.has(sequence) {
@@ -30,9 +25,9 @@ impl DuplicateWindow {
         true
     }
 
-    /// As [`DuplicateWindow::insert`], but what is older than the first that was noted is not new.
-    pub fn insert_since_first(&mut self, sequence: u64) -> bool {
-        sequence >= self.first && self.insert(sequence)
+    /// As [`DuplicateWindow::insert`], but what is older than the newest that was noted is not new, seen or not.
+    pub fn insert_newer(&mut self, sequence: u64) -> bool {
+        sequence > self.highest && self.insert(sequence)
     }
 
     fn advance(&mut self, to: u64) {
@@ -81,20 +76,20 @@ mod tests {
     }
 
     #[test]
-    fn what_is_older_than_the_first_is_not_new() {
+    fn what_is_older_than_the_newest_is_not_newer() {
         let mut window = DuplicateWindow::default();
         for (sequence, new) in [
             (8, true),
             (9, true),
             (7, false),
             (11, true),
-            (10, true),
-            (8, false),
-            (5, false),
+            (10, false),
+            (11, false),
+            (12, true),
         ] {
-            assert_eq!(window.insert_since_first(sequence), new, "{sequence}");
+            assert_eq!(window.insert_newer(sequence), new, "{sequence}");
         }
-        assert!(window.insert(5));
+        assert!(window.insert(10) && !window.insert(12));
     }
 
     #[test]

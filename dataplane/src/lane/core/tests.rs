@@ -288,6 +288,12 @@ fn what_comes_over_the_link_behind_newer_messages_is_dropped() {
     let written: Vec<u64> = bench.out.frames.lock().iter().map(Frame::sequence).collect();
     assert_eq!(written, [8, 9, 10]);
     assert_eq!(bench.drops(), [(DropReason::Duplicate, 5)]);
+    // The first carrier could not send 11 to 13, and the next one begins with them.
+    for sequence in [14, 15, 11, 12, 13, 14, 15, 16] {
+        bench.core.deliver(bench.now, of_fog(sequence), &mut bench.link);
+    }
+    let written: Vec<u64> = bench.out.frames.lock().iter().map(Frame::sequence).collect();
+    assert_eq!(written, [8, 9, 10, 14, 15, 16]);
 }
 
 #[test]
