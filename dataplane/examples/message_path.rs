@@ -75,6 +75,7 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
         degraded: None,
         relays: Vec::new(),
         shared: None,
+        held: false,
     };
     let plan = TopicPlan {
         bridges: vec![Bridge {

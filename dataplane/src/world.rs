@@ -56,7 +56,8 @@ pub enum Role {
     /// It is: flows of other groups reach it.
     #[default]
     Gateway,
-    /// It has been since a moment: what it wrote to the layer scope before is still carried out for it.
+    /// It has been since a moment: what it wrote to the layer scope before is still carried out for it, and what it writes until it
+    /// sends itself.
     NewGateway,
     /// It is still, for what is on its way, but has said that it will not be. Of the own flow only.
     Leaving,

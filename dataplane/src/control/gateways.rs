@@ -34,6 +34,9 @@ const CANNOT: Duration = Duration::from_secs(15);
 const CUT_OFF: Duration = Duration::from_secs(5);
 /// Whoever leaves the inter scope has heard of the flows there from the gateways within this time.
 const HEARD_OF: Duration = Duration::from_secs(30);
+/// A flow that was of use before it became a gateway lets another one carry for it so long: well below [`GRACE`](crate::registry::GRACE), in which
+/// that one does, and above what messages need on their way over it.
+const ENTER: Duration = Duration::from_secs(1);
 /// One that leaves sends and takes what it did before for this long; its peers are told half way.
 const LEAVE: Duration = Duration::from_secs(2);
 
@@ -91,6 +94,8 @@ pub(super) struct Gateways {
     cannot: bool,
     /// Since when it has reached nobody there, though others do.
     cut_off: Option<Instant>,
+    /// Since when it is a gateway, while another flow still carries for it.
+    entered: Option<Instant>,
     /// What Hello on the inter scope says.
     shown: FlowState,
 }
@@ -118,12 +123,14 @@ impl Gateways {
             choice: None,
             cannot: false,
             cut_off: None,
+            entered: None,
             shown: FlowState::Starting,
         }
     }
 
     pub(super) fn role(&self) -> Role {
         match self.stage {
+            Stage::Gateway if self.entered.is_some() => Role::NewGateway,
             Stage::Gateway => Role::Gateway,
             Stage::Leaving { .. } => Role::Leaving,
             Stage::Listening | Stage::Joining { .. } | Stage::Closing | Stage::Member => Role::Member,
@@ -235,6 +242,10 @@ impl ControlCore {
         } else {
             None
         };
+        if self.gateways.entered.is_some_and(|at| now.saturating_duration_since(at) >= ENTER) {
+            self.gateways.entered = None;
+            self.enter(now, self.gateways.stage);
+        }
         match self.gateways.stage {
             Stage::Joining { since, there } => self.join(now, since, there),
             Stage::Gateway if self.is_cut_off(now) => {
@@ -305,6 +316,8 @@ impl ControlCore {
             return;
         }
         if listened >= LISTEN && (self.registry.knows_link() || listened >= LISTEN + KNOW_OTHERS) {
+            // One that has just started has sent nothing another way.
+            self.gateways.entered = (self.state == FlowState::Ready).then_some(now);
             self.enter(now, Stage::Gateway);
         }
     }
@@ -316,6 +329,9 @@ impl ControlCore {
         }
         self.gateways.stage = stage;
         self.gateways.choice = None;
+        if stage != Stage::Gateway {
+            self.gateways.entered = None;
+        }
         let setting = self.gateways.setting(&self.config);
         let changed = self.registry.set_role(setting, self.gateways.role());
         self.touch(now, changed);

@@ -113,6 +113,13 @@ impl DataCore {
             if begins {
                 self.hold_back(now, topic, at);
             }
+            let bridge = &mut self.topics[topic.0 as usize].bridges[at];
+            if begins && bridge.lane.held {
+                bridge.held.get_or_insert_default();
+            }
+            if bridge.held.is_some() {
+                self.draining.insert(topic);
+            }
         }
         self.pass_on(topic);
         self.stir();

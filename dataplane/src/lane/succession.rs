@@ -385,7 +385,8 @@ impl DataCore {
         let bridges = &mut self.topics[topic.0 as usize].bridges;
         let mut again = None;
         for at in 0..bridges.len() {
-            if bridges[at].held.is_none() || bridges.iter().any(|other| other.comes_before(&bridges[at])) {
+            let waits = bridges[at].lane.held && !bridges[at].is_draining() && !self.succession.leaving;
+            if waits || bridges[at].held.is_none() || bridges.iter().any(|other| other.comes_before(&bridges[at])) {
                 continue;
             }
             let bridge = &mut bridges[at];

@@ -53,6 +53,7 @@ impl LaneBuilder {
                 .then_some(WhyCode::QosMismatch),
             relays: Vec::new(),
             shared: None,
+            held: false,
         };
         self.cap(&mut lane);
         Some(lane)

@@ -166,6 +166,8 @@ pub struct LaneSpec {
     pub relays: Vec<FlowId>,
     /// To another group: the layer broker that its flows share, so that another of them could be the receiver as well; `None`: it is alone.
     pub shared: Option<LayerScopeId>,
+    /// What it takes is held for the moment: another flow carries the same, and what is on its way there is not to be overtaken.
+    pub held: bool,
 }
 
 impl LaneSpec {
@@ -303,7 +305,8 @@ impl Planner<'_, '_> {
         let over_layer = self
             .view
             .requesters_over_own_layer()
-            .chain(self.view.requesters_over_gateways());
+            .chain(self.view.requesters_over_gateways())
+            .chain(self.view.requesters_over_former_carrier());
         let lane = self.lanes.lane(self.view.pairs([publisher], over_layer));
         self.put(Scope::Node, Target::Layer, lane);
         self.send_to_other_groups(publisher, &[], previous);
@@ -374,6 +377,7 @@ impl Planner<'_, '_> {
                 .lane(self.view.pairs([publisher], requesters.iter().copied()))
                 .map(|lane| LaneSpec {
                     relays: relays.to_vec(),
+                    held: publisher.scope == Scope::Node && self.view.enters(),
                     shared: match group {
                         Group::Shared(_, broker) => Some(broker),
                         Group::Alone(_) => None,

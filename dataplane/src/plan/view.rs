@@ -265,14 +265,29 @@ impl<'w> TopicView<'w> {
             .filter(|requester| requester.scope == Scope::Inter)
     }
 
+    /// Whether this flow has been on the inter scope since a moment only: another one still carries for it.
+    pub(crate) fn enters(&self) -> bool {
+        self.role == Role::NewGateway
+    }
+
+    /// Requesters of other groups whom another flow still reaches for this one, if this one has been on the inter scope since a
+    /// moment only.
+    pub(crate) fn requesters_over_former_carrier(&self) -> impl Iterator<Item = &Requester<'w>> + Clone {
+        let enters = self.enters();
+        self.requesters
+            .iter()
+            .filter(move |requester| enters && requester.group != self.group)
+    }
+
     /// Publishers on nodes of flows that are not on the inter scope, or were not until a moment ago: what they write to the
-    /// layer scope is carried out of it.
+    /// layer scope is carried out of it. What this flow wrote there itself it does not carry.
     pub(crate) fn relayed_publishers(&self) -> impl Iterator<Item = &Publisher<'w>> {
         // Of a thousand publishers hardly any is of the own group, so that is asked first.
         let relayed = |publisher: &&Publisher<'w>| {
             let view = || self.world.flows.get(publisher.flow);
             publisher.scope == Scope::Node
                 && publisher.group == self.group
+                && !(publisher.flow == self.me && self.enters())
                 && view().is_some_and(|view| view.role != Role::Gateway)
         };
         self.publishers.iter().filter(relayed)

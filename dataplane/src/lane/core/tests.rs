@@ -95,6 +95,7 @@ fn lane_spec() -> crate::plan::LaneSpec {
         from: Vec::new(),
         degraded: None,
         relays: Vec::new(),
+        held: false,
         shared: Some(LayerScopeId::kafka("")),
     }
 }
