@@ -1,6 +1,7 @@
 //! Real processes of the product, their output, and their end.
 
-use std::io::{BufRead, BufReader, Read};
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Write as _};
 use std::path::PathBuf;
 use std::process::{Child, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -90,8 +91,9 @@ impl Process {
             .stdout(Stdio::piped())
             .stderr(Stdio::piped());
         let mut child = command.spawn().with_context(|| format!("starting {name}"))?;
-        let stdout = collect(child.stdout.take());
-        let stderr = collect(child.stderr.take());
+        let log = log_file(name, child.id())?;
+        let stdout = collect(child.stdout.take(), None);
+        let stderr = collect(child.stderr.take(), log);
         Ok(Self {
             child,
             namespace: namespace.map(str::to_owned),
@@ -237,12 +239,28 @@ impl Drop for Process {
     }
 }
 
-fn collect(pipe: Option<impl Read + Send + 'static>) -> Lines {
+/// Where all that a process says on stderr is written, besides what is kept: in the folder `BLAZE_TEST_LOGS`, if that is given. For runs that
+/// are too long to keep everything.
+fn log_file(name: &str, id: u32) -> anyhow::Result<Option<File>> {
+    let Some(folder) = std::env::var_os("BLAZE_TEST_LOGS") else {
+        return Ok(None);
+    };
+    std::fs::create_dir_all(&folder)?;
+    let path = PathBuf::from(folder).join(format!("{name}-{id}.log"));
+    let file = File::create(&path).with_context(|| format!("making {}", path.display()))?;
+    Ok(Some(file))
+}
+
+fn collect(pipe: Option<impl Read + Send + 'static>, mut log: Option<File>) -> Lines {
     let lines = Lines::default();
     let Some(pipe) = pipe else { return lines };
     let kept = Arc::clone(&lines);
     std::thread::spawn(move || {
         for line in BufReader::new(pipe).lines().map_while(Result::ok) {
+            if let Some(log) = &mut log {
+                // A full disk is no fault of the process.
+                let _ = writeln!(log, "{line}");
+            }
             let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
             if kept.len() >= MAX_LINES {
                 kept.drain(..MAX_LINES / 2);

@@ -16,6 +16,7 @@ mod tools;
 
 use std::fmt;
 use std::sync::Arc;
+use std::time::Duration;
 
 use async_trait::async_trait;
 use blaze_domain::names::ChannelName;
@@ -49,6 +50,9 @@ pub struct Capabilities {
     pub keeps_while_away: bool,
     /// A publisher finds its readers only some time after it was made (DDS).
     pub finds_readers_late: bool,
+    /// What was published so short a time before a subscription may count as published after it, because clocks of several hosts are
+    /// compared (DDS).
+    pub clocks_apart: Duration,
     /// Most bytes of messages that one publisher's queue holds while the server is away.
     pub queue_bytes: usize,
     /// How many channels at once to try.
@@ -67,6 +71,7 @@ impl Default for Capabilities {
             outage: true,
             keeps_while_away: false,
             finds_readers_late: false,
+            clocks_apart: Duration::ZERO,
             queue_bytes: 64 * 1024 * 1024,
             channels: 500,
             largest_payload: 8_000_000,

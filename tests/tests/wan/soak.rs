@@ -111,6 +111,8 @@ fn a_mixed_load_with_random_faults() -> anyhow::Result<()> {
     for (at, fault) in &scenario.faults {
         println!("  {:>7.1} s {fault:?}", at.as_secs_f64());
     }
+    let begun = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH)?;
+    println!("begun at {} s since 1970", begun.as_secs());
     let report = run(&scenario).with_context(|| format!("seed {seed}, {seconds} s"))?;
     println!("{report}");
     for route in &report.routes {

@@ -61,6 +61,7 @@ impl Fixture for Domain {
             // There is no server that could go away.
             outage: false,
             finds_readers_late: true,
+            clocks_apart: Duration::from_millis(30),
             queue_bytes: MAX_QUEUE_BYTES,
             channels: 100,
             ..Capabilities::default()
