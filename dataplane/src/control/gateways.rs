@@ -242,7 +242,11 @@ impl ControlCore {
         } else {
             None
         };
-        if self.gateways.entered.is_some_and(|at| now.saturating_duration_since(at) >= ENTER) {
+        if self
+            .gateways
+            .entered
+            .is_some_and(|at| now.saturating_duration_since(at) >= ENTER)
+        {
             self.gateways.entered = None;
             self.enter(now, self.gateways.stage);
         }

@@ -17,6 +17,8 @@ struct Heard {
     sent: usize,
     lost: usize,
     twice: usize,
+    /// Came behind a later one of its writer.
+    late: usize,
 }
 
 impl World {
@@ -59,6 +61,24 @@ impl World {
         counts
     }
 
+    /// How many messages came to a channel behind a later one of their writers.
+    fn late_on_channel(&self, index: usize, topic: &str) -> usize {
+        let mut newest: BTreeMap<WriterId, u64> = BTreeMap::new();
+        let log = self.redis.log.lock();
+        let records = log.get(&channel(index, Scope::Node, topic)).into_iter().flatten();
+        let mut late = 0;
+        for record in records {
+            if let Content::Frame(frame) = &record.content
+                && frame.hops() > 0
+            {
+                let newest = newest.entry(frame.writer()).or_default();
+                late += usize::from(frame.sequence() < *newest);
+                *newest = frame.sequence().max(*newest);
+            }
+        }
+        late
+    }
+
     /// What became of everything that was published on nodes of the flows that live.
     fn heard(&self) -> Heard {
         let mut heard = Heard::default();
@@ -70,6 +90,10 @@ impl World {
         let at_robot = self.on_channel(0, STATUS);
         let living: Vec<usize> = self.stages().into_keys().collect();
         let at_nodes: Vec<_> = living.iter().map(|index| self.on_channel(*index, TELEOP)).collect();
+        heard.late = self.late_on_channel(0, STATUS);
+        for index in &living {
+            heard.late += self.late_on_channel(*index, TELEOP);
+        }
         for (index, sequence) in &self.said {
             let key = (node_writer(*index), *sequence);
             if *index == 0 {
@@ -96,7 +120,8 @@ impl World {
             Heard {
                 sent: 2 * 50 * flows,
                 lost: 0,
-                twice: 0
+                twice: 0,
+                late: 0
             },
             "{what}"
         );
@@ -198,7 +223,11 @@ fn who_becomes_a_member_or_a_gateway_misses_nothing_meanwhile() {
             world.stages()
         );
         let heard = world.heard();
-        assert_eq!((heard.lost, heard.twice), (0, 0), "seed {seed}, leaving: {heard:?}");
+        assert_eq!(
+            (heard.lost, heard.twice, heard.late),
+            (0, 0, 0),
+            "seed {seed}, leaving: {heard:?}"
+        );
         let members: BTreeSet<usize> = world
             .stages()
             .into_keys()
@@ -216,7 +245,11 @@ fn who_becomes_a_member_or_a_gateway_misses_nothing_meanwhile() {
         world.run_for(Duration::from_secs(2));
         assert_eq!(world.gateways().len(), 15, "seed {seed}: {:?}", world.stages());
         let heard = world.heard();
-        assert_eq!((heard.lost, heard.twice), (0, 0), "seed {seed}, joining: {heard:?}");
+        assert_eq!(
+            (heard.lost, heard.twice, heard.late),
+            (0, 0, 0),
+            "seed {seed}, joining: {heard:?}"
+        );
         assert!(heard.sent > 50_000, "{heard:?}");
     }
 }
