@@ -172,6 +172,7 @@ pub async fn late_joiners_get_what_is_kept(fixture: &dyn Fixture) -> Outcome {
             witness.next_frame("a message of a writer that keeps three").await?;
         }
     }
+    // Time itself is what tells the one from the other here.
     tokio::time::sleep(fixture.capabilities().clocks_apart).await;
     let with_kept = SubscribeOptions {
         with_kept: true,

@@ -34,7 +34,7 @@ const CANNOT: Duration = Duration::from_secs(15);
 const CUT_OFF: Duration = Duration::from_secs(5);
 /// Whoever leaves the inter scope has heard of the flows there from the gateways within this time.
 const HEARD_OF: Duration = Duration::from_secs(30);
-/// A flow that was of use before it became a gateway lets another one carry for it so long: well below [`GRACE`](crate::registry::GRACE), in which
+/// A flow that was of use before it became a gateway lets another one carry for it so long: well below the two seconds in which
 /// that one does, and above what messages need on their way over it.
 const ENTER: Duration = Duration::from_secs(1);
 /// One that leaves sends and takes what it did before for this long; its peers are told half way.
