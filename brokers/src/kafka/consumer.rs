@@ -17,11 +17,11 @@ mod topic;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use blaze_domain::names::ChannelName;
 use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
-use parking_lot::Mutex;
+use parking_lot::{Mutex, MutexGuard};
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
 use tokio_util::sync::CancellationToken;
 
@@ -35,6 +35,10 @@ use topic::{Partition, TopicState};
 
 /// How long the thread may sleep: closing waits for that.
 const POLL: Duration = Duration::from_millis(100);
+
+/// How long a client that was replaced is waited for until nobody uses it any more, and how often that is looked at.
+const LEAVE: Duration = Duration::from_secs(2);
+const LEAVE_TURN: Duration = Duration::from_millis(5);
 
 /// How long a reader waits to learn of its topic.
 const LEARN: Duration = Duration::from_secs(1);
@@ -151,6 +155,14 @@ impl Consumer {
         made.map(Arc::new).map_err(|error| error.to_string())
     }
 
+    /// What is read, and the client that reads it: both at once, because another client may come at any moment, and what is asked of
+    /// the one before it is never read. `None` when it was closed.
+    fn reading(&self) -> Option<(MutexGuard<'_, State>, Arc<Client>)> {
+        let state = self.state.lock();
+        let client = self.client.lock().clone()?;
+        Some((state, client))
+    }
+
     /// Whether the client gets an answer of the server. Waits for it.
     pub(super) fn is_answered(&self, topic: &str, timeout: Duration) -> bool {
         let client = self.client.lock().clone();
@@ -176,6 +188,12 @@ impl Consumer {
             moved.insert(Arc::clone(name));
         }
         drop(state);
+        // The thread that reads is with the old one for a moment yet. If it were the last to leave it, it would read nothing while that
+        // one ends.
+        let until = Instant::now() + LEAVE;
+        while Arc::strong_count(&old) > 1 && Instant::now() < until {
+            std::thread::sleep(LEAVE_TURN);
+        }
         drop(old);
         Ok(())
     }
@@ -189,11 +207,10 @@ impl Consumer {
         sender: SubscriptionSender,
         join: Join<'_>,
     ) -> Result<(), Refused> {
-        let Some(client) = self.client.lock().clone() else {
+        self.learn(&source.topic);
+        let Some((mut state, client)) = self.reading() else {
             return Err(Refused::Closed);
         };
-        self.learn(&client, &source.topic);
-        let mut state = self.state.lock();
         let State {
             topics, moved, closed, ..
         } = &mut *state;
@@ -284,10 +301,13 @@ impl Consumer {
     }
 
     /// Lets the client ask for a topic that is new to it: by itself it does so once a second.
-    fn learn(&self, client: &Client, topic: &str) {
+    fn learn(&self, topic: &str) {
         if self.state.lock().topics.contains_key(topic) {
             return;
         }
+        let Some(client) = self.client.lock().clone() else {
+            return;
+        };
         // Without an answer it asks again by itself.
         if let Err(error) = client.fetch_metadata(Some(topic), LEARN) {
             tracing::debug!(topic, %error, "the reader has not learnt of its topic");
@@ -316,10 +336,9 @@ impl Consumer {
 
     /// Forgets readers that have gone, and topics without any.
     pub(super) fn sweep(&self) {
-        let Some(client) = self.client.lock().clone() else {
+        let Some((mut state, client)) = self.reading() else {
             return;
         };
-        let mut state = self.state.lock();
         let mut empty = Vec::new();
         for (name, topic) in &mut state.topics {
             topic.readers.retain(|reader| !reader.sender.is_closed());
@@ -334,10 +353,9 @@ impl Consumer {
 
     /// Stops reading, but for what stays open.
     pub(super) fn stand_back(&self) {
-        let Some(client) = self.client.lock().clone() else {
+        let Some((mut state, client)) = self.reading() else {
             return;
         };
-        let mut state = self.state.lock();
         for topic in state.topics.values_mut().filter(|topic| !topic.source.stays_open) {
             topic.unassign(&client);
         }
@@ -346,10 +364,9 @@ impl Consumer {
     /// Reads a topic again, from its end: what was written meanwhile was another's.
     /// `lets` is asked under the lock that [`Consumer::stand_back`] takes: who stands back meanwhile reads nothing.
     pub(super) fn resume(&self, topic: &str, info: &TopicInfo, marks: &[Marks], lets: impl FnOnce() -> bool) {
-        let Some(client) = self.client.lock().clone() else {
+        let Some((mut state, client)) = self.reading() else {
             return;
         };
-        let mut state = self.state.lock();
         if !lets() {
             return;
         }

@@ -87,6 +87,8 @@ impl Watch {
         self.admin = Silence::default();
         self.consumers.clear();
         self.producers.clear();
+        // Who is forsaken is so since the server has come back: they are looked at as soon as it answers.
+        self.looked = None;
     }
 
     /// Looks whether the clients that read and write get answers, which the server has just given.

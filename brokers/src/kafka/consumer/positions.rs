@@ -13,10 +13,9 @@ const BELIEVED: Duration = Duration::from_secs(3);
 impl Consumer {
     /// A topic has so many partitions: those that are new are read from their beginning.
     pub(in crate::kafka) fn note_partitions(&self, topic: &str, partitions: usize) {
-        let Some(client) = self.client.lock().clone() else {
+        let Some((mut state, client)) = self.reading() else {
             return;
         };
-        let mut state = self.state.lock();
         let Some(topic) = state.topics.get_mut(topic) else {
             return;
         };
@@ -28,10 +27,9 @@ impl Consumer {
 
     /// Looks whether the positions of a topic are on the server, and moves those that are not to what is nearest.
     pub(in crate::kafka) fn check_positions(&self, now: Instant, topic: &str, info: &TopicInfo, marks: &[Marks]) {
-        let Some(client) = self.client.lock().clone() else {
+        let Some((mut state, client)) = self.reading() else {
             return;
         };
-        let mut state = self.state.lock();
         let State { topics, moved, .. } = &mut *state;
         let Some(topic) = topics.get_mut(topic) else {
             return;
@@ -64,10 +62,9 @@ impl Consumer {
 
     /// Looks whether a topic is read although records wait.
     pub(in crate::kafka) fn watch(&self, topic: &str, info: &TopicInfo, marks: &[Marks]) {
-        let Some(client) = self.client.lock().clone() else {
+        let Some((mut state, client)) = self.reading() else {
             return;
         };
-        let mut state = self.state.lock();
         if let Some(topic) = state.topics.get_mut(topic)
             && topic.assigned
             && topic.uuid == info.uuid

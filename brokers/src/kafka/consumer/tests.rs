@@ -98,7 +98,7 @@ impl Bench {
         while Instant::now() < until {
             match self.client.poll(POLL) {
                 Some(Ok(message)) => return message,
-                other => self.consumer.hand_out(&self.client, other),
+                other => self.consumer.hand_out(other),
             }
         }
         panic!("nothing came");
@@ -108,7 +108,7 @@ impl Bench {
     fn hand_out_until(&self, reader: &mut Offsets, last: i64) {
         while reader.take().last() != Some(&last) {
             let message = self.poll();
-            self.consumer.hand_out(&self.client, Some(Ok(message)));
+            self.consumer.hand_out(Some(Ok(message)));
         }
     }
 }
@@ -121,7 +121,7 @@ fn a_record_that_waited_while_a_reader_came_does_not_hide_what_is_read_again() {
     let waiting = bench.poll();
     assert_eq!(waiting.offset(), 3);
     let mut second = bench.add(0, Join::Rewinding);
-    bench.consumer.hand_out(&bench.client, Some(Ok(waiting)));
+    bench.consumer.hand_out(Some(Ok(waiting)));
     bench.hand_out_until(&mut second, 5);
     assert_eq!(second.take(), [0, 1, 2, 3, 4, 5]);
     assert_eq!(first.take(), [0, 1, 2, 3, 4, 5]);
@@ -135,7 +135,7 @@ fn a_record_that_was_polled_after_a_reader_came_is_not_lost() {
     let mut second = bench.add(1, Join::Rewinding);
     let fresh = bench.poll();
     assert_eq!(fresh.offset(), 1, "the client reads from there already");
-    bench.consumer.hand_out(&bench.client, Some(Ok(fresh)));
+    bench.consumer.hand_out(Some(Ok(fresh)));
     bench.hand_out_until(&mut second, 5);
     assert_eq!(second.take(), [1, 2, 3, 4, 5]);
     assert_eq!(first.take(), [0, 1, 2, 3, 4, 5]);
@@ -169,7 +169,7 @@ fn readers_that_come_while_records_flow_get_each_once_and_in_order() {
         bench.hand_out_until(&mut readers[0], at);
         let waiting = bench.poll();
         readers.push(bench.add(at / 2, Join::Rewinding));
-        bench.consumer.hand_out(&bench.client, Some(Ok(waiting)));
+        bench.consumer.hand_out(Some(Ok(waiting)));
     }
     for (reader, start) in readers.iter_mut().zip([0, 3, 9, 15]) {
         bench.hand_out_until(reader, 39);
@@ -223,4 +223,32 @@ fn an_end_before_what_was_read_is_not_believed_at_once() {
     assert_eq!(check(2_950, 20), (10, false));
     assert_eq!(check(3_100, 7), (10, true), "that is another time");
     assert_eq!(check(6_200, 7), (7, false), "it says so for long");
+}
+
+#[test]
+fn a_reader_that_comes_while_the_client_is_made_anew_reads_with_the_new_one() {
+    let mut bench = Bench::new(10);
+    let (sender, subscription) = subscription(SubscribeOptions::default());
+    let mut reader = Offsets {
+        subscription,
+        got: Vec::new(),
+    };
+    let settings = Settings::new(&section_at(&bench.server.bootstrap_servers(), "{}")).unwrap();
+    // It waits for an answer about its topic meanwhile.
+    bench.server.broker_down(1).unwrap();
+    std::thread::scope(|scope| {
+        let add = scope.spawn(|| {
+            let join = Join::Following;
+            bench.consumer.add(&bench.source, &INFO, vec![0], sender, join)
+        });
+        while Arc::strong_count(&bench.client) < 3 && !add.is_finished() {
+            std::thread::yield_now();
+        }
+        bench.consumer.remake(&settings).unwrap();
+        bench.server.broker_up(1).unwrap();
+        add.join().unwrap().unwrap();
+    });
+    bench.client = bench.consumer.client.lock().clone().unwrap();
+    bench.hand_out_until(&mut reader, 9);
+    assert!(reader.take().iter().copied().eq(0..10), "{:?}", reader.got);
 }

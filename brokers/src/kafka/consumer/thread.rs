@@ -19,16 +19,19 @@ impl Consumer {
                 break;
             };
             let next = client.poll(POLL);
-            self.hand_out(&client, next);
+            self.hand_out(next);
         }
         self.close();
         let client = self.client.lock().take();
         drop(client);
     }
 
-    /// Hands out what was polled.
-    pub(super) fn hand_out(&self, client: &Client, next: Option<KafkaResult<BorrowedMessage<'_>>>) {
-        let mut state = self.state.lock();
+    /// Hands out what was polled, be it of a client that was replaced meanwhile.
+    pub(super) fn hand_out(&self, next: Option<KafkaResult<BorrowedMessage<'_>>>) {
+        let Some((mut state, client)) = self.reading() else {
+            return;
+        };
+        let client = &*client;
         let reset = self.follow_identities(&mut state, client);
         let moved = std::mem::take(&mut state.moved);
         match next {

@@ -90,7 +90,9 @@ fn what_is_waited_while_nobody_is_answered_does_not_count() {
     assert!(!watch.producers.entry(lot).or_default().note(start, false));
     assert!(!watch.consumers.entry(false).or_default().note(start, false));
     assert!(!watch.admin.note(start, false));
+    watch.looked = Some(start);
     watch.nobody_is_answered();
+    assert_eq!(watch.looked, None, "they are looked at with the next answer");
     let back = start + FORSAKEN;
     assert!(!watch.producers.entry(lot).or_default().note(back, false));
     assert!(!watch.consumers.entry(false).or_default().note(back, false));
