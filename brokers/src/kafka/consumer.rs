@@ -248,11 +248,12 @@ impl Consumer {
                 .map(|start| Partition {
                     next: *start,
                     bare_writer: None,
-                    ahead_since: None,
+                    doubted_since: None,
                 })
                 .collect(),
             readers: Vec::new(),
             assigned: false,
+            stood_back: false,
             awaited: false,
             behind: None,
         };
@@ -283,6 +284,7 @@ impl Consumer {
                 partitions: Vec::new(),
                 readers: Vec::new(),
                 assigned: false,
+                stood_back: false,
                 awaited: true,
                 behind: None,
             });
@@ -358,10 +360,12 @@ impl Consumer {
         };
         for topic in state.topics.values_mut().filter(|topic| !topic.source.stays_open) {
             topic.unassign(&client);
+            topic.stood_back = true;
         }
     }
 
-    /// Reads a topic again, from its end: what was written meanwhile was another's.
+    /// Reads a topic again. One that this flow stood back from is read from its end, because what was written meanwhile was another's;
+    /// one that the client did not take when it was to be read on, from where it stood.
     /// `lets` is asked under the lock that [`Consumer::stand_back`] takes: who stands back meanwhile reads nothing.
     pub(super) fn resume(&self, topic: &str, info: &TopicInfo, marks: &[Marks], lets: impl FnOnce() -> bool) {
         let Some((mut state, client)) = self.reading() else {
@@ -384,13 +388,13 @@ impl Consumer {
         }
         topic.identify(info.uuid.clone(), &self.layer);
         topic.grow(info.partitions, &self.layer);
-        for (number, mark) in marks.iter().enumerate() {
-            if let Some(partition) = topic.partitions.get_mut(number) {
+        if std::mem::take(&mut topic.stood_back) {
+            for (partition, mark) in topic.partitions.iter_mut().zip(marks) {
                 partition.next = mark.high;
             }
-        }
-        for reader in &mut topic.readers {
-            reader.starts = marks.iter().map(|mark| mark.high).collect();
+            for reader in &mut topic.readers {
+                reader.starts = marks.iter().map(|mark| mark.high).collect();
+            }
         }
         if let Err(error) = topic.assign(&client) {
             tracing::debug!(topic = %topic.source.topic, %error, "could not be read again yet");

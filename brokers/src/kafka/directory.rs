@@ -37,6 +37,13 @@ pub(super) struct Marks {
     pub(super) high: i64,
 }
 
+impl Marks {
+    /// Whether a reader that is to read this record next can do so.
+    pub(super) fn holds(&self, next: i64) -> bool {
+        (self.low..=self.high.max(self.low)).contains(&next)
+    }
+}
+
 /// Why there is no answer about a topic.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(super) enum LookupError {

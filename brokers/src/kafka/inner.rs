@@ -33,6 +33,10 @@ use crate::port::{Begin, BrokerError, BrokerStatus, Health, Received, SubscribeO
 const MAX_CHANNELS: usize = 10_000;
 /// How long subscribing may take.
 const SUBSCRIBE: Duration = Duration::from_secs(5);
+/// How often a server is asked again that names ends which do not hold where a reader was told to begin …
+const DOUBTS: usize = 10;
+/// … after this time.
+const DOUBT: Duration = Duration::from_millis(200);
 /// How long reading what is kept for late joiners may take.
 const SUBSCRIBE_KEPT: Duration = Duration::from_secs(15);
 
@@ -255,7 +259,7 @@ impl Inner {
             }
             Err(error) => return Err(error.into()),
         };
-        let marks = self.directory.marks(&source.topic, info.partitions, deadline)?;
+        let marks = self.marks(&source.topic, info.partitions, begin, deadline)?;
         let mut ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
         let (sender, subscription) = subscription(options);
         if !options.with_kept {
@@ -289,6 +293,30 @@ impl Inner {
                 Err(Refused::Behind(next)) => ends = next,
                 Err(error) => return Err(refused(&error)),
             }
+        }
+    }
+
+    /// Where a topic begins and ends. If that does not hold where a reader was told to begin, it is asked again for a while: a server that
+    /// stood still for a moment names other ends first, and whoever believes them leaves out what the reader is there for.
+    fn marks(
+        &self,
+        topic: &str,
+        partitions: usize,
+        begin: &Begin,
+        deadline: Instant,
+    ) -> Result<Vec<Marks>, LookupError> {
+        let mut doubts = DOUBTS;
+        loop {
+            let marks = self.directory.marks(topic, partitions, deadline)?;
+            let holds = match begin {
+                Begin::At(offsets) => marks.iter().zip(&**offsets).all(|(mark, offset)| mark.holds(*offset)),
+                Begin::Now | Begin::Since { .. } => true,
+            };
+            if holds || doubts == 0 || self.is_closed() {
+                return Ok(marks);
+            }
+            doubts -= 1;
+            std::thread::sleep(DOUBT);
         }
     }
 

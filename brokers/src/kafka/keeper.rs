@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use super::consumer::Consumer;
-use super::directory::Listing;
+use super::directory::{Listing, LookupError};
 use super::flow_side::Made;
 use super::inner::Inner;
 use super::settings::Lot;
@@ -293,6 +293,10 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
                 tracing::debug!(%topic, %error, "could not be looked at");
                 if lost_position {
                     consumer.look_again();
+                }
+                if matches!(error, LookupError::Away(_)) && Instant::now() >= deadline {
+                    // It would be so with the others: whether the server is there at all is what is to be found out next.
+                    return;
                 }
             }
         }

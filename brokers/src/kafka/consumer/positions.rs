@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use super::{Consumer, State};
 use crate::kafka::directory::{Marks, TopicInfo};
 
-/// An end before what was read already is believed after this time: a server that stood still for a moment, and begins to lead the
-/// partition again, names an earlier one first. To believe it would be to read the last records twice.
+/// A beginning or an end that does not hold what is to be read next is believed after this time: a server that stood still for a moment,
+/// and begins to lead the partition again, names others first. To believe them would be to read the last records twice, or never.
 const BELIEVED: Duration = Duration::from_secs(3);
 
 impl Consumer {
@@ -38,9 +38,9 @@ impl Consumer {
             return;
         }
         for (number, (partition, mark)) in topic.partitions.iter_mut().zip(marks).enumerate() {
-            if mark.high.max(mark.low) >= partition.next {
-                partition.ahead_since = None;
-            } else if now.saturating_duration_since(*partition.ahead_since.get_or_insert(now)) < BELIEVED {
+            if mark.holds(partition.next) {
+                partition.doubted_since = None;
+            } else if now.saturating_duration_since(*partition.doubted_since.get_or_insert(now)) < BELIEVED {
                 self.look_again();
                 continue;
             }

@@ -225,6 +225,56 @@ fn an_end_before_what_was_read_is_not_believed_at_once() {
     assert_eq!(check(6_200, 7), (7, false), "it says so for long");
 }
 
+/// The same of its beginning: seen once, with a log that nothing had been taken from.
+#[test]
+fn a_beginning_behind_what_was_read_is_not_believed_at_once() {
+    let bench = Bench::new(20);
+    let mut reader = bench.add(0, Join::Following);
+    bench.hand_out_until(&mut reader, 9);
+    let next = || bench.consumer.state.lock().topics[TOPIC].partitions[0].next;
+    let info = TopicInfo {
+        uuid: bench.consumer.state.lock().topics[TOPIC].uuid.clone(),
+        ..INFO
+    };
+    let begun = Instant::now();
+    let check = |after_ms: u64, low: i64| {
+        let now = begun + Duration::from_millis(after_ms);
+        let marks = [Marks { low, high: 20 }];
+        bench.consumer.check_positions(now, TOPIC, &info, &marks);
+        (next(), bench.consumer.take_lost_position())
+    };
+    assert_eq!(check(0, 20), (10, true), "it is asked again");
+    assert_eq!(check(500, 0), (10, false));
+    assert_eq!(check(1_000, 12), (10, true));
+    assert_eq!(check(4_100, 12), (12, false), "it says so for long");
+}
+
+#[test]
+fn a_topic_that_the_client_did_not_take_is_read_on_where_it_stood() {
+    let bench = Bench::new(20);
+    let mut reader = bench.add(0, Join::Following);
+    bench.hand_out_until(&mut reader, 9);
+    let marks = [Marks { low: 0, high: 20 }];
+    let resume = || {
+        let info = TopicInfo {
+            uuid: bench.consumer.state.lock().topics[TOPIC].uuid.clone(),
+            ..INFO
+        };
+        bench.consumer.resume(TOPIC, &info, &marks, || true);
+    };
+    // As after an attempt that failed.
+    if let Some(topic) = bench.consumer.state.lock().topics.get_mut(TOPIC) {
+        topic.unassign(&bench.client);
+    }
+    resume();
+    bench.hand_out_until(&mut reader, 14);
+    assert!(reader.take().iter().copied().eq(0..15), "{:?}", reader.got);
+    bench.consumer.stand_back();
+    resume();
+    let next = bench.consumer.state.lock().topics[TOPIC].partitions[0].next;
+    assert_eq!(next, 20, "what was written meanwhile was another's");
+}
+
 #[test]
 fn a_reader_that_comes_while_the_client_is_made_anew_reads_with_the_new_one() {
     let mut bench = Bench::new(10);

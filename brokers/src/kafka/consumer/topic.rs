@@ -17,8 +17,8 @@ pub(super) struct Partition {
     pub(super) next: i64,
     /// Writer of its bare records, where the topic has an identity.
     pub(super) bare_writer: Option<WriterId>,
-    /// Since when the server has named an end before `next`.
-    pub(super) ahead_since: Option<Instant>,
+    /// Since when the server has named a beginning or an end that does not hold `next`.
+    pub(super) doubted_since: Option<Instant>,
 }
 
 pub(super) struct Reader {
@@ -34,6 +34,8 @@ pub(super) struct TopicState {
     pub(super) readers: Vec<Reader>,
     /// Whether the client reads it now.
     pub(super) assigned: bool,
+    /// It belongs to another flow: what is written meanwhile is not for its readers.
+    pub(super) stood_back: bool,
     /// It was not there when its readers came: whatever it will hold came after them, so it is read from its beginning.
     pub(super) awaited: bool,
     /// It was behind the server's end when it was last looked at.
@@ -149,7 +151,7 @@ impl TopicState {
             self.partitions.push(Partition {
                 next: 0,
                 bare_writer: self.uuid.as_ref().map(|uuid| uuid.bare_writer(layer, number)),
-                ahead_since: None,
+                doubted_since: None,
             });
         }
     }
