@@ -206,6 +206,15 @@ pub struct TopicEntry {
     pub outside: ScopeEntry,
 }
 
+impl TopicEntry {
+    /// Whether anybody asks for it.
+    pub(crate) fn is_requested(&self) -> bool {
+        [&self.node, &self.layer, &self.outside]
+            .iter()
+            .any(|scope| scope.request.is_some())
+    }
+}
+
 /// What the services of one scope advertise and request of one topic.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ScopeEntry {

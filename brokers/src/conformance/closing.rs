@@ -28,7 +28,12 @@ pub async fn close_delivers_and_ends(fixture: &dyn Fixture) -> Outcome {
         let found = other
             .next_frame("a message that was taken before the client was closed")
             .await
-            .map_err(|error| format!("message {sequence} of {MESSAGES}: {error}; later: {:?}", publisher.later()))?
+            .map_err(|error| {
+                format!(
+                    "message {sequence} of {MESSAGES}: {error}; later: {:?}",
+                    publisher.later()
+                )
+            })?
             .sequence();
         if found != sequence {
             return Err(format!("message {sequence} was expected, but it was {found}"));

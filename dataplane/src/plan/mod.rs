@@ -235,6 +235,10 @@ pub fn plan_within(
     previous: Option<&TopicPlan>,
 ) -> TopicPlan {
     let world = survey.world;
+    // Of what a fleet publishes most is asked for by nobody.
+    if !survey.may_be_requested(topic) {
+        return TopicPlan::default();
+    }
     let Some(view) = TopicView::within(survey, topic) else {
         return TopicPlan::default();
     };

@@ -77,7 +77,15 @@ impl<'w> Survey<'w> {
         holders.map(|holder| (holder.id, holder.flow)).collect()
     }
 
-    /// The same, with what they announced.
+    /// Whether anybody asks for a topic. Where that is not known without looking at every flow, it may be.
+    pub(super) fn may_be_requested(&self, topic: &TopicName) -> bool {
+        let requested = |holder: &Holder<'_>| holder.entry.is_some_and(TopicEntry::is_requested);
+        self.by_topic
+            .as_ref()
+            .is_none_or(|by_topic| by_topic.get(topic).is_some_and(|holders| holders.iter().any(requested)))
+    }
+
+    /// The same as [`Survey::holders`], with what they announced.
     pub(super) fn find(&self, topic: &TopicName) -> Vec<Holder<'w>> {
         let holder = |(id, flow): (&'w FlowId, &'w FlowView)| {
             let entry = flow.topics.get(topic);

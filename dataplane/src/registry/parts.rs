@@ -17,7 +17,7 @@ use super::Registry;
 use super::announce::MAX_ENTRIES;
 use super::remote::Remote;
 use super::wire::MAX_ROUTES;
-use crate::world::{Carrying, Handover, Hold, Part, Reach};
+use crate::world::{Carrying, Handover, Hold, Part, Reach, TopicEntry};
 
 /// A route state with this step says that the flow carries the topic out of its layer.
 const CARRY: &str = "carry";
@@ -211,8 +211,8 @@ impl Registry {
                     Carrying::No => self.take_up_lost(now, flow, &topic),
                 }
                 self.urgent.insert(topic.clone());
-            } else if !shares && !self.is_asked_outside(&topic) {
-                // What is left behind is for those who asked all the while.
+            } else if !shares && self.legacies.contains_key(&topic) && !self.is_asked_outside(&topic) {
+                // What is left behind is for those who asked all the while. Few topics are, and looking for them takes all flows.
                 self.legacies.remove(&topic);
             }
             self.put_part(flow, &topic, part);
@@ -237,14 +237,7 @@ impl Registry {
     fn is_asked_outside(&self, topic: &TopicName) -> bool {
         let others = self.world.flows.iter().filter(|(flow, _)| **flow != self.config.me);
         let mut outside = others.filter(|(flow, view)| view.reach != Reach::Down && !self.shares_layer(flow));
-        outside.any(|(_, view)| {
-            let entry = view.topics.get(topic);
-            entry.is_some_and(|entry| {
-                [&entry.node, &entry.layer, &entry.outside]
-                    .iter()
-                    .any(|scope| scope.request.is_some())
-            })
-        })
+        outside.any(|(_, view)| view.topics.get(topic).is_some_and(TopicEntry::is_requested))
     }
 
     fn put_part(&mut self, flow: &FlowId, topic: &TopicName, part: Part) {

@@ -8,7 +8,7 @@ use blaze_domain::FlowId;
 use super::generate::{Dice, System};
 use super::simulate::{Intake, Simulation, is_live};
 use super::worlds::topic;
-use crate::plan::{PlanRules, Target, TopicPlan, plan_topic};
+use crate::plan::{PlanRules, Survey, Target, TopicPlan, plan_topic, plan_within};
 
 type Plans = BTreeMap<FlowId, TopicPlan>;
 
@@ -22,14 +22,15 @@ fn worlds() -> u64 {
     }
 }
 
-/// Plans of all flows that live, in the view that all share.
+/// Plans of all flows that live, in the view that all share. A plan of many topics is the same.
 fn plans(system: &System, previous: &Plans) -> Plans {
+    let rules = PlanRules::default();
     let live = system.world.flows.iter().filter(|(_, view)| is_live(view));
     live.map(|(id, _)| {
-        (
-            id.clone(),
-            plan_topic(&system.known_to(id), &topic(), &PlanRules::default(), previous.get(id)),
-        )
+        let (world, topic, previous) = (system.known_to(id), topic(), previous.get(id));
+        let plan = plan_topic(&world, &topic, &rules, previous);
+        assert_eq!(plan_within(&Survey::of_all(&world), &topic, &rules, previous), plan);
+        (id.clone(), plan)
     })
     .collect()
 }
