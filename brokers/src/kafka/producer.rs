@@ -10,6 +10,8 @@
 
 mod delivery;
 mod ready;
+#[cfg(test)]
+mod tests;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -74,6 +76,8 @@ pub(super) struct Producer {
     client: Mutex<Option<Arc<Client>>>,
     context: Arc<WriteContext>,
     gate: Arc<Gate>,
+    /// Messages are between the outbox and the client.
+    handing_over: AtomicBool,
 }
 
 impl Producer {
@@ -87,7 +91,27 @@ impl Producer {
         supervisor: &Supervisor,
         stop: &CancellationToken,
     ) -> Result<Arc<Self>, String> {
-        let producer = Arc::new(Self {
+        let producer = Arc::new(Self::new(lot, settings, gate, clock, last_error)?);
+        let poller = {
+            let (producer, stop) = (Arc::clone(&producer), stop.clone());
+            move || producer.poll(&stop)
+        };
+        supervisor
+            .spawn_thread(lot.as_str(), TaskPolicy::MayEnd, poller)
+            .map_err(|error| error.to_string())?;
+        let (feeder, stop) = (Arc::clone(&producer), stop.clone());
+        supervisor.spawn(lot.as_str(), TaskPolicy::MayEnd, async move { feeder.feed(stop).await });
+        Ok(producer)
+    }
+
+    fn new(
+        lot: Lot,
+        settings: &Settings,
+        gate: &Arc<Gate>,
+        clock: &Arc<Mutex<BrokerClock>>,
+        last_error: &Arc<LastError>,
+    ) -> Result<Self, String> {
+        let producer = Self {
             lot,
             settings: settings.clone(),
             outbox: Outbox::new(LIMITS),
@@ -102,17 +126,9 @@ impl Producer {
                 last_error: Arc::clone(last_error),
             }),
             gate: Arc::clone(gate),
-        });
-        *producer.client.lock() = Some(producer.make_client().map_err(|error| error.to_string())?);
-        let poller = {
-            let (producer, stop) = (Arc::clone(&producer), stop.clone());
-            move || producer.poll(&stop)
+            handing_over: AtomicBool::new(false),
         };
-        supervisor
-            .spawn_thread(lot.as_str(), TaskPolicy::MayEnd, poller)
-            .map_err(|error| error.to_string())?;
-        let (feeder, stop) = (Arc::clone(&producer), stop.clone());
-        supervisor.spawn(lot.as_str(), TaskPolicy::MayEnd, async move { feeder.feed(stop).await });
+        *producer.client.lock() = Some(producer.make_client().map_err(|error| error.to_string())?);
         Ok(producer)
     }
 
@@ -180,9 +196,11 @@ impl Producer {
         self.context.bell.ring();
     }
 
-    /// Whether everything that was taken has been settled.
+    /// Whether everything that was taken has been settled. Looked for in the order in which messages go.
     pub(super) fn is_drained(&self) -> bool {
-        self.outbox.is_empty() && self.context.in_flight.load(Ordering::Acquire) == 0
+        self.outbox.is_empty()
+            && !self.handing_over.load(Ordering::Acquire)
+            && self.context.in_flight.load(Ordering::Acquire) == 0
     }
 
     async fn feed(&self, stop: CancellationToken) {
@@ -206,6 +224,13 @@ impl Producer {
 
     /// Hands over as much as there is room for.
     fn hand_over(&self, taken: &mut Vec<Waiting<Target>>, scratch: &mut String) {
+        // Before anything leaves the outbox, so that nothing is overlooked that is not in flight yet.
+        self.handing_over.store(true, Ordering::Release);
+        self.hand_over_what_fits(taken, scratch);
+        self.handing_over.store(false, Ordering::Release);
+    }
+
+    fn hand_over_what_fits(&self, taken: &mut Vec<Waiting<Target>>, scratch: &mut String) {
         while self.gate.is_open() {
             let in_flight = self.context.in_flight.load(Ordering::Acquire);
             if in_flight >= CROWD {

@@ -1,0 +1,52 @@
+//! Without a server: nothing that is handed over is ever acknowledged.
+
+use super::*;
+use crate::kafka::settings::tests::section_at;
+use crate::kafka::topics::Topics;
+use crate::outbox::Body;
+use crate::port::PublishOutcome;
+
+/// Closing ends a client that is drained, with what is on its way from the outbox to it.
+#[test]
+fn what_is_being_handed_over_is_not_drained() {
+    const MESSAGES: u64 = 200;
+    for _ in 0..20 {
+        let settings = Settings::new(&section_at("127.0.0.1:9", "{}")).unwrap();
+        let gate = Arc::<Gate>::default();
+        gate.set_up(true);
+        let clock = Arc::new(Mutex::new(BrokerClock::new(Instant::now())));
+        let producer = Producer::new(Lot::default(), &settings, &gate, &clock, &Arc::default()).unwrap();
+        let topics = Topics::default();
+        let name: Arc<str> = "fog.imu.data".into();
+        let (topic, _) = topics.of(&name, false);
+        topics.note(&name, 1);
+        let lane = producer.lane(Target {
+            topic,
+            keying: Keying::Writer { depth: 0 },
+        });
+        assert!(producer.is_drained());
+        for _ in 0..MESSAGES {
+            let body = Body::Bare(Bytes::from_static(b"bare"));
+            assert_eq!(lane.push(body, None), PublishOutcome::Taken);
+        }
+        let (looks, over) = (AtomicBool::new(false), AtomicBool::new(false));
+        let drained = std::thread::scope(|scope| {
+            let watch = scope.spawn(|| {
+                let mut drained = producer.is_drained();
+                looks.store(true, Ordering::Release);
+                while !over.load(Ordering::Acquire) {
+                    drained |= producer.is_drained();
+                }
+                drained
+            });
+            while !looks.load(Ordering::Acquire) {
+                std::hint::spin_loop();
+            }
+            producer.hand_over(&mut Vec::new(), &mut String::new());
+            over.store(true, Ordering::Release);
+            watch.join().unwrap()
+        });
+        assert!(!drained, "nothing was acknowledged");
+        assert_eq!(lane.later().queued, MESSAGES);
+    }
+}
