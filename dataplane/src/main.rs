@@ -20,7 +20,7 @@ use blaze_runtime::{logs, ready_line, say, state};
 use clap::Parser;
 
 /// A shutdown takes at most this long.
-const SHUTDOWN: Duration = Duration::from_secs(8);
+const SHUTDOWN: Duration = Duration::from_secs(5);
 
 /// BlazeFlow: connects whoever publishes a topic with whoever asks for it, on any broker, on any layer.
 #[derive(Parser)]

@@ -67,7 +67,7 @@ use topics::Topics;
 /// How long closing waits for what was taken while the server is known not to answer.
 const DRAIN: Duration = Duration::from_secs(1);
 /// How long while it answers: a leader that is elected, or a busy server, may take more than a second for its acknowledgement.
-const DRAIN_ANSWERED: Duration = Duration::from_secs(5);
+const DRAIN_ANSWERED: Duration = Duration::from_secs(3);
 /// How long closing waits for threads and tasks beyond that.
 const END: Duration = Duration::from_secs(3);
 /// How often closing looks whether all was taken.
