@@ -202,7 +202,10 @@ impl ControlCore {
             // The one that was to get it is gone or cannot have it, or nobody asks for the topic any more.
             self.balance.note_taken_back(now, &gift.topic);
         }
-        self.hold_heavy(&loads.carried);
+        // While the layer broker is away nothing comes, which says nothing of what a topic weighs.
+        if self.scopes.health(Scope::Layer) == ScopeHealth::Up {
+            self.hold_heavy(&loads.carried);
+        }
         self.give(now, &loads.carried);
     }
 

@@ -72,7 +72,14 @@ impl ControlCore {
         };
         let me = &self.config.me;
         let for_me = channel.to.is_empty() || channel.to == me.to_string();
-        if !for_me || from == *me || from.layer != me.layer {
+        if from == *me {
+            // Not of an earlier life, which may still be on its way.
+            if channel.began == self.replicas.began && matches!(body, Body::Hello(_)) {
+                self.registry.on_own_hello(now, appended_ms);
+            }
+            return false;
+        }
+        if !for_me || from.layer != me.layer {
             return false;
         }
         let changed = match body {
@@ -195,6 +202,7 @@ impl ControlCore {
             }),
             ingress_bytes_per_s: Some(load.in_bytes_per_s),
             link_peers: self.registry.link_peers(),
+            heard_ms: self.registry.heard_ms(),
             ..Hello::default()
         }
     }

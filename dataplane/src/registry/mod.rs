@@ -50,6 +50,7 @@ pub use pieces::MAX_LINK_CONTROL_BYTES;
 #[cfg(test)]
 pub(crate) use pieces::entry_hash;
 use remote::Remote;
+use replicas::Hearing;
 pub use replicas::SILENT;
 pub use stored::{Restored, UnsavedLease};
 pub use types::{AnswerOut, Changes, ControlOutcome, EventDraft, RegistryConfig, RemoteLease, SyncFaults};
@@ -87,6 +88,8 @@ pub struct Registry {
     /// This flow is a gateway and, when it was last looked at, spoke for flows of its group.
     speaks_for_others: bool,
     remotes: BTreeMap<FlowId, Remote>,
+    /// What this flow hears of itself on the layer broker.
+    hearing: Option<Hearing>,
     /// Flows whose last life is over, and until when they may come back with the services that they had.
     departed: BTreeMap<FlowId, Instant>,
     world: World,
@@ -134,6 +137,7 @@ impl Registry {
             announcer: Announcer::default(),
             layer_announcer: Announcer::default(),
             said_parts: BTreeMap::new(),
+            hearing: None,
             speaks_for_others: false,
             remotes: BTreeMap::new(),
             departed: BTreeMap::new(),

@@ -223,7 +223,7 @@ impl Registry {
     /// flow reaches: that one has lost its way to them. What it sent since is lost.
     fn take_up_lost(&mut self, now: Instant, flow: &FlowId, topic: &TopicName) {
         let carried = self.carrying(flow, topic) == Some(&Carrying::Carries);
-        let sign = self.remotes.get(flow).and_then(Remote::last_sign_ms);
+        let sign = self.remotes.get(flow).and_then(Remote::last_read_ms);
         if let Some(last_ms) = sign.filter(|_| carried && self.is_asked_outside(topic)) {
             let since = Begin::Since {
                 appended_ms: last_ms.saturating_sub(BEFORE_LOST_WAY_MS),
@@ -258,7 +258,7 @@ impl Registry {
         };
         let carried = view.parts.iter().filter(|(_, part)| part.carrying == Carrying::Carries);
         let topics: Vec<TopicName> = carried.map(|(topic, _)| topic.clone()).collect();
-        let sign = self.remotes.get(flow).and_then(Remote::last_sign_ms);
+        let sign = self.remotes.get(flow).and_then(Remote::last_read_ms);
         for topic in topics {
             if let Some(last_ms) = sign {
                 let since = Begin::Since {

@@ -125,9 +125,9 @@ impl Remote {
         (self.version, self.digest) == self.heard && !self.doubt
     }
 
-    /// When the layer broker took the last sign of life, by the server's clock.
-    pub(super) fn last_sign_ms(&self) -> Option<i64> {
-        self.ways.layer?.appended_ms
+    /// Until when it had read what is published on the layer broker, as its last sign of life says, by the server's clock.
+    pub(super) fn last_read_ms(&self) -> Option<i64> {
+        self.ways.layer?.read_ms
     }
 
     pub(super) fn is_pulling(&self) -> bool {

@@ -17,6 +17,10 @@ use crate::world::{FlowState, Reach, SETTLED_AFTER};
 
 /// A flow that was not heard on the layer broker for this long is gone.
 pub const SILENT: Duration = Duration::from_millis(2500);
+/// A flow that does not hear its own Hellos for this long, two of them, hears nobody.
+const DEAF: Duration = Duration::from_millis(1200);
+/// Who stood still for longer before it went silent is taken up from so much before its last sign of life at most, in milliseconds.
+const LONGEST_DEAF_MS: i64 = 30_000;
 /// One that is heard nowhere is forgotten after this long.
 const FORGET: Duration = Duration::from_secs(60);
 
@@ -24,8 +28,8 @@ const FORGET: Duration = Duration::from_secs(60);
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sign {
     pub(super) at: Instant,
-    /// When the server took it, by its own clock.
-    pub(super) appended_ms: Option<i64>,
+    /// Until when it had read what is published on the server, by that one's clock; its own Hello, where it does not say so.
+    pub(super) read_ms: Option<i64>,
     /// It is too old, or was the last on purpose.
     pub(super) over: bool,
     /// What the flow carries, as it says.
@@ -60,7 +64,55 @@ impl Ways {
     }
 }
 
+/// Until when the sender of a Hello has read what is published, given when the server took it and what it says itself. It may stand still
+/// although what it writes gets through.
+fn read_until(appended_ms: i64, heard_ms: i64) -> i64 {
+    if heard_ms > 0 {
+        heard_ms.clamp(appended_ms.saturating_sub(LONGEST_DEAF_MS), appended_ms)
+    } else {
+        appended_ms
+    }
+}
+
+/// Whether this flow hears what is said on the layer broker: it hears itself there.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Hearing {
+    /// Without a pause since then.
+    since: Instant,
+    last: Instant,
+    appended_ms: Option<i64>,
+}
+
+impl Hearing {
+    /// For how long nothing has been heard of a flow that should have been.
+    fn silence(hearing: Option<&Self>, now: Instant, sign: &Sign) -> Duration {
+        let heard_since = match hearing {
+            Some(hearing) if now.saturating_duration_since(hearing.last) >= DEAF => now,
+            Some(hearing) => hearing.since.max(sign.at),
+            // Not every broker gives back what one says.
+            None => sign.at,
+        };
+        now.saturating_duration_since(heard_since)
+    }
+}
+
 impl Registry {
+    /// The own Hello came back; the server took it at `appended_ms` of its clock.
+    pub fn on_own_hello(&mut self, now: Instant, appended_ms: Option<i64>) {
+        let before = self.hearing.filter(|hearing| now.saturating_duration_since(hearing.last) < DEAF);
+        self.hearing = Some(Hearing {
+            since: before.map_or(now, |hearing| hearing.since),
+            last: now,
+            appended_ms,
+        });
+    }
+
+    /// Until when this flow has read what is published on the layer broker, by the server's clock in milliseconds; 0 = not known.
+    #[must_use]
+    pub fn heard_ms(&self) -> i64 {
+        self.hearing.and_then(|hearing| hearing.appended_ms).unwrap_or(0)
+    }
+
     /// A flow that shares the layer broker said Hello there, and the life that its process `began` with; the server took that at
     /// `appended_ms` of its clock. Returns the topics to plan anew.
     pub fn on_layer_hello(
@@ -85,7 +137,7 @@ impl Registry {
             remote.began = Some(began);
             remote.ways.layer = Some(Sign {
                 at: now,
-                appended_ms,
+                read_ms: appended_ms.map(|appended| read_until(appended, hello.heard_ms)),
                 over: false,
                 load: Load::said(hello),
             });
@@ -128,7 +180,8 @@ impl Registry {
         for (flow, remote) in &mut self.remotes {
             let Some(sign) = &mut remote.ways.layer else { continue };
             let since = now.saturating_duration_since(sign.at);
-            if !sign.over && since >= SILENT {
+            // Who hears nothing believes no silence.
+            if !sign.over && Hearing::silence(self.hearing.as_ref(), now, sign) >= SILENT {
                 sign.over = true;
                 silent.push(flow.clone());
             } else if sign.over && since >= FORGET && !remote.ways.over_link() {

@@ -174,6 +174,10 @@ pub(crate) struct Flow {
     pub(crate) leaves: Option<Instant>,
     /// When it was last measured what it carries.
     pub(crate) measured: Instant,
+    /// Its reader of Kafka stands still.
+    pub(crate) deaf: bool,
+    /// What it says to other replicas gets lost.
+    pub(crate) mute: bool,
 }
 
 /// A topic of the cloud that the robot asks for.

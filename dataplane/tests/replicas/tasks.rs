@@ -24,7 +24,11 @@ impl World {
     pub(crate) fn read(&mut self, index: usize) {
         let (now, wall) = (self.now, self.wall());
         let topics: Vec<(TopicName, Scope)> = self.flows[index].reads.keys().cloned().collect();
+        let deaf = self.flows[index].deaf;
         for (topic, scope) in topics {
+            if deaf && scope == Scope::Layer {
+                continue;
+            }
             let server = if scope == Scope::Layer {
                 &self.kafka
             } else {
@@ -60,7 +64,7 @@ impl World {
             drop(log);
             flow.plane.ingest(now, wall, id, scope, &mut batch);
         }
-        if index == 0 {
+        if index == 0 || deaf {
             return;
         }
         let visible = self.kafka.readable(now) - self.kafka_delay;
@@ -132,6 +136,9 @@ impl World {
             return;
         }
         if let Output::Replicas { body, .. } = output {
+            if self.flows[index].mute {
+                return;
+            }
             let content = Content::Bare {
                 payload: body,
                 identity: None,

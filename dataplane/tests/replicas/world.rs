@@ -207,6 +207,8 @@ impl World {
             was_inside: inside,
             leaves: None,
             measured: self.now,
+            deaf: false,
+            mute: false,
         }
     }
 
@@ -294,6 +296,13 @@ impl World {
             _ => None,
         });
         receivers.min()
+    }
+
+    /// The replica that carries what the robot asks for.
+    pub(crate) fn carrier_down(&self) -> Option<usize> {
+        let topic: TopicName = DOWN.parse().unwrap();
+        let carries = |flow: &Flow| flow.control.plans().get(&topic).is_some_and(TopicPlan::carries_out);
+        self.flows.iter().position(carries)
     }
 
     /// Kafka stands still for so long.

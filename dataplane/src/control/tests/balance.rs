@@ -359,3 +359,23 @@ fn what_came_by_load_stays_a_minute_whatever_the_loads_are() {
     assert!(pair.run_until_given_up(10_000).is_some());
     assert_eq!(pair.bench.core.emptying(), [topic("t0")]);
 }
+
+#[test]
+fn what_weighs_something_stays_after_an_outage_of_its_broker() {
+    let mut pair = Pair::new(None, [300, 200, 100]);
+    pair.run(7_000);
+    let health = |pair: &mut Pair, health| {
+        let now = pair.bench.now;
+        pair.bench.core.set_scope_health(now, Scope::Layer, health);
+    };
+    health(&mut pair, ScopeHealth::Away);
+    pair.weights = [0; 3];
+    pair.run(4_000);
+    health(&mut pair, ScopeHealth::Up);
+    // What was measured last may still be of the outage.
+    pair.run(300);
+    pair.weights = [300, 200, 100];
+    pair.run(7_000);
+    assert_eq!(pair.bench.core.moves().settled, 0);
+    assert_eq!(pair.carried(), TOPICS);
+}

@@ -404,3 +404,48 @@ fn what_a_flow_carried_that_has_lost_its_way_out_begins_a_while_back() {
         "whoever asks anew gets what is published from now on"
     );
 }
+
+#[test]
+fn who_hears_nothing_believes_no_silence() {
+    let mut pair = Pair::new(0);
+    pair.run(1000 * MS);
+    let mut now = pair.now;
+    let b = &mut pair.flows[1];
+    b.on_own_hello(now, Some(0));
+    let reach = |b: &Registry| b.world().flows[&id("cloud/a")].reach;
+    // The own Hellos stay away, too.
+    b.watch_flows(now + 2 * SILENT);
+    assert_eq!(reach(b), Reach::Up);
+    now += 2 * SILENT;
+    // They are back, and the other's have as long as ever to follow.
+    for after in 0..5 {
+        b.on_own_hello(now + 500 * MS * after, Some(0));
+        b.watch_flows(now + 500 * MS * after);
+        assert_eq!(reach(b), Reach::Up, "{after}");
+    }
+    b.watch_flows(now + SILENT);
+    assert_eq!(reach(b), Reach::Down);
+}
+
+#[test]
+fn what_a_flow_had_not_read_before_it_fell_silent_is_taken_up() {
+    let mut pair = Pair::new(0);
+    pair.carries(0, &Carrying::Carries);
+    pair.run(8000 * MS);
+    let a = id("cloud/a");
+    let (now, ms) = (pair.now, pair.server_ms());
+    for (heard_ms, begins) in [(0, ms), (ms - 6000, ms - 6000), (ms + 5, ms), (ms - 90_000, ms - 30_000)] {
+        let said = Hello {
+            heard_ms,
+            ..hello(&pair.flows[0])
+        };
+        let b = &mut pair.flows[1];
+        b.on_layer_hello(now, &a, &said, said.epoch, Some(ms));
+        b.watch_flows(now + SILENT);
+        let since = Begin::Since {
+            appended_ms: begins - 1000,
+            latest: [].into(),
+        };
+        assert_eq!(b.begin_carrying(now + SILENT, &topic("t"), true), since, "{heard_ms}");
+    }
+}
