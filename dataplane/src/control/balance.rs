@@ -21,6 +21,8 @@ const PERSIST: Duration = Duration::from_secs(3);
 const TURN: Duration = Duration::from_secs(3);
 /// A move that has not begun after this long is not to be.
 const BEGIN_WITHIN: Duration = Duration::from_secs(1);
+/// While the layer broker is away nothing comes, which says nothing of what a topic weighs; nor does the mean for so long after.
+const UNWEIGHED: Duration = Duration::from_secs(10);
 /// A topic that weighs less is placed by hashing, as one that is idle.
 const LIGHT: u64 = MIN_GAP;
 
@@ -91,6 +93,8 @@ pub(super) struct Balance {
     uneven: Option<Instant>,
     /// Nothing is moved before.
     pause: Option<Instant>,
+    /// What topics weigh is not looked at before.
+    weighed_from: Option<Instant>,
     moves: Moves,
 }
 
@@ -202,8 +206,10 @@ impl ControlCore {
             // The one that was to get it is gone or cannot have it, or nobody asks for the topic any more.
             self.balance.note_taken_back(now, &gift.topic);
         }
-        // While the layer broker is away nothing comes, which says nothing of what a topic weighs.
-        if self.scopes.health(Scope::Layer) == ScopeHealth::Up {
+        if self.scopes.health(Scope::Layer) != ScopeHealth::Up {
+            self.balance.weighed_from = Some(now + UNWEIGHED);
+        }
+        if self.balance.weighed_from.is_none_or(|from| from <= now) {
             self.hold_heavy(&loads.carried);
         }
         self.give(now, &loads.carried);

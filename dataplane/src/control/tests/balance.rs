@@ -372,10 +372,10 @@ fn what_weighs_something_stays_after_an_outage_of_its_broker() {
     pair.weights = [0; 3];
     pair.run(4_000);
     health(&mut pair, ScopeHealth::Up);
-    // What was measured last may still be of the outage.
-    pair.run(300);
+    // The mean is still low.
+    pair.run(4_000);
     pair.weights = [300, 200, 100];
-    pair.run(7_000);
+    pair.run(10_000);
     assert_eq!(pair.bench.core.moves().settled, 0);
     assert_eq!(pair.carried(), TOPICS);
 }
