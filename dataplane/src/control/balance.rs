@@ -206,7 +206,7 @@ impl ControlCore {
             // The one that was to get it is gone or cannot have it, or nobody asks for the topic any more.
             self.balance.note_taken_back(now, &gift.topic);
         }
-        if self.scopes.health(Scope::Layer) != ScopeHealth::Up {
+        if self.state == FlowState::Ready && self.scopes.health(Scope::Layer) != ScopeHealth::Up {
             self.balance.weighed_from = Some(now + UNWEIGHED);
         }
         if self.balance.weighed_from.is_none_or(|from| from <= now) {
