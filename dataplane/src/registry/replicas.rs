@@ -99,7 +99,9 @@ impl Hearing {
 impl Registry {
     /// The own Hello came back; the server took it at `appended_ms` of its clock.
     pub fn on_own_hello(&mut self, now: Instant, appended_ms: Option<i64>) {
-        let before = self.hearing.filter(|hearing| now.saturating_duration_since(hearing.last) < DEAF);
+        let before = self
+            .hearing
+            .filter(|hearing| now.saturating_duration_since(hearing.last) < DEAF);
         self.hearing = Some(Hearing {
             since: before.map_or(now, |hearing| hearing.since),
             last: now,
