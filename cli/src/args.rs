@@ -9,6 +9,7 @@ use clap::{Args, Parser, Subcommand};
 use crate::demo::options::DemoOptions;
 use crate::local::{EchoOptions, HzOptions, PublishOptions};
 use crate::output::Format;
+use crate::plan::PlanOptions;
 
 /// Joins robots, fog and cloud: see what flows, and why something does not.
 #[derive(Debug, Parser)]
@@ -39,6 +40,8 @@ pub enum Command {
     Peers(FlowTarget),
     /// Why a topic does or does not arrive; exits with 0 if it flows
     Why(WhyOptions),
+    /// The rate that each topic would get at each destination, from a file of flows and topics
+    Plan(PlanOptions),
     /// Publish on a topic, as a service on the local broker
     Pub(PublishOptions),
     /// Print the messages of a topic, as a service on the local broker

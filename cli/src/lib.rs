@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! args ──► admin: topics, bridges, peers, why ──► http ──► admin port of a flow ──► output
+//!      ├─► plan: plan file ──► allocator of the data plane ──► output
 //!      ├─► local: pub, echo, hz ──► ServiceManager ──► local broker of the node file
 //!      └─► demo: recordings ──► player ──► flows and services of one process ──► board ──► report
 //! ```
@@ -14,6 +15,7 @@ pub mod http;
 pub mod local;
 mod node_file;
 pub mod output;
+pub mod plan;
 
 use std::process::ExitCode;
 
@@ -48,6 +50,7 @@ async fn dispatch(arguments: Arguments) -> Result<Exit, CliError> {
         Command::Bridges(target) => admin::bridges(&target.flow, format).await,
         Command::Peers(target) => admin::peers(&target.flow, format).await,
         Command::Why(why) => admin::why(&why, format).await,
+        Command::Plan(options) => plan::run(&options, format),
         Command::Pub(options) => local::publish(options, format).await,
         Command::Echo(options) => local::echo(options, format).await,
         Command::Hz(options) => local::hz(options, format).await,

@@ -3,8 +3,10 @@
 //! The allocator of F9 will decide each lane's rate here; today a lane runs at the rate that its requesters ask for and the
 //! pacer alone keeps the budget.
 
+pub mod allocate;
 pub mod bucket;
 pub mod pacer;
+pub mod rates;
 
 /// Bits of one megabit in `limit_mbps`: 1024², as in the paper. 160 means 167.8 Mbit/s in SI units.
 pub const BITS_PER_MEGABIT: f64 = 1024.0 * 1024.0;

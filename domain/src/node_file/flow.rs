@@ -8,8 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::readers::{boolean, number, parsed, whole};
 use super::walk::{Node, Section, from_empty};
-use super::{AccessRules, AutoBool, TopicPattern, auto_bool};
-use crate::MAX_PAYLOAD_BYTES;
+use super::{AccessRules, AutoBool, MAX_BYTES, TopicPattern, auto_bool};
 use crate::names::{LayerName, TopicName};
 use crate::qos::{Priority, UnknownWord, word_enum};
 
@@ -20,7 +19,6 @@ pub const LARGE_BYTES: u32 = 65_536;
 /// Longest lifespan: a day.
 const MAX_LIFESPAN_MS: u32 = 86_400_000;
 const MAX_MBPS: f64 = 1_000_000.0;
-const MAX_BYTES: u32 = MAX_PAYLOAD_BYTES as u32;
 
 /// Everything that BlazeFlow reads besides its brokers; reloads while it runs.
 #[derive(Debug, Clone, PartialEq)]
@@ -100,7 +98,7 @@ impl Default for BandwidthSection {
 }
 
 impl BandwidthSection {
-    fn section(s: &mut Section<'_>) -> Self {
+    pub(super) fn section(s: &mut Section<'_>) -> Self {
         Self {
             limit_mbps: s.or("limit_mbps", number(0.001, MAX_MBPS), 160.0),
             per_message_share: s.or("per_message_share", number(0.01, 1.0), 0.95),

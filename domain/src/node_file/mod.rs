@@ -14,6 +14,7 @@ mod control_plane;
 mod effect;
 mod flow;
 mod pattern;
+mod plan_file;
 mod readers;
 mod services;
 #[cfg(test)]
@@ -39,6 +40,7 @@ pub use flow::{
     TopicRule, TopicSettings, TopicValues, WireOverhead,
 };
 pub use pattern::{PatternError, TopicPattern};
+pub use plan_file::{FlowSource, PlanFile, PlannedClass, PlannedFlow, PlannedLane, PlannedTopic};
 pub use services::{
     AdminSection, CacheSection, ConfigSection, DatabaseSection, LogFormat, LogSection, MonitorSection, WorkerSection,
 };
@@ -46,8 +48,12 @@ pub use services::{
 use crate::identity::FlowId;
 use crate::names::{LayerName, NodeName};
 use crate::qos::LayerKind;
+use crate::MAX_PAYLOAD_BYTES;
 use readers::{parsed, path};
 use walk::{Node, Report, Section};
+
+/// Largest payload, as the readers of numbers take it.
+const MAX_BYTES: u32 = MAX_PAYLOAD_BYTES as u32;
 
 /// Something in the file that is not allowed.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
