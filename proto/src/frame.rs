@@ -8,6 +8,7 @@
 //! place. Hops and age change on the way; [`Frame::with_hops_and_age`] notes them beside the bytes, and only a writer
 //! that puts the frame on a broker encodes them ([`Frame::head_to_write`]). The payload is never copied here.
 
+mod compressed;
 mod header;
 mod index;
 
@@ -21,6 +22,7 @@ use bytes::{BufMut, Bytes, BytesMut};
 use prost::Message as _;
 use prost::encoding::{WireType, encode_key, encode_varint};
 
+pub use compressed::Compression;
 pub use header::Header;
 use index::{Index, usize_range};
 

@@ -1,5 +1,6 @@
 //! `GET /v1/…`: what the flow knows and does, as JSON. Each answer also names the flow, its epoch and the time.
 
+mod allocation;
 mod peers;
 
 use std::collections::BTreeMap;
@@ -13,7 +14,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
 use blaze_domain::control::{LeaseKind, rfc3339_millis};
-use blaze_domain::{Priority, Scope, TopicName};
+use blaze_domain::{Scope, TopicName};
 use serde_json::{Map, Value, json};
 
 use super::Shared;
@@ -33,7 +34,7 @@ pub(super) fn router(shared: Arc<Shared>) -> Router {
         .route("/v1/topics", get(topics))
         .route("/v1/bridges", get(bridges))
         .route("/v1/peers", get(peers::peers))
-        .route("/v1/allocation", get(allocation))
+        .route("/v1/allocation", get(allocation::allocation))
         .route("/v1/why", get(super::why::why))
         .with_state(shared)
 }
@@ -314,82 +315,6 @@ fn bridge_row(shared: &Shared, now: Instant, path: &TopicPath, bridge: &BridgeSt
         "detail": bridge.failure, "class": class, "reliable": bridge.lane.reliable, "max_rate_hz": bridge.lane.max_rate_hz,
         "lifespan_ms": bridge.lane.lifespan_ms,
     })
-}
-
-async fn allocation(State(shared): App) -> Json<Value> {
-    let now = Instant::now();
-    let limit_mbps = shared.live.lock().limit_mbps;
-    let mut traffic = shared.egress.traffic();
-    let rows = shared.plane.read(|state| {
-        let mut rows = Vec::new();
-        let mut payload = 0.0;
-        for (_, path) in state.core.topics_mut() {
-            if let Some(row) = allocation_row(now, path, &mut payload) {
-                rows.push(row);
-            }
-        }
-        (rows, payload)
-    });
-    let (rows, payload) = rows;
-    let links: BTreeMap<String, f64> = traffic
-        .by_destination
-        .iter_mut()
-        .fold(BTreeMap::new(), |mut links, to| {
-            *links.entry(to.flow.layer.to_string()).or_default() += to.rate.rate(now).1;
-            links
-        });
-    let wire: f64 = links.values().sum();
-    // F9: s·α with the overhead factor α = 1.02.
-    let factor = if payload > 0.0 {
-        rounded(wire / (payload * 1.02))
-    } else {
-        Value::Null
-    };
-    let links: Vec<Value> = links
-        .into_iter()
-        .map(|(layer, rate)| json!({"layer": layer, "limit_bytes_per_s": null, "wire_bytes_per_s": rate.round()}))
-        .collect();
-    answer(
-        &shared,
-        json!({
-            "limit_mbps": limit_mbps, "budget_bytes_per_s": shared.egress.budget(), "measured_bytes_per_s": null,
-            "wire_factor": factor, "feasible": null, "wire_bytes": traffic.wire_bytes,
-            "control_wire_bytes": traffic.control_bytes, "topics": rows, "links": links,
-        }),
-    )
-}
-
-/// One topic that leaves on the inter scope. Lanes are not allocated a rate yet, so `allocated_hz` is what requesters ask.
-fn allocation_row(now: Instant, path: &mut TopicPath, payload_bytes_per_s: &mut f64) -> Option<Value> {
-    let mut lanes = Vec::new();
-    let mut class = None;
-    let size = path.size_bytes();
-    for bridge in path.bridges.iter_mut().filter(|bridge| bridge.phase != Phase::Ended) {
-        let Some(layer) = bridge.receiver().map(|(layer, _)| layer.clone()) else {
-            continue;
-        };
-        let (hz, bytes) = bridge.out_rate.rate(now);
-        *payload_bytes_per_s += bytes;
-        if let Sink::Lane { class: lane_class, .. } = bridge.sink {
-            class = Some(lane_class);
-        }
-        lanes.push(json!({
-            "layer": layer, "allocated_hz": bridge.lane.max_rate_hz, "actual_hz": rounded(hz),
-            "skipped": bridge.stats.dropped.total(),
-        }));
-    }
-    if lanes.is_empty() {
-        return None;
-    }
-    let advertised = path.info.rate_hz.unwrap_or_else(|| path.in_rate.rate(now).0);
-    let class = if class == Some(Priority::Bulk) {
-        "large"
-    } else {
-        "standard"
-    };
-    Some(json!({
-        "topic": path.name, "class": class, "size_bytes": size, "advertised_hz": rounded(advertised), "lanes": lanes,
-    }))
 }
 
 /// Largest topic name plus room for `to`: anything longer is no question.

@@ -160,6 +160,7 @@ impl ControlTask {
         }
         self.carry_out_all(now);
         self.empty(now);
+        self.shared.allocate(now);
         for (topic, writer) in self.shared.plane.with(|state| state.core.take_superseded()) {
             self.forget_writer(&topic, writer);
         }

@@ -215,7 +215,9 @@ impl Page {
                 .with_label_values(&[topic, "", reason.as_str()])
                 .inc_by(count as f64);
         }
-        let advertised = path.info.rate_hz.unwrap_or_else(|| path.in_rate.rate(now).0);
+        let measured = path.in_rate.rate(now).0;
+        let granted = path.granted.map(|granted| granted.advertised_hz);
+        let advertised = granted.or(path.info.rate_hz).unwrap_or(measured);
         for bridge in &mut path.bridges {
             let to = bridge.to_label();
             let from = bridge.from.as_str();
@@ -253,7 +255,7 @@ impl Page {
             }
             let actual = bridge.out_rate.rate(now).0;
             self.rate.with_label_values(&[topic, &to, "actual"]).set(actual);
-            if let Some(allocated) = bridge.lane.max_rate_hz {
+            if let Some(allocated) = bridge.allocated_hz {
                 self.rate.with_label_values(&[topic, &to, "allocated"]).set(allocated);
             }
         }

@@ -12,6 +12,7 @@
 //! | admin task | `/livez`, `/readyz`, `/metrics`, `/v1/…` | 1 and one per connection |
 
 mod admin;
+mod allocation;
 mod control_task;
 mod epochs;
 mod health;
@@ -43,6 +44,7 @@ use tokio::sync::{Notify, watch};
 
 use crate::control::{ControlConfig, ControlCore};
 use crate::lane::core::{DataConfig, DataCore};
+use crate::limit::limiter::Limiter;
 use crate::link::{Engine, EngineConfig, Limits};
 use crate::registry::{LayerNames, peers_channel};
 use crate::world::LayerScopeId;
@@ -92,6 +94,7 @@ pub(crate) struct Shared {
     pub(crate) brokers: LocalBrokers,
     pub(crate) inter: Option<InterScope>,
     pub(crate) egress: Arc<Egress>,
+    pub(crate) limiter: Mutex<Limiter>,
     pub(crate) live: Mutex<LiveSettings>,
     pub(crate) readiness: Readiness,
     /// Whether the control channels of node and layer are read.
@@ -186,7 +189,7 @@ pub async fn start_with(
     let core = DataCore::new(DataConfig {
         me: settings.me.clone(),
         epoch,
-        large_bytes: settings.live.large_bytes,
+        large_bytes: settings.live.bandwidth.large_bytes.into(),
         salt: rand::random(),
     });
     let engine = settings.inter.as_ref().map(|inter| {
@@ -236,7 +239,7 @@ pub async fn start_with(
         inter.join()?;
     }
     let control = ControlCore::new(config, now);
-    let egress = Egress::new(settings.live.budget_bytes_per_s());
+    let egress = Egress::new(settings.live.bandwidth.limit_bytes_per_s());
     let readiness = readiness(&brokers, inter.is_some());
     let shared = Arc::new(Shared {
         me: settings.me.clone(),
@@ -248,6 +251,7 @@ pub async fn start_with(
         brokers,
         inter,
         egress,
+        limiter: Mutex::new(Limiter::new(settings.live.bandwidth.clone())),
         live: Mutex::new(settings.live),
         readiness: readiness.clone(),
         hears: Default::default(),
@@ -323,10 +327,11 @@ impl RunningFlow {
     /// Takes new limits and rules.
     pub fn reload(&self, live: LiveSettings) {
         let now = Instant::now();
-        self.shared.egress.set_budget(live.budget_bytes_per_s());
+        self.shared.egress.set_budget(live.bandwidth.limit_bytes_per_s());
+        self.shared.limiter.lock().set_bandwidth(live.bandwidth.clone());
         self.shared
             .plane
-            .read(|state| state.core.set_large_bytes(live.large_bytes));
+            .read(|state| state.core.set_large_bytes(live.bandwidth.large_bytes.into()));
         {
             let mut control = self.shared.control.lock();
             control.set_rules(now, live.rules.clone());

@@ -47,6 +47,8 @@ pub struct DestinationTraffic {
     pub flow: FlowId,
     /// Since the start, per class in the order of [`Priority::ALL`].
     pub wire_bytes: [u64; 3],
+    /// Of those, what carried no user message.
+    pub control_bytes: u64,
     /// Bytes per second.
     pub rate: RateMeter,
 }
@@ -147,6 +149,7 @@ impl Traffic {
                 self.by_destination.push(DestinationTraffic {
                     flow: to.clone(),
                     wire_bytes: [0; 3],
+                    control_bytes: 0,
                     rate,
                 });
                 self.by_destination.len() - 1
@@ -155,6 +158,9 @@ impl Traffic {
         };
         let destination = &mut self.by_destination[place];
         destination.wire_bytes[class as usize] += wire_bytes;
+        if control {
+            destination.control_bytes += wire_bytes;
+        }
         destination.rate.add(now, wire_bytes);
     }
 }

@@ -2,10 +2,9 @@
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
-use blaze_domain::node_file::{AccessRules, AutoBool, Chunking, FlowSection, NodeFile};
+use blaze_domain::node_file::{AccessRules, AutoBool, BandwidthSection, Chunking, FlowSection, NodeFile};
 use blaze_domain::{FlowId, LayerKind};
 
-use crate::limit::budget_bytes_per_s;
 use crate::plan::PlanRules;
 
 /// The inter scope of a flow.
@@ -28,29 +27,18 @@ pub struct InterSettings {
 /// What may change while the flow runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LiveSettings {
-    /// `limit_mbps`, in units of 1024² bit/s.
-    pub limit_mbps: f64,
-    /// Payloads above this many bytes make a topic `bulk`.
-    pub large_bytes: u64,
+    /// What may be sent on the inter scope.
+    pub bandwidth: BandwidthSection,
     /// Rules for topics.
     pub rules: PlanRules,
     /// Who may advertise and request what.
     pub access: AccessRules,
 }
 
-impl LiveSettings {
-    /// The budget in wire bytes per second.
-    #[must_use]
-    pub fn budget_bytes_per_s(&self) -> f64 {
-        budget_bytes_per_s(self.limit_mbps)
-    }
-}
-
 impl From<&FlowSection> for LiveSettings {
     fn from(flow: &FlowSection) -> Self {
         Self {
-            limit_mbps: flow.bandwidth.limit_mbps,
-            large_bytes: u64::from(flow.bandwidth.large_bytes),
+            bandwidth: flow.bandwidth.clone(),
             rules: PlanRules {
                 topics: flow.topics.clone(),
             },

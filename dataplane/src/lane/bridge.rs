@@ -14,7 +14,7 @@ use super::reading::For;
 use super::stats::BridgeStats;
 use super::succession::{Succession, Waiting};
 use super::writer::{NewWriter, Writer};
-use crate::limit::bucket::TokenBucket;
+use crate::limit::gate::Gate;
 use crate::link::{StreamKey, Submit};
 use crate::plan::{Bridge, Target};
 
@@ -30,7 +30,9 @@ impl BridgeState {
             phase: Phase::Up { since: now },
             failure: None,
             ended: None,
-            bucket: planned.lane.max_rate_hz.map(|rate| TokenBucket::new(rate, now)),
+            gate: Gate::new(planned.lane.max_rate_hz, now),
+            allocated_hz: None,
+            sent_bytes: 0,
             sink,
             submitted: false,
             held: None,
@@ -51,11 +53,7 @@ impl BridgeState {
         }
         let begins = begins || (planned.lane.durable && !self.lane.durable);
         self.ended = None;
-        match (planned.lane.max_rate_hz, &mut self.bucket) {
-            (Some(rate), Some(bucket)) => bucket.set_rate(rate, now),
-            (Some(rate), bucket) => *bucket = Some(TokenBucket::new(rate, now)),
-            (None, bucket) => *bucket = None,
-        }
+        self.gate.set_max_rate(planned.lane.max_rate_hz, now);
         self.lane = planned.lane.clone();
         begins
     }
@@ -176,9 +174,14 @@ impl BridgeState {
             self.stats.dropped.add(DropReason::Lifespan, 1);
             return;
         }
-        if self.bucket.as_mut().is_some_and(|bucket| !bucket.admit(now)) {
-            self.stats.dropped.add(DropReason::MaxRate, 1);
-            return;
+        match self.gate.admit(now) {
+            // What is kept for late joiners comes at once and is not repeated: the budget is the pacer's then.
+            Err(DropReason::RateLimit) if message.kept => {}
+            Err(reason) => {
+                self.stats.dropped.add(reason, 1);
+                return;
+            }
+            Ok(()) => {}
         }
         self.load.add(bytes);
         match &mut self.sink {

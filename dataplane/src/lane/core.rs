@@ -128,6 +128,8 @@ pub struct DataCore {
     pub(super) begun: Vec<(TopicId, usize)>,
     /// What could not be attributed to a topic.
     pub unattributed: Drops,
+    /// The rates of lanes have to be worked out anew.
+    pub(super) allocation_due: bool,
     /// Windows that gave way to newer writers.
     pub evicted_writers: u64,
 }
@@ -154,6 +156,7 @@ impl DataCore {
             kept: KeptMessages::default(),
             begun: Vec::new(),
             unattributed: Drops::default(),
+            allocation_due: false,
             evicted_writers: 0,
         }
     }
@@ -220,6 +223,7 @@ impl DataCore {
     /// Changes what counts as large, from the next message on.
     pub fn set_large_bytes(&mut self, bytes: u64) {
         self.config.large_bytes = bytes;
+        self.allocation_due = true;
     }
 
     /// Takes a batch that a local scope delivered. `wall_ns` is the clock since 1970 at `now`.
@@ -318,6 +322,7 @@ impl DataCore {
     pub fn lane_sent(&mut self, now: Instant, lane: LaneId, bytes: u64, wait: Duration) {
         if let Some(bridge) = self.lane_bridge(lane) {
             bridge.out_rate.add(now, bytes);
+            bridge.sent_bytes += bytes;
             bridge.stats.latency.record(micros(wait));
         }
     }
@@ -393,6 +398,9 @@ impl DataCore {
         self.kept.keep(now, topic, from, message);
         let path = &mut self.topics[topic.0 as usize];
         let large = path.is_large(self.config.large_bytes);
+        if path.bridges.iter().any(|bridge| bridge.from == from && bridge.lane_id().is_some()) {
+            self.allocation_due |= path.sent_size.note(now, message.frame.payload().len() as u64);
+        }
         for bridge in path.bridges.iter_mut().filter(|bridge| bridge.from == from) {
             if bridge.takes() && bridge.wants(message) && bridge.is_meant(message.meant) {
                 bridge.pass(now, topic, message, large, &mut self.succession, link);

@@ -1,6 +1,7 @@
 //! The path of a message through one flow.
 
 mod admit;
+pub mod allocation;
 mod bridge;
 pub mod core;
 mod early;

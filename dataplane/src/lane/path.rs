@@ -9,6 +9,7 @@ use blaze_domain::{DropReason, FlowId, LayerName, Priority, Scope, TopicName, Wr
 use blaze_proto::Frame;
 
 use super::admit::Refusal;
+use super::allocation::Granted;
 use super::core::FORGET;
 use super::load::LoadMeter;
 use super::measure::RateMeter;
@@ -16,7 +17,8 @@ use super::reading::Places;
 use super::stats::{BridgeStats, Drops};
 use super::succession::{Held, Unwritten};
 use super::writer::Writer;
-use crate::limit::bucket::TokenBucket;
+use crate::limit::gate::Gate;
+use crate::limit::size::SizeMeter;
 use crate::link::LaneId;
 use crate::plan::{LaneSpec, Target};
 
@@ -167,8 +169,12 @@ pub struct BridgeState {
     pub failure: Option<String>,
     /// When it ended, if it did.
     pub ended: Option<Instant>,
-    /// Thins to `max_rate_hz`.
-    pub bucket: Option<TokenBucket>,
+    /// Thins to what requesters ask for and the budget allows.
+    pub gate: Gate,
+    /// What the budget allows a lane, in Hz, once it is worked out.
+    pub allocated_hz: Option<f64>,
+    /// Payload bytes of messages of a lane that were sent, each counted once.
+    pub sent_bytes: u64,
     /// Where it writes.
     pub sink: Sink,
     /// It has given messages to its lane since it last ended.
@@ -255,6 +261,14 @@ pub struct TopicPath {
     pub bridges: Vec<BridgeState>,
     /// Largest payload seen, in bytes.
     pub largest_bytes: u64,
+    /// Largest payload as sent on the inter scope.
+    pub sent_size: SizeMeter,
+    /// What was decided for it, where it leaves on the inter scope.
+    pub granted: Option<Granted>,
+    /// Rate of what came from local scopes, in Hz, as it was when it last moved.
+    pub(super) believed_hz: f64,
+    /// What the allocator was told last.
+    pub(super) advertised_told: Option<(f64, bool)>,
     /// What came from local scopes.
     pub in_rate: RateMeter,
     /// Dropped before any bridge: echoes, duplicates, what could not be read.
@@ -283,6 +297,10 @@ impl TopicPath {
             info: TopicInfo::default(),
             bridges: Vec::new(),
             largest_bytes: 0,
+            sent_size: SizeMeter::default(),
+            granted: None,
+            believed_hz: 0.0,
+            advertised_told: None,
             in_rate: RateMeter::new(now),
             ingress_drops: Drops::default(),
             refused: Default::default(),

@@ -123,6 +123,7 @@ impl DataCore {
         }
         self.pass_on(topic);
         self.stir();
+        self.allocation_due = true;
     }
 
     /// Gives bridges of a topic that have begun what was kept for them. To be called after [`DataCore::apply`].

@@ -15,10 +15,9 @@ use blaze_brokers::{
 };
 use blaze_domain::LayerKind;
 use blaze_domain::names::ChannelName;
-use blaze_domain::node_file::AccessRules;
+use blaze_domain::node_file::FlowSection;
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
 use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
-use blaze_flow::plan::PlanRules;
 use blaze_flow::world::LayerScopeId;
 use blaze_runtime::supervisor::Supervisor;
 use bytes::Bytes;
@@ -45,12 +44,7 @@ impl Node {
             kind: LayerKind::Fog,
             admin: "127.0.0.1:0".parse().unwrap(),
             inter: None,
-            live: LiveSettings {
-                limit_mbps: 160.0,
-                large_bytes: 65_536,
-                rules: PlanRules::default(),
-                access: AccessRules::default(),
-            },
+            live: LiveSettings::from(&FlowSection::default()),
         };
         let options = FlowOptions {
             settings,

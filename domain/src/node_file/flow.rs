@@ -87,6 +87,8 @@ pub struct BandwidthSection {
     pub wire_overhead: WireOverhead,
     /// Whether the budget follows what the link really carries.
     pub adaptive: bool,
+    /// Seconds, one to two times, after which the largest size of a topic is forgotten; 0: never.
+    pub size_window_s: u32,
     /// Budgets per destination layer, besides the one of all.
     pub links: BTreeMap<LayerName, LinkLimit>,
 }
@@ -108,11 +110,12 @@ impl BandwidthSection {
             share: s.or("share", parsed, SharePolicy::Paper),
             wire_overhead: s.or("wire_overhead", parsed, WireOverhead::Measured),
             adaptive: s.or("adaptive", boolean, true),
+            size_window_s: s.or("size_window_s", whole(0, 86_400), 0),
             links: s.opt("links", links).unwrap_or_default(),
         }
     }
 
-    /// The budget of all links together, in bytes per second.
+    /// The budget of all links together: `B_avail = L_client · 1024² / 8`, in bytes per second (F9).
     #[must_use]
     pub fn limit_bytes_per_s(&self) -> f64 {
         self.limit_mbps * BYTES_PER_MBIT

@@ -6,11 +6,10 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use blaze_brokers::memory::MemoryHub;
-use blaze_domain::node_file::{AccessRules, Chunking};
+use blaze_domain::node_file::{BandwidthSection, Chunking, FlowSection};
 use blaze_domain::{FlowId, LayerKind, Reliability, Scope, TopicName};
 use blaze_flow::flow::settings::{FlowSettings, InterSettings, LiveSettings};
 use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
-use blaze_flow::plan::PlanRules;
 use blaze_flow::world::LayerScopeId;
 use blaze_runtime::Supervisor;
 use blaze_sdk::{Advertise, PublishOptions, Request, ServiceManager, ServiceOptions, SubscribeOptions};
@@ -46,12 +45,13 @@ async fn flow(
             mtu: 1500,
             chunking: Chunking::Mtu,
         }),
-        live: LiveSettings {
-            limit_mbps: LIMIT_MBPS,
-            large_bytes: 65_536,
-            rules: PlanRules::default(),
-            access: AccessRules::default(),
-        },
+        live: LiveSettings::from(&FlowSection {
+            bandwidth: BandwidthSection {
+                limit_mbps: LIMIT_MBPS,
+                ..BandwidthSection::default()
+            },
+            ..FlowSection::default()
+        }),
     };
     let layer = LayerBroker {
         broker: Arc::new(hub.broker()),

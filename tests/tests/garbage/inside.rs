@@ -11,11 +11,10 @@ use blaze_brokers::{
     Subscription, SubscriptionSender,
 };
 use blaze_domain::names::ChannelName;
-use blaze_domain::node_file::AccessRules;
+use blaze_domain::node_file::FlowSection;
 use blaze_domain::{FlowId, LayerKind, Origin, Scope, WriterId};
 use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
 use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
-use blaze_flow::plan::PlanRules;
 use blaze_flow::world::LayerScopeId;
 use blaze_proto::{Frame, Header};
 use blaze_runtime::Supervisor;
@@ -129,12 +128,7 @@ impl Inside {
         let supervisor = Supervisor::new("garbage");
         let (node, layer) = (MemoryHub::new("node"), MemoryHub::new("layer"));
         let node_broker = OpenBroker::new(&node);
-        let live = LiveSettings {
-            limit_mbps: 160.0,
-            large_bytes: 65_536,
-            rules: PlanRules::default(),
-            access: AccessRules::default(),
-        };
+        let live = LiveSettings::from(&FlowSection::default());
         let options = FlowOptions {
             settings: FlowSettings {
                 gateway: blaze_domain::node_file::AutoBool::Auto,

@@ -1,5 +1,6 @@
 //! The message path alone: a link that only takes notes, brokers that only collect.
 
+mod allocation;
 mod load;
 mod succession;
 

@@ -8,16 +8,15 @@ use std::time::Duration;
 use anyhow::Context as _;
 use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::{Broker, Health, open_layer, open_node};
-use blaze_domain::node_file::{AccessRules, Chunking, KafkaBroker, NodeBroker, RedisBroker};
+use blaze_domain::node_file::{BandwidthSection, Chunking, FlowSection, KafkaBroker, NodeBroker, RedisBroker};
 use blaze_domain::{FlowId, LayerKind, LayerName, NodeName, Scope};
 use blaze_flow::flow::settings::{FlowSettings, InterSettings, LiveSettings};
 use blaze_flow::flow::{FlowOptions, LayerBroker, RunningFlow};
-use blaze_flow::plan::PlanRules;
 use blaze_flow::world::LayerScopeId;
 use blaze_runtime::Supervisor;
 use blaze_sdk::{ServiceManager, ServiceOptions};
 
-use crate::{LARGE_BYTES, Options, Role};
+use crate::{Options, Role};
 
 /// How long a flow may take to be ready, and a server to answer.
 const START: Duration = Duration::from_secs(30);
@@ -141,12 +140,13 @@ async fn start_flow(
             mtu: 1500,
             chunking: Chunking::Auto,
         }),
-        live: LiveSettings {
-            limit_mbps: options.limit_mbps,
-            large_bytes: LARGE_BYTES as u64,
-            rules: PlanRules::default(),
-            access: AccessRules::default(),
-        },
+        live: LiveSettings::from(&FlowSection {
+            bandwidth: BandwidthSection {
+                limit_mbps: options.limit_mbps,
+                ..BandwidthSection::default()
+            },
+            ..FlowSection::default()
+        }),
     };
     let flow = FlowOptions {
         settings,
