@@ -6,6 +6,7 @@ use std::str::FromStr;
 use blaze_domain::{LayerName, NodeName, ServiceName, TopicName};
 use clap::{Args, Parser, Subcommand};
 
+use crate::admin::TopOptions;
 use crate::demo::options::DemoOptions;
 use crate::local::{EchoOptions, HzOptions, PublishOptions};
 use crate::output::Format;
@@ -38,6 +39,8 @@ pub enum Command {
     Bridges(FlowTarget),
     /// Other flows that a flow sees
     Peers(FlowTarget),
+    /// What each lane carries beside what it was allocated, once a second
+    Top(TopOptions),
     /// Why a topic does or does not arrive; exits with 0 if it flows
     Why(WhyOptions),
     /// The rate that each topic would get at each destination, from a file of flows and topics

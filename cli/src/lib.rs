@@ -1,7 +1,7 @@
 //! The command line of BlazeAIoT.
 //!
 //! ```text
-//! args ──► admin: topics, bridges, peers, why ──► http ──► admin port of a flow ──► output
+//! args ──► admin: topics, bridges, peers, top, why ──► http ──► admin port of a flow ──► output
 //!      ├─► plan: plan file ──► allocator of the data plane ──► output
 //!      ├─► local: pub, echo, hz ──► ServiceManager ──► local broker of the node file
 //!      └─► demo: recordings ──► player ──► flows and services of one process ──► board ──► report
@@ -49,6 +49,7 @@ async fn dispatch(arguments: Arguments) -> Result<Exit, CliError> {
         Command::Topics(target) => admin::topics(&target.flow, format).await,
         Command::Bridges(target) => admin::bridges(&target.flow, format).await,
         Command::Peers(target) => admin::peers(&target.flow, format).await,
+        Command::Top(options) => admin::top(&options, format).await,
         Command::Why(why) => admin::why(&why, format).await,
         Command::Plan(options) => plan::run(&options, format),
         Command::Pub(options) => local::publish(options, format).await,

@@ -2,6 +2,7 @@
 
 mod bridges;
 mod peers;
+mod top;
 mod topics;
 mod why;
 
@@ -16,6 +17,7 @@ use crate::output::{self, Format, terminal_width};
 
 pub(crate) use bridges::dropped_text;
 pub use bridges::{Bridge, Bridges, Place};
+pub use top::TopOptions;
 
 /// `blaze topics`.
 ///
@@ -39,6 +41,14 @@ pub async fn bridges(flow: &FlowAddress, format: Format) -> Result<Exit, CliErro
 /// As [`topics`].
 pub async fn peers(flow: &FlowAddress, format: Format) -> Result<Exit, CliError> {
     show(flow, "/v1/peers", format, peers::table).await
+}
+
+/// `blaze top`.
+///
+/// # Errors
+/// As [`topics`].
+pub async fn top(options: &TopOptions, format: Format) -> Result<Exit, CliError> {
+    top::run(options, format).await
 }
 
 /// `blaze why`: done if the topic flows, even if degraded; else failed.

@@ -1,0 +1,228 @@
+//! `blaze top`: what each lane carries beside what it was allocated, again and again.
+
+use std::io::IsTerminal as _;
+use std::time::Duration;
+
+use clap::Args;
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::{heading, typed};
+use crate::args::{FlowAddress, FlowTarget};
+use crate::exit::{CliError, Exit};
+use crate::http::get_json;
+use crate::output::{self, Align, Format, bytes, number, render_table, terminal_width};
+
+/// Options of `blaze top`.
+#[derive(Debug, Args)]
+pub struct TopOptions {
+    /// Which flow to ask.
+    #[command(flatten)]
+    pub target: FlowTarget,
+    /// Seconds between two looks
+    #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = parse_interval)]
+    pub interval: f64,
+    /// End after this many looks
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub count: Option<u64>,
+}
+
+fn parse_interval(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if (0.1..=3600.0).contains(&seconds) => Ok(seconds),
+        _ => Err("0.1 to 3600 seconds".to_owned()),
+    }
+}
+
+#[derive(Debug, Deserialize)]
+struct Allocation {
+    limit_mbps: f64,
+    budget_bytes_per_s: f64,
+    #[serde(default)]
+    measured_bytes_per_s: Option<f64>,
+    #[serde(default)]
+    wire_factor: Option<f64>,
+    #[serde(default)]
+    feasible: Option<bool>,
+    topics: Vec<Topic>,
+    links: Vec<Link>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Topic {
+    topic: String,
+    class: String,
+    size_bytes: f64,
+    advertised_hz: f64,
+    #[serde(default)]
+    compression: Option<Compression>,
+    lanes: Vec<Lane>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Compression {
+    #[serde(default)]
+    ratio: Option<f64>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Lane {
+    layer: String,
+    #[serde(default)]
+    allocated_hz: Option<f64>,
+    actual_hz: f64,
+    skipped: u64,
+    #[serde(default)]
+    queued: u64,
+    #[serde(default)]
+    wait_ms: Option<Percentiles>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Percentiles {
+    #[serde(default)]
+    p99: Option<f64>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Link {
+    layer: String,
+    #[serde(default)]
+    limit_bytes_per_s: Option<f64>,
+    #[serde(default)]
+    measured_bytes_per_s: Option<f64>,
+    wire_bytes_per_s: f64,
+}
+
+/// Prints until it is interrupted, or `--count` times. On a terminal each look replaces the one before; with `-o json` each is one line.
+///
+/// # Errors
+/// What [`get_json`] says, or an answer that is not as the contract says.
+pub(super) async fn run(options: &TopOptions, format: Format) -> Result<Exit, CliError> {
+    let flow = &options.target.flow;
+    let mut looks = 0;
+    loop {
+        let value = get_json(flow, "/v1/allocation").await?;
+        let text = match format {
+            Format::Json => value.to_string(),
+            Format::Table | Format::Yaml => {
+                output::format_object(&value, format, |value| table(flow, value, terminal_width()))?
+            }
+        };
+        let replaces = format == Format::Table && std::io::stdout().is_terminal();
+        // Home, and clear what is below.
+        let begin = if replaces { "\x1b[H\x1b[J" } else { "" };
+        let between = if format == Format::Yaml { "---\n" } else { "" };
+        output::print(&format!("{begin}{between}{text}"))?;
+        looks += 1;
+        if options.count.is_some_and(|count| looks >= count) {
+            return Ok(Exit::Done);
+        }
+        tokio::select! {
+            () = tokio::time::sleep(Duration::from_secs_f64(options.interval)) => {}
+            _ = tokio::signal::ctrl_c() => return Ok(Exit::Done),
+        }
+    }
+}
+
+fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String, CliError> {
+    let answer: Allocation = typed(flow, value)?;
+    let mut text = heading(value);
+    text.push_str(&format!(
+        "limit {} Mbit/s of 1024² bit = {}/s on the wire, wire factor {}{}{}\n",
+        answer.limit_mbps,
+        bytes(answer.budget_bytes_per_s),
+        number(answer.wire_factor, 3),
+        answer
+            .measured_bytes_per_s
+            .map(|measured| format!(", measured {}/s", bytes(measured)))
+            .unwrap_or_default(),
+        if answer.feasible == Some(false) { ", NOT feasible" } else { "" },
+    ));
+    if answer.topics.is_empty() {
+        text.push_str("Nothing leaves on the inter scope. `blaze why TOPIC --to LAYER` says what is missing.\n");
+    } else {
+        let columns = [
+            ("TOPIC", Align::Left),
+            ("CLASS", Align::Left),
+            ("BYTES", Align::Right),
+            ("LZ4", Align::Right),
+            ("TO", Align::Left),
+            ("ADVERTISED/Hz", Align::Right),
+            ("PLANNED/Hz", Align::Right),
+            ("ACTUAL/Hz", Align::Right),
+            ("SKIPPED", Align::Right),
+            ("QUEUED", Align::Right),
+            ("p99/ms", Align::Right),
+        ];
+        text.push_str(&render_table(&columns, answer.topics.iter().flat_map(rows).collect(), width));
+    }
+    for link in &answer.links {
+        let limit = link.limit_bytes_per_s.unwrap_or(answer.budget_bytes_per_s);
+        let measured = link
+            .measured_bytes_per_s
+            .map(|measured| format!(", measured {}/s", bytes(measured)))
+            .unwrap_or_default();
+        text.push_str(&format!(
+            "link to {}: {}/s of {}/s, {:.1} %{measured}\n",
+            link.layer,
+            bytes(link.wire_bytes_per_s),
+            bytes(limit),
+            100.0 * link.wire_bytes_per_s / limit.max(1.0),
+        ));
+    }
+    Ok(text)
+}
+
+fn rows(topic: &Topic) -> Vec<Vec<String>> {
+    let ratio = topic.compression.as_ref().and_then(|compression| compression.ratio);
+    let row = |lane: &Lane| {
+        vec![
+            topic.topic.clone(),
+            topic.class.clone(),
+            number(Some(topic.size_bytes), 0),
+            ratio.map_or_else(|| "-".to_owned(), |ratio| format!("{:.0} %", 100.0 * ratio)),
+            lane.layer.clone(),
+            number(Some(topic.advertised_hz), 2),
+            number(lane.allocated_hz, 2),
+            number(Some(lane.actual_hz), 2),
+            lane.skipped.to_string(),
+            lane.queued.to_string(),
+            number(lane.wait_ms.as_ref().and_then(|wait| wait.p99), 2),
+        ]
+    };
+    topic.lanes.iter().map(row).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn planned_and_actual_stand_side_by_side() {
+        let value = json!({
+            "flow": "edge/robot-1", "limit_mbps": 40, "budget_bytes_per_s": 5_242_880, "measured_bytes_per_s": null,
+            "wire_factor": 1.0912, "feasible": true,
+            "topics": [{"topic": "camera/image_raw", "class": "large", "size_bytes": 921_600, "advertised_hz": 30.0, "lanes": [
+                {"layer": "fog", "allocated_hz": 4.85, "actual_hz": 4.8, "skipped": 252, "queued": 1, "wait_ms": {"p50": 1.0, "p99": 190.5}}]}],
+            "links": [{"layer": "fog", "limit_bytes_per_s": null, "wire_bytes_per_s": 5_137_000.0}],
+        });
+        let flow = "127.0.0.1:9101".parse().unwrap();
+        assert_eq!(
+            table(&flow, &value, None).unwrap(),
+            "flow edge/robot-1\n\
+             limit 40 Mbit/s of 1024² bit = 5.0 MiB/s on the wire, wire factor 1.091\n\
+             TOPIC             CLASS   BYTES  LZ4  TO   ADVERTISED/Hz  PLANNED/Hz  ACTUAL/Hz  SKIPPED  QUEUED  p99/ms\n\
+             camera/image_raw  large  921600    -  fog          30.00        4.85       4.80      252       1  190.50\n\
+             link to fog: 4.9 MiB/s of 5.0 MiB/s, 98.0 %\n"
+        );
+    }
+
+    #[test]
+    fn a_flow_that_sends_nothing_says_so() {
+        let value = json!({"flow": "fog/fog-1", "limit_mbps": 160, "budget_bytes_per_s": 1, "topics": [], "links": []});
+        let flow = "127.0.0.1:9101".parse().unwrap();
+        assert!(table(&flow, &value, None).unwrap().contains("Nothing leaves"));
+    }
+}
