@@ -25,7 +25,11 @@
 //! - The rate rises only while at least half of it is used, as RFC 7661 has it; else it doubles in half a minute, so that
 //!   what was learned is forgotten in the end, even if the traffic is thinned because of it.
 
+mod path;
+
 use std::time::{Duration, Instant};
+
+use path::{Delay, Loss};
 
 /// The rate never falls below this, in bytes per second, unless the limit is lower: what is small must get through.
 pub const FLOOR_BYTES_PER_S: f64 = 16.0 * 1024.0;
@@ -62,21 +66,8 @@ const PROVEN: Duration = Duration::from_secs(10);
 /// Pause before the first step after a back-off; doubled each time the same estimate comes out, to spare the dips.
 const HOLD: Duration = Duration::from_secs(2);
 const LONGEST_HOLD: Duration = Duration::from_secs(8);
-/// What every sample must exceed to count as a queue, at least and at most.
-const LEAST_TOLERANCE: Duration = Duration::from_millis(25);
-const MOST_TOLERANCE: Duration = Duration::from_millis(150);
-/// How long and in how many samples it must do so.
-const LASTING: Duration = Duration::from_millis(120);
-const LASTING_SAMPLES: u32 = 4;
-/// Samples further apart do not belong together.
-const APART: Duration = Duration::from_secs(1);
 /// A round trip above this is a mistake.
 const LONGEST_ROUND_TRIP: Duration = Duration::from_secs(30);
-/// A least round trip counts for this long, and as long again.
-const BASE_HOLDS: Duration = Duration::from_secs(30);
-/// Loss is judged over this time, and over so many datagrams.
-const LOSS_WINDOW: Duration = Duration::from_secs(1);
-const LOSS_DATAGRAMS: f64 = 200.0;
 
 /// What a Feedback tells. Bytes are wire bytes, as for [`Capacity::sent`]: a caller that counts less multiplies by its wire
 /// factor.
@@ -126,7 +117,6 @@ pub struct Capacity {
     estimate: Option<f64>,
     phase: Phase,
     delay: Delay,
-    run: Option<Run>,
     loss: Loss,
     /// Mean size of a datagram.
     datagram_bytes: f64,
@@ -185,7 +175,6 @@ impl Capacity {
             estimate: None,
             phase: Phase::Rising,
             delay: Delay::default(),
-            run: None,
             loss: Loss::new(now),
             datagram_bytes: 0.0,
             step: now,
@@ -221,7 +210,6 @@ impl Capacity {
         self.estimate = None;
         self.phase = Phase::Rising;
         self.delay = Delay::default();
-        self.run = None;
         self.loss = Loss::new(self.now);
         self.hold = HOLD;
         self.pause = Duration::ZERO;
@@ -300,29 +288,24 @@ impl Capacity {
 
     /// Takes the delay of a datagram, and what was delivered with it.
     fn delayed(&mut self, round_trip: Duration, delivered: f64) {
-        let queue = self.delay.take(self.now, round_trip);
-        if queue <= self.delay.tolerance() {
-            self.run = None;
-        } else if let Some(run) = self.run.as_mut().filter(|run| self.now - run.until <= APART) {
-            run.until = self.now;
-            run.samples += 1;
-            run.delivered += delivered;
-        } else {
-            self.run = Some(Run::new(self.now));
-        }
-        let carried = self.run.as_ref().and_then(Run::bytes_per_s);
-        if matches!(self.phase, Phase::Draining(_)) {
-            self.drained(round_trip, delivered, carried);
-        } else if let Some(carried) = carried {
-            let before = match &self.phase {
-                Phase::Sparing(spare) => spare.before,
-                _ => self.rate,
-            };
-            self.drain(before, carried, queue);
+        self.delay.take(self.now, round_trip, delivered);
+        match &self.phase {
+            Phase::Draining(drain) => {
+                let drain = drain.clone();
+                self.drained(drain, delivered);
+            }
+            Phase::Rising => self.drain_if_queued(self.rate),
+            Phase::Sparing(spare) => self.drain_if_queued(spare.before),
         }
     }
 
-    fn drain(&mut self, before: f64, carried: f64, queue: Duration) {
+    fn drain_if_queued(&mut self, before: f64) {
+        if let Some(carried) = self.delay.carried() {
+            self.drain(before, carried);
+        }
+    }
+
+    fn drain(&mut self, before: f64, carried: f64) {
         self.phase = Phase::Draining(Drain {
             since: self.now,
             before,
@@ -330,52 +313,53 @@ impl Capacity {
             sent: 0.0,
             delivered: 0.0,
             mark: None,
-            peak: queue,
+            peak: self.delay.queue,
             least: Duration::MAX,
         });
         self.set_rate(carried * DRAINING);
     }
 
     /// Looks whether the delay has gone, has become less, or stays.
-    fn drained(&mut self, round_trip: Duration, delivered: f64, carried: Option<f64>) {
-        let (elapsed, queue, tolerance) = (self.now, self.delay.queue, self.delay.tolerance());
-        let Phase::Draining(drain) = &mut self.phase else { return };
-        let elapsed = elapsed.saturating_duration_since(drain.since);
-        if queue <= tolerance * 3 / 4 {
-            let carried = drain.carried;
-            self.learn(carried);
-            return;
-        }
+    fn drained(&mut self, mut drain: Drain, delivered: f64) {
+        let (queue, tolerance) = (self.delay.queue, self.delay.tolerance());
         // The longer the queue lasts, the better is known what comes out of it.
-        drain.carried = carried.unwrap_or(drain.carried);
-        let Some(tried) = elapsed.checked_sub(round_trip) else {
-            drain.peak = drain.peak.max(queue);
+        drain.carried = self.delay.carried().unwrap_or(drain.carried);
+        if queue <= tolerance * 3 / 4 {
+            self.learn(drain.carried);
             return;
-        };
-        let mark = *drain.mark.get_or_insert(self.now);
-        if mark < self.now {
-            drain.delivered += delivered;
         }
-        // In this time a queue of ours shrinks by 100 ms and the tolerance.
+        // How long the newest datagram was sent after the beginning. In the trial a queue of ours shrinks by 100 ms and the
+        // tolerance.
         let trial = Duration::from_millis(200) + tolerance * 2;
-        if tried >= trial {
+        let after = self.since(drain.since).checked_sub(self.delay.newest);
+        match after {
+            None => drain.peak = drain.peak.max(queue),
+            Some(_) if drain.mark.is_none() => drain.mark = Some(self.now),
+            Some(_) => drain.delivered += delivered,
+        }
+        if after.is_some_and(|after| after >= trial) {
             drain.least = drain.least.min(queue);
         }
-        if tried < trial + Duration::from_millis(150) {
-            return;
-        }
-        let measured = self.now.saturating_duration_since(mark).as_secs_f64();
-        let arrived = if measured > 0.0 { drain.delivered / measured } else { 0.0 };
-        let (before, carried) = (drain.before, drain.carried);
-        if drain.least + tolerance.max(Duration::from_millis(60)) <= drain.peak {
-            self.drain(before, carried, queue);
-        } else if arrived < 0.8 * drain.sent / elapsed.as_secs_f64() && self.rate > self.floor() {
-            // Even that is more than now gets through.
-            self.drain(before, arrived, queue);
+        if after.is_some_and(|after| after >= trial + Duration::from_millis(150)) {
+            self.decide(&drain);
         } else {
-            let least = drain.least;
-            self.delay.is_own(self.now, least);
-            self.resume(before);
+            self.phase = Phase::Draining(drain);
+        }
+    }
+
+    fn decide(&mut self, drain: &Drain) {
+        let rate = |bytes: f64, since: Instant| bytes / self.since(since).as_secs_f64().max(1e-3);
+        let sent = rate(drain.sent, drain.since);
+        let delivered = rate(drain.delivered, drain.mark.unwrap_or(drain.since));
+        let shrunk = drain.peak.saturating_sub(drain.least);
+        if shrunk >= self.delay.tolerance().max(Duration::from_millis(60)) {
+            self.drain(drain.before, drain.carried);
+        } else if delivered < 0.8 * sent && self.rate > self.floor() {
+            // Even that is more than now gets through.
+            self.drain(drain.before, delivered);
+        } else {
+            self.delay.is_own(self.now, drain.least);
+            self.resume(drain.before);
         }
     }
 
@@ -393,14 +377,14 @@ impl Capacity {
 
     fn resume(&mut self, bytes_per_s: f64) {
         self.phase = Phase::Rising;
-        self.run = None;
+        self.delay.restart();
         self.pause = Duration::ZERO;
         self.loss.restart(self.now);
         self.set_rate(bytes_per_s);
     }
 
     fn judge_loss(&mut self) {
-        let Some((share, delivered)) = self.loss.judge(self.now, LOSS_DATAGRAMS * self.datagram_bytes) else {
+        let Some((share, delivered)) = self.loss.judge(self.now, self.datagram_bytes) else {
             return;
         };
         let ordinary = self.loss.ordinary;
@@ -432,7 +416,7 @@ impl Capacity {
     fn rise(&mut self) {
         let elapsed = self.since(self.step);
         let settled = elapsed >= self.pause.max(self.delay.newest + STEP);
-        if !settled || self.run.is_some() || !matches!(self.phase, Phase::Rising) {
+        if !settled || self.delay.is_queued() || !matches!(self.phase, Phase::Rising) {
             return;
         }
         if self.rate >= self.limit {

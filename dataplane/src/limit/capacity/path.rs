@@ -1,15 +1,35 @@
+//! What a path does to datagrams: how long it takes, and what it loses.
+
+use std::time::{Duration, Instant};
+
+/// What every sample must exceed to count as a queue, at least and at most.
+const LEAST_TOLERANCE: Duration = Duration::from_millis(25);
+const MOST_TOLERANCE: Duration = Duration::from_millis(150);
+/// How long and in how many samples it must do so.
+const LASTING: Duration = Duration::from_millis(120);
+const LASTING_SAMPLES: u32 = 4;
+/// Samples further apart do not belong together.
+const APART: Duration = Duration::from_secs(1);
+/// A least round trip counts for this long, and as long again.
+const BASE_HOLDS: Duration = Duration::from_secs(30);
+/// Loss is judged over this time, and over so many datagrams.
+const LOSS_WINDOW: Duration = Duration::from_secs(1);
+const LOSS_DATAGRAMS: f64 = 200.0;
+
 /// Round trips of a path, and how much of the newest is queueing.
 #[derive(Debug, Clone, Default)]
-struct Delay {
-    newest: Duration,
-    queue: Duration,
+pub(super) struct Delay {
+    pub(super) newest: Duration,
+    pub(super) queue: Duration,
     jitter: Duration,
     /// Least of the current and of the previous period, and when the current one began.
     base: Option<(Instant, Duration, Duration)>,
+    run: Option<Run>,
 }
 
 impl Delay {
-    fn take(&mut self, now: Instant, round_trip: Duration) -> Duration {
+    /// Takes the round trip of a datagram, and the bytes that were delivered with it.
+    pub(super) fn take(&mut self, now: Instant, round_trip: Duration, delivered: f64) {
         let (since, current, previous) = match self.base {
             None => (now, round_trip, round_trip),
             Some((since, current, _)) if now.saturating_duration_since(since) > BASE_HOLDS => (now, round_trip, current),
@@ -23,15 +43,40 @@ impl Delay {
         self.base = Some((since, current, previous));
         self.newest = round_trip;
         self.queue = round_trip.saturating_sub(current.min(previous));
-        self.queue
+        if self.queue <= self.tolerance() {
+            self.run = None;
+        } else if let Some(run) = self.run.as_mut().filter(|run| now - run.until <= APART) {
+            run.until = now;
+            run.samples += 1;
+            run.delivered += delivered;
+        } else {
+            self.run = Some(Run { since: now, until: now, samples: 1, delivered: 0.0 });
+        }
     }
 
-    fn tolerance(&self) -> Duration {
+    /// Whether the newest round trip has a queue in it.
+    pub(super) fn is_queued(&self) -> bool {
+        self.run.is_some()
+    }
+
+    /// What came out of a queue that has lasted, in bytes per second.
+    pub(super) fn carried(&self) -> Option<f64> {
+        let run = self.run.as_ref()?;
+        let lasted = run.until - run.since;
+        (lasted >= LASTING && run.samples >= LASTING_SAMPLES).then(|| run.delivered / lasted.as_secs_f64())
+    }
+
+    /// Begins to look for a queue anew.
+    pub(super) fn restart(&mut self) {
+        self.run = None;
+    }
+
+    pub(super) fn tolerance(&self) -> Duration {
         (self.jitter * 5).clamp(LEAST_TOLERANCE, MOST_TOLERANCE)
     }
 
     /// So much of what was taken for queueing is the path's own.
-    fn is_own(&mut self, now: Instant, queue: Duration) {
+    pub(super) fn is_own(&mut self, now: Instant, queue: Duration) {
         let base = self.newest.saturating_sub(self.queue) + queue;
         self.base = Some((now, base, base));
         self.queue = self.newest.saturating_sub(base);
@@ -48,36 +93,19 @@ struct Run {
     delivered: f64,
 }
 
-impl Run {
-    fn new(now: Instant) -> Self {
-        Self {
-            since: now,
-            until: now,
-            samples: 1,
-            delivered: 0.0,
-        }
-    }
-
-    /// What came out of the queue in bytes per second, if it has lasted.
-    fn bytes_per_s(&self) -> Option<f64> {
-        let lasted = self.until - self.since;
-        (lasted >= LASTING && self.samples >= LASTING_SAMPLES).then(|| self.delivered / lasted.as_secs_f64())
-    }
-}
-
 /// Share of bytes that are lost.
 #[derive(Debug, Clone)]
-struct Loss {
-    since: Instant,
-    delivered: f64,
-    lost: f64,
-    newest: f64,
+pub(super) struct Loss {
+    pub(super) since: Instant,
+    pub(super) delivered: f64,
+    pub(super) lost: f64,
+    pub(super) newest: f64,
     /// What is lost whether much is sent or little.
-    ordinary: f64,
+    pub(super) ordinary: f64,
 }
 
 impl Loss {
-    fn new(now: Instant) -> Self {
+    pub(super) fn new(now: Instant) -> Self {
         Self {
             since: now,
             delivered: 0.0,
@@ -87,15 +115,15 @@ impl Loss {
         }
     }
 
-    fn restart(&mut self, now: Instant) {
+    pub(super) fn restart(&mut self, now: Instant) {
         (self.since, self.delivered, self.lost) = (now, 0.0, 0.0);
     }
 
-    /// The share, and the bytes per second delivered, once that many bytes tell.
-    fn judge(&mut self, now: Instant, bytes: f64) -> Option<(f64, f64)> {
+    /// The share, and the bytes per second delivered, once there is enough to tell.
+    pub(super) fn judge(&mut self, now: Instant, datagram_bytes: f64) -> Option<(f64, f64)> {
         let elapsed = now.saturating_duration_since(self.since);
         let total = self.delivered + self.lost;
-        if elapsed < LOSS_WINDOW || total < bytes.max(1.0) {
+        if elapsed < LOSS_WINDOW || total < (LOSS_DATAGRAMS * datagram_bytes).max(1.0) {
             return None;
         }
         self.newest = self.lost / total;
