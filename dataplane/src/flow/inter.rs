@@ -19,7 +19,7 @@ use super::plane::{News, Plane};
 use super::settings::InterSettings;
 use crate::link::dds::{self, DdsConfig, DdsStatus, DdsTransport};
 use crate::link::transport::{Endpoint, SendOutcome, Transport};
-use crate::link::{DownReason, LinkEvent};
+use crate::link::{DownReason, LinkEvent, PacketSize};
 
 /// Between attempts to start a transport.
 const RETRY: Duration = Duration::from_secs(1);
@@ -278,6 +278,14 @@ impl InterScope {
     fn sizes(&self) -> (usize, blaze_domain::node_file::Chunking, IpAddr) {
         let settings = &self.settings;
         (settings.mtu.into(), settings.chunking, settings.listen_address())
+    }
+}
+
+impl InterScope {
+    /// What datagrams become on the wire.
+    pub(super) fn packets(&self) -> PacketSize {
+        let (mtu, chunking, listen) = self.sizes();
+        dds::packets(mtu, chunking, listen)
     }
 }
 

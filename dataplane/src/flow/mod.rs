@@ -258,6 +258,8 @@ pub async fn start_with(
         started_s: wall_ns() as f64 / 1e9,
     });
 
+    let bandwidth = shared.live.lock().bandwidth.clone();
+    shared.set_bandwidth(now, &bandwidth);
     let metrics_of = Arc::clone(&shared);
     let admin = AdminServer::bind(
         settings.admin,
@@ -327,11 +329,7 @@ impl RunningFlow {
     /// Takes new limits and rules.
     pub fn reload(&self, live: LiveSettings) {
         let now = Instant::now();
-        self.shared.egress.set_budget(live.bandwidth.limit_bytes_per_s());
-        self.shared.limiter.lock().set_bandwidth(live.bandwidth.clone());
-        self.shared
-            .plane
-            .read(|state| state.core.set_large_bytes(live.bandwidth.large_bytes.into()));
+        self.shared.set_bandwidth(now, &live.bandwidth);
         {
             let mut control = self.shared.control.lock();
             control.set_rules(now, live.rules.clone());

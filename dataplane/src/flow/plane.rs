@@ -267,7 +267,8 @@ impl Plane {
             let transmit = state.engine.as_mut().and_then(|engine| next(engine, now));
             state.pump(now, &mut tell);
             if transmit.is_none() && !told && !idle.is_zero() {
-                let until = due.map_or(now + idle, |due| due.min(now + idle));
+                let paced = state.engine.as_ref().and_then(Engine::paced_until);
+                let until = [due, paced].into_iter().flatten().fold(now + idle, Instant::min);
                 self.work.wait_until(&mut state, until);
             }
             transmit

@@ -145,10 +145,8 @@ struct Drain {
     before: f64,
     /// What the bottleneck carries, if the delay is that of its queue.
     carried: f64,
-    sent: f64,
-    /// What came of what was sent since, and since when.
-    delivered: f64,
-    mark: Option<Instant>,
+    /// Seconds per second by which a queue of ours shrinks.
+    shrinking: f64,
     /// Longest delay of what was sent before, least of what was sent a while after.
     peak: Duration,
     least: Duration,
@@ -199,9 +197,6 @@ impl Capacity {
         let bytes = wire_bytes as f64;
         self.datagram_bytes += (bytes - self.datagram_bytes) / 16.0;
         self.step_sent += bytes;
-        if let Phase::Draining(drain) = &mut self.phase {
-            drain.sent += bytes;
-        }
     }
 
     /// The peer was suspect or down and is back, or a link epoch begins: the path may be another one. Slow start.
@@ -225,6 +220,7 @@ impl Capacity {
         // A Feedback of an idle class echoes a datagram of long ago: its delay is none of now.
         let sample = seen.round_trip.filter(|_| seen.delivered_bytes > 0);
         if let Some(round_trip) = sample.filter(|round_trip| *round_trip <= LONGEST_ROUND_TRIP) {
+            if std::env::var_os("SHOW").is_some() { println!("{:?} rt {round_trip:?} {delivered} q {:?} tol {:?}", self.now, self.delay.queue, self.delay.tolerance()); }
             self.delayed(round_trip, delivered);
         }
         self.judge_loss();
@@ -292,7 +288,7 @@ impl Capacity {
         match &self.phase {
             Phase::Draining(drain) => {
                 let drain = drain.clone();
-                self.drained(drain, delivered);
+                self.drained(drain);
             }
             Phase::Rising => self.drain_if_queued(self.rate),
             Phase::Sparing(spare) => self.drain_if_queued(spare.before),
@@ -301,6 +297,7 @@ impl Capacity {
 
     fn drain_if_queued(&mut self, before: f64) {
         if let Some(carried) = self.delay.carried() {
+            if std::env::var_os("SHOW").is_some() { println!("drain {:?} {:?}", self.now, self.delay); }
             self.drain(before, carried);
         }
     }
@@ -310,9 +307,7 @@ impl Capacity {
             since: self.now,
             before,
             carried,
-            sent: 0.0,
-            delivered: 0.0,
-            mark: None,
+            shrinking: (1.0 - self.floor() / carried).clamp(0.05, DRAINING),
             peak: self.delay.queue,
             least: Duration::MAX,
         });
@@ -320,7 +315,7 @@ impl Capacity {
     }
 
     /// Looks whether the delay has gone, has become less, or stays.
-    fn drained(&mut self, mut drain: Drain, delivered: f64) {
+    fn drained(&mut self, mut drain: Drain) {
         let (queue, tolerance) = (self.delay.queue, self.delay.tolerance());
         // The longer the queue lasts, the better is known what comes out of it.
         drain.carried = self.delay.carried().unwrap_or(drain.carried);
@@ -328,35 +323,26 @@ impl Capacity {
             self.learn(drain.carried);
             return;
         }
-        // How long the newest datagram was sent after the beginning. In the trial a queue of ours shrinks by 100 ms and the
-        // tolerance.
-        let trial = Duration::from_millis(200) + tolerance * 2;
-        let after = self.since(drain.since).checked_sub(self.delay.newest);
-        match after {
-            None => drain.peak = drain.peak.max(queue),
-            Some(_) if drain.mark.is_none() => drain.mark = Some(self.now),
-            Some(_) => drain.delivered += delivered,
+        let elapsed = self.since(drain.since);
+        let sent = self.step_sent / elapsed.as_secs_f64().max(1e-3);
+        if elapsed >= STEP && drain.carried < 0.8 * sent && self.rate > self.floor() {
+            // The link has become slower still: that is more than it carries.
+            self.drain(drain.before, drain.carried);
+            return;
         }
-        if after.is_some_and(|after| after >= trial) {
+        // In the trial a queue of ours shrinks by 100 ms and the tolerance.
+        let trial = (Duration::from_millis(100) + tolerance).div_f64(drain.shrinking);
+        // How long the newest datagram was sent after the beginning.
+        let after = elapsed.saturating_sub(self.delay.newest);
+        if after.is_zero() {
+            drain.peak = drain.peak.max(queue);
+        } else if after >= trial {
             drain.least = drain.least.min(queue);
         }
-        if after.is_some_and(|after| after >= trial + Duration::from_millis(150)) {
-            self.decide(&drain);
-        } else {
+        if after < trial + Duration::from_millis(150) {
             self.phase = Phase::Draining(drain);
-        }
-    }
-
-    fn decide(&mut self, drain: &Drain) {
-        let rate = |bytes: f64, since: Instant| bytes / self.since(since).as_secs_f64().max(1e-3);
-        let sent = rate(drain.sent, drain.since);
-        let delivered = rate(drain.delivered, drain.mark.unwrap_or(drain.since));
-        let shrunk = drain.peak.saturating_sub(drain.least);
-        if shrunk >= self.delay.tolerance().max(Duration::from_millis(60)) {
+        } else if drain.peak.saturating_sub(drain.least) >= tolerance.max(Duration::from_millis(60)) {
             self.drain(drain.before, drain.carried);
-        } else if delivered < 0.8 * sent && self.rate > self.floor() {
-            // Even that is more than now gets through.
-            self.drain(drain.before, delivered);
         } else {
             self.delay.is_own(self.now, drain.least);
             self.resume(drain.before);

@@ -8,6 +8,7 @@
 
 pub mod allocate;
 pub mod bucket;
+pub mod capacity;
 pub mod gate;
 pub mod limiter;
 pub mod pacer;

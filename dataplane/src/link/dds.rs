@@ -26,6 +26,7 @@ use blaze_domain::{FlowId, Priority};
 use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};
 
+use super::budget::PacketSize;
 use super::transport::{Endpoint, SendOutcome, Transport, TransportEvent};
 use wire::Wire;
 
@@ -48,6 +49,12 @@ pub fn max_datagram_bytes(mtu: usize, chunking: Chunking, listen: IpAddr) -> usi
 #[must_use]
 pub fn wire_bytes(mtu: usize, chunking: Chunking, listen: IpAddr, datagram_bytes: usize) -> usize {
     Wire::new(mtu, chunking, listen.is_loopback()).bytes(datagram_bytes)
+}
+
+/// What datagrams become on the wire, for the budgets of an engine.
+#[must_use]
+pub fn packets(mtu: usize, chunking: Chunking, listen: IpAddr) -> PacketSize {
+    Wire::new(mtu, chunking, listen.is_loopback()).packets()
 }
 
 /// Called with everything that happens. It runs in the threads of the transport and must not wait for long.

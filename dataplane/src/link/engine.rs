@@ -20,6 +20,7 @@ use bytes::Bytes;
 use prost::Message as _;
 
 use super::addresses::Addresses;
+use super::budget::{Budgets, LinkBudgets};
 use super::clock::Clocks;
 use super::event::{LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit};
 use super::lifecycle::Missed;
@@ -113,6 +114,7 @@ pub struct Engine {
     pub(super) ledger: Ledger,
     pub(super) counters: LinkCounters,
     pub(super) hasher: RandomState,
+    pub(super) budgets: Budgets,
 }
 
 impl Engine {
@@ -143,6 +145,7 @@ impl Engine {
             ledger: Ledger::default(),
             counters: LinkCounters::default(),
             hasher: RandomState::new(),
+            budgets: Budgets::default(),
             config,
         }
     }
@@ -205,6 +208,21 @@ impl Engine {
     /// Demand and limit of the own egress, for the next Hellos.
     pub fn set_egress(&mut self, egress: Egress) {
         self.egress = Some(egress);
+    }
+
+    /// What may go to each peer from now on. Before the first call nothing is held back here.
+    pub fn set_budgets(&mut self, now: Instant, budgets: LinkBudgets) {
+        let burst = self.budgets.burst_bytes(self.config.max_datagram);
+        self.budgets.set(budgets, burst, now);
+        for peer in self.peers.iter_mut().flatten() {
+            self.budgets.fit(now, &peer.endpoint.flow.layer, burst, &mut peer.path);
+        }
+    }
+
+    /// When a peer may be sent to for which [`Engine::poll_transmit`] has something and its link no budget.
+    #[must_use]
+    pub fn paced_until(&self) -> Option<Instant> {
+        self.budgets.paced_until
     }
 
     fn hello_soon(&mut self, now: Instant) {

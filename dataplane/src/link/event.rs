@@ -8,6 +8,7 @@ use blaze_proto::Frame;
 use blaze_proto::link::link_control::{Body, Hello, LayerScope, State};
 use bytes::Bytes;
 
+use super::budget::LinkCapacity;
 use super::transport::Endpoint;
 
 /// A lane of the flow; the engine only counts by it.
@@ -335,6 +336,8 @@ pub struct PeerInfo {
     pub receiving_bytes_per_s: f64,
     /// Queueing on the way, as far as the round trip shows.
     pub queueing_delay: Duration,
+    /// What the link carries, where that is estimated.
+    pub capacity: Option<LinkCapacity>,
     /// Bytes that it will take, per class (control, state, bulk).
     pub window_bytes: [u64; 3],
     /// Bytes on the way, per class.

@@ -85,7 +85,9 @@ impl Engine {
             streams: self.config.limits.streams,
             max_datagram: self.config.max_datagram,
         });
-        let peer = Peer::new(now, endpoint, self.next_link_epoch, limits, self.config.limits.streams);
+        let mut peer = Peer::new(now, endpoint, self.next_link_epoch, limits, self.config.limits.streams);
+        let burst = self.budgets.burst_bytes(self.config.max_datagram);
+        self.budgets.fit(now, &peer.endpoint.flow.layer, burst, &mut peer.path);
         self.next_link_epoch = self.next_link_epoch.saturating_add(3);
         self.by_flow.insert(peer.endpoint.flow.clone(), at);
         self.by_sender.insert(peer.sender, at);

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! engine       messages in, events out                        addresses  where flows are
+//!  ├ budget     what may go to each peer
 //!  ├ lifecycle  peers come and go                              clock      round trips, offsets, loss
 //!  ├ transmit   who is served next; Hello, Feedback            event      what goes in and comes out
 //!  ├ receive    LinkControl and messages
@@ -14,6 +15,7 @@
 
 mod addresses;
 mod assembly;
+mod budget;
 mod clock;
 pub mod dds;
 mod engine;
@@ -37,6 +39,7 @@ pub(crate) mod sim;
 #[cfg(test)]
 mod tests;
 
+pub use budget::{LinkBudgets, LinkCapacity, PacketSize};
 pub use engine::{Engine, EngineConfig, Limits, MAX_PEERS, MIN_DATAGRAM_BYTES, PeerIndex};
 pub use event::{DownReason, LaneId, LinkCounters, LinkEvent, PeerInfo, PeerState, StreamKey, Submit, Tally, Transmit};
 pub use wire::{HEADER_BYTES, RECORD_BYTES};

@@ -7,6 +7,7 @@ use blaze_domain::{DropReason, LayerKind, Priority};
 use blaze_proto::link::link_control::{Hello, Kind, LayerScope, State};
 use bytes::Bytes;
 
+use super::budget::PathBudget;
 use super::clock::{ClockOffset, RoundTrip};
 use super::event::{Ledger, PeerInfo, PeerState};
 use super::receiver::ReceiveClass;
@@ -55,6 +56,8 @@ pub(crate) struct Peer {
     /// When it was found, or left.
     pub since: Instant,
     pub last_hello: Option<Instant>,
+    /// It has been up in this life.
+    pub was_heard: bool,
     pub hello: Option<Box<Hello>>,
     pub hello_at: Instant,
     pub hello_due: bool,
@@ -66,6 +69,7 @@ pub(crate) struct Peer {
     pub last_feedback: Option<Instant>,
     pub send: [SendClass; 3],
     pub receive: [ReceiveClass; 3],
+    pub path: PathBudget,
 }
 
 impl Peer {
@@ -88,6 +92,7 @@ impl Peer {
             phase: Phase::Connecting,
             since: now,
             last_hello: None,
+            was_heard: false,
             hello: None,
             hello_at: now,
             hello_due: true,
@@ -99,6 +104,7 @@ impl Peer {
             last_feedback: None,
             send: [class(0), class(1), class(2)],
             receive: std::array::from_fn(|_| ReceiveClass::new(streams)),
+            path: PathBudget::default(),
         }
     }
 
@@ -188,6 +194,7 @@ impl Peer {
             loss: if lost > 0.0 { lost / (received + lost) } else { 0.0 },
             receiving_bytes_per_s: self.send.iter().map(|class| class.rate.bytes_per_s()).sum(),
             queueing_delay: self.round_trip.queueing(),
+            capacity: self.path.capacity(),
             window_bytes: [0, 1, 2].map(|at| self.send[at].window()),
             outstanding_bytes: [0, 1, 2].map(|at| self.send[at].outstanding()),
             queue_bytes: [0, 1, 2].map(|at| self.send[at].queue_bytes()),

@@ -15,6 +15,7 @@ use super::receiver::{Admission, GIVEN_UP_TOLD, Inbox, MISSING_RANGES, MORE_RANG
 use super::sender::{FeedbackView, SendContext};
 use super::transport::Endpoint;
 use super::wire::{Datagram, LinkHeader, SenderId, VERSION, class_code, class_index};
+use crate::limit::capacity::Seen;
 
 /// What a Feedback lists, checked for form.
 struct Told {
@@ -261,6 +262,9 @@ impl Engine {
         if !peer.is_connected() {
             peer.phase = Phase::Up;
             peer.since = now;
+            if std::mem::replace(&mut peer.was_heard, true) {
+                peer.path.outage(now);
+            }
             self.missed.remove(&flow);
             peer.hello_due = true;
             peer.hello_at = now + HELLO_EVERY;
@@ -303,15 +307,29 @@ impl Engine {
             window_bytes: feedback.window_bytes,
             delivered_message: feedback.delivered_message,
         };
-        if !peer.send[class_index(class)].feedback(&mut ctx, &view) {
+        let sender = &mut peer.send[class_index(class)];
+        if !sender.feedback(&mut ctx, &view) {
             self.counters.stale += 1;
             return;
         }
-        peer.round_trip
+        let (delivered, lost) = sender.take_settled();
+        let round_trip = peer
+            .round_trip
             .echo(now, now_ns, feedback.echo_send_ns, feedback.echo_held_ns);
+        let wire = |(samples, bytes): (u64, u64)| {
+            let headers = self.budgets.wire_bytes(0).unwrap_or(0) as u64;
+            bytes + samples * headers
+        };
+        let seen = Seen {
+            delivered_bytes: wire(delivered),
+            lost_bytes: wire(lost),
+            round_trip,
+        };
+        peer.path.feedback(now, &seen);
         peer.last_feedback = Some(now);
         if peer.phase == Phase::Suspect {
             peer.phase = Phase::Up;
+            peer.path.outage(now);
             let flow = peer.endpoint.flow.clone();
             self.ledger.events.push_back(LinkEvent::PeerRecovered { flow });
         }

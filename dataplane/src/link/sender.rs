@@ -109,6 +109,8 @@ pub(crate) struct SendClass {
     last_sweep: Option<Instant>,
     pub loss: LossMeter,
     pub rate: RateMeter,
+    /// Samples and bytes that were found to be received and lost, since the last [`SendClass::take_settled`].
+    settled: [(u64, u64); 2],
 }
 
 /// What [`SendClass::transmit`] needs of its peer and engine.
@@ -153,6 +155,7 @@ impl SendClass {
             last_sweep: None,
             loss: LossMeter::default(),
             rate: RateMeter::default(),
+            settled: [(0, 0); 2],
         }
     }
 
@@ -180,6 +183,17 @@ impl SendClass {
     #[cfg(test)]
     pub(crate) fn skip_to_last_numbers(&mut self, left: u32) {
         self.next_number = LAST_NUMBER - left;
+    }
+
+    /// Whether there is anything to send, credit or not.
+    pub(crate) fn has_work(&self) -> bool {
+        !(self.repairs.is_empty() && self.current.is_none() && self.waiting.is_empty())
+    }
+
+    /// Samples and bytes that were received, and that were lost, since the last call.
+    pub(crate) fn take_settled(&mut self) -> ((u64, u64), (u64, u64)) {
+        let [received, lost] = std::mem::take(&mut self.settled);
+        (received, lost)
     }
 
     /// Bytes that wait or may have to be repaired.
@@ -329,7 +343,7 @@ impl SendClass {
     /// The next datagram with messages, if there is anything to send and credit for it. Returns it with the bytes of
     /// messages in it.
     pub(crate) fn transmit(&mut self, ctx: &mut SendContext<'_>) -> Option<(bytes::Bytes, usize)> {
-        if self.repairs.is_empty() && self.current.is_none() && self.waiting.is_empty() {
+        if !self.has_work() {
             return None;
         }
         let sequence = self.next_sequence();

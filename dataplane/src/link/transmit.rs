@@ -77,6 +77,7 @@ impl Engine {
             unsettled: 0,
             message_floor: 0,
         });
+        self.budgets.spend(now, &to.flow.layer, &mut peer.path, datagram.len());
         Some(Transmit {
             to,
             class: Priority::Control,
@@ -162,6 +163,8 @@ impl Engine {
         };
         for (index, class) in peer.send.iter_mut().enumerate() {
             if let Some(datagram) = class.probe(&mut ctx) {
+                self.budgets
+                    .spend(now, &peer.endpoint.flow.layer, &mut peer.path, datagram.len());
                 return Some(Transmit {
                     to: peer.endpoint.clone(),
                     class: Priority::ALL[index],
@@ -178,12 +181,17 @@ impl Engine {
     pub(super) fn transmit_messages(&mut self, now: Instant) -> Option<Transmit> {
         let count = self.peers.len();
         let send_ns = self.clocks.monotonic_ns(now);
+        self.budgets.paced_until = None;
         for (index, class) in Priority::ALL.iter().copied().enumerate() {
             for step in 1..=count {
                 let at = (self.cursors[index] + step) % count;
                 let Some(peer) = self.peers[at].as_mut().filter(|peer| peer.phase == Phase::Up) else {
                     continue;
                 };
+                let layer = &peer.endpoint.flow.layer;
+                if !peer.send[index].has_work() || !self.budgets.may_send(now, layer, &mut peer.path) {
+                    continue;
+                }
                 let mut ctx = SendContext {
                     now,
                     send_ns,
@@ -194,6 +202,7 @@ impl Engine {
                 };
                 if let Some((datagram, user_bytes)) = peer.send[index].transmit(&mut ctx) {
                     self.cursors[index] = at;
+                    self.budgets.spend(now, layer, &mut peer.path, datagram.len());
                     return Some(Transmit {
                         to: peer.endpoint.clone(),
                         class,

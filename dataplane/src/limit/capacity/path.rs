@@ -8,6 +8,10 @@ const MOST_TOLERANCE: Duration = Duration::from_millis(150);
 /// How long and in how many samples it must do so.
 const LASTING: Duration = Duration::from_millis(120);
 const LASTING_SAMPLES: u32 = 4;
+/// Over what time it is measured what comes out of the queue, later on.
+const BLOCK: Duration = Duration::from_millis(300);
+/// Samples nearer to one another count once: after a pause of the sender's many come at a time.
+const TOGETHER: Duration = Duration::from_millis(20);
 /// Samples further apart do not belong together.
 const APART: Duration = Duration::from_secs(1);
 /// A least round trip counts for this long, and as long again.
@@ -46,11 +50,16 @@ impl Delay {
         if self.queue <= self.tolerance() {
             self.run = None;
         } else if let Some(run) = self.run.as_mut().filter(|run| now - run.until <= APART) {
-            run.until = now;
-            run.samples += 1;
-            run.delivered += delivered;
+            run.add(now, delivered);
         } else {
-            self.run = Some(Run { since: now, until: now, samples: 1, delivered: 0.0 });
+            self.run = Some(Run {
+                since: now,
+                until: now,
+                samples: 1,
+                counted: now,
+                delivered: 0.0,
+                carried: None,
+            });
         }
     }
 
@@ -59,11 +68,9 @@ impl Delay {
         self.run.is_some()
     }
 
-    /// What came out of a queue that has lasted, in bytes per second.
+    /// What comes out of a queue that lasts, in bytes per second.
     pub(super) fn carried(&self) -> Option<f64> {
-        let run = self.run.as_ref()?;
-        let lasted = run.until - run.since;
-        (lasted >= LASTING && run.samples >= LASTING_SAMPLES).then(|| run.delivered / lasted.as_secs_f64())
+        self.run.as_ref().and_then(Run::bytes_per_s)
     }
 
     /// Begins to look for a queue anew.
@@ -86,11 +93,42 @@ impl Delay {
 /// Samples in a row that all have a queue before them.
 #[derive(Debug, Clone)]
 struct Run {
+    /// Of the current block, as what follows.
     since: Instant,
     until: Instant,
     samples: u32,
-    /// After the first.
+    /// When a sample was counted last.
+    counted: Instant,
+    /// After its first sample.
     delivered: f64,
+    /// Of the blocks before it.
+    carried: Option<f64>,
+}
+
+impl Run {
+    fn add(&mut self, now: Instant, delivered: f64) {
+        if now - self.counted >= TOGETHER {
+            self.counted = now;
+            self.samples += 1;
+        }
+        self.until = now;
+        self.delivered += delivered;
+        if now - self.since >= BLOCK {
+            self.carried = self.bytes_per_s();
+            (self.since, self.delivered, self.samples) = (now, 0.0, 1);
+        }
+    }
+
+    fn bytes_per_s(&self) -> Option<f64> {
+        let lasted = self.until - self.since;
+        let tells = lasted >= LASTING && self.samples >= LASTING_SAMPLES;
+        let newest = tells.then(|| self.delivered / lasted.as_secs_f64());
+        match (newest, self.carried) {
+            // What is much less is not the same rate measured again.
+            (Some(newest), Some(before)) if newest > 0.8 * before => Some(f64::midpoint(newest, before)),
+            (newest, before) => newest.or(before),
+        }
+    }
 }
 
 /// Share of bytes that are lost.

@@ -3,7 +3,7 @@
 use blaze_domain::node_file::MIN_MTU;
 
 use super::Chunking;
-use crate::link::MIN_DATAGRAM_BYTES;
+use crate::link::{MIN_DATAGRAM_BYTES, PacketSize};
 
 /// IPv4 and UDP headers.
 const IP_UDP: usize = 20 + 8;
@@ -62,6 +62,22 @@ impl Wire {
         self.max_datagram
     }
 
+    /// The same for whoever only adds up: what each packet carries of a datagram, and its headers.
+    pub(super) fn packets(self) -> PacketSize {
+        let one = self.bytes(self.max_datagram);
+        if one <= self.mtu {
+            return PacketSize {
+                content_bytes: self.max_datagram,
+                header_bytes: one - self.max_datagram,
+            };
+        }
+        let room = (self.mtu - BUDGET - RTPS_HEADER).saturating_sub(DATA_FRAG);
+        PacketSize {
+            content_bytes: (room / FRAGMENT).max(1) * FRAGMENT,
+            header_bytes: IP_UDP + RTPS_HEADER + DATA_FRAG,
+        }
+    }
+
     /// Bytes of the largest sample that may come in fragments: a datagram of this transport, or one packet of a flow
     /// whose `mtu` is above that of its interface.
     pub(super) fn largest_sample(self) -> u32 {
@@ -108,6 +124,17 @@ mod tests {
         assert_eq!(wire.bytes(6000), 5 * 84 + 6008);
         assert_eq!(wire.bytes(1400), 2 * 84 + 1408);
         assert_eq!(wire.bytes(1396), 1396 + 80);
+    }
+
+    #[test]
+    fn what_packets_add_is_reckoned_alike() {
+        for (chunking, loopback) in [(Chunking::Auto, false), (Chunking::Auto, true), (Chunking::Whole, false)] {
+            let wire = Wire::new(1500, chunking, loopback);
+            for datagram in [100, 1_000, wire.max_datagram_bytes()] {
+                let (exact, reckoned) = (wire.bytes(datagram), wire.packets().wire_bytes(datagram));
+                assert!(exact.abs_diff(reckoned) <= 16 + exact / 100, "{chunking:?} {datagram}: {exact}, {reckoned}");
+            }
+        }
     }
 
     #[test]

@@ -60,6 +60,12 @@ impl SendClass {
             sample.settled = true;
             self.outstanding = self.outstanding.saturating_sub(sample.bytes as usize);
             let parts = std::mem::take(&mut sample.parts);
+            // A probe is no message: its size says nothing of the link.
+            if !sample.probe {
+                let settled = &mut self.settled[usize::from(is_missing)];
+                settled.0 += 1;
+                settled.1 += u64::from(sample.bytes);
+            }
             if is_missing && sample.announces.is_some() {
                 self.announce = self.announce.max(sample.announces);
                 self.probe_due = true;
