@@ -39,6 +39,8 @@ pub struct FlowSpec {
     pub peers: Vec<Ipv4Addr>,
     /// `flow.bandwidth.limit_mbps`.
     pub limit_mbps: f64,
+    /// More keys of `flow.bandwidth`, such as `share: fair`.
+    pub bandwidth: String,
     /// Further lines of the node file.
     pub extra: String,
     /// More keys of `flow`, such as `access: […]`.
@@ -60,6 +62,7 @@ impl FlowSpec {
             host: None,
             peers: Vec::new(),
             limit_mbps: 160.0,
+            bandwidth: String::new(),
             extra: String::new(),
             flow: String::new(),
         }
@@ -139,8 +142,9 @@ impl FlowSpec {
         }
         let _ = write!(
             text,
-            "admin: {{ flow: \"127.0.0.1:0\" }}\nflow: {{ bandwidth: {{ limit_mbps: {} }}, {} }}\nstate_dir: {}\n{}",
+            "admin: {{ flow: \"127.0.0.1:0\" }}\nflow: {{ bandwidth: {{ limit_mbps: {}, {} }}, {} }}\nstate_dir: {}\n{}",
             self.limit_mbps,
+            self.bandwidth,
             self.flow,
             state.display(),
             self.extra

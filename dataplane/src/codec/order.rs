@@ -307,10 +307,11 @@ impl<K: Copy + Eq + Hash, W: Clone + Eq + Hash, T> InOrder<K, W, T> {
         let Some(queue) = self.queues.get_mut(key) else {
             return withdrawn;
         };
-        while let Some(waits) = queue.waits.get(writer)
-            && waits.len() > keep
-            && let Some(oldest) = waits.front().copied()
-        {
+        let surplus = queue.waits.get(writer).map_or(0, |waits| waits.len().saturating_sub(keep));
+        for _ in 0..surplus {
+            let Some(oldest) = queue.waits.get(writer).and_then(|waits| waits.front().copied()) else {
+                break;
+            };
             let bytes = remove(queue, oldest);
             self.held.remove(bytes);
             withdrawn.add(bytes);

@@ -47,6 +47,8 @@ const HIGHEST_LIMIT: f64 = 1e12;
 const KEPT: f64 = 0.95;
 /// Sent of what is delivered, to see whether the delay goes.
 const DRAINING: f64 = 0.5;
+/// Trials in a row that must gain nothing for a delay to be the path's own.
+const TRIALS: u32 = 2;
 /// Sent of what is delivered, to see whether the loss goes.
 const SPARING: f64 = 0.85;
 /// Estimates nearer to one another than this are of one rate.
@@ -143,6 +145,8 @@ struct Drain {
     since: Instant,
     /// The rate to return to.
     before: f64,
+    /// Which trial this is without anything gained.
+    vain: u32,
     /// What the bottleneck carries, if the delay is that of its queue.
     carried: f64,
     /// Seconds per second by which a queue of ours shrinks.
@@ -298,14 +302,15 @@ impl Capacity {
     fn drain_if_queued(&mut self, before: f64) {
         if let Some(carried) = self.delay.carried() {
             if std::env::var_os("SHOW").is_some() { println!("drain {:?} {:?}", self.now, self.delay); }
-            self.drain(before, carried);
+            self.drain(before, carried, 1);
         }
     }
 
-    fn drain(&mut self, before: f64, carried: f64) {
+    fn drain(&mut self, before: f64, carried: f64, vain: u32) {
         self.phase = Phase::Draining(Drain {
             since: self.now,
             before,
+            vain,
             carried,
             shrinking: (1.0 - self.floor() / carried).clamp(0.05, DRAINING),
             peak: self.delay.queue,
@@ -327,7 +332,7 @@ impl Capacity {
         let sent = self.step_sent / elapsed.as_secs_f64().max(1e-3);
         if elapsed >= STEP && drain.carried < 0.8 * sent && self.rate > self.floor() {
             // The link has become slower still: that is more than it carries.
-            self.drain(drain.before, drain.carried);
+            self.drain(drain.before, drain.carried, 1);
             return;
         }
         // In the trial a queue of ours shrinks by 100 ms and the tolerance.
@@ -342,7 +347,10 @@ impl Capacity {
         if after < trial + Duration::from_millis(150) {
             self.phase = Phase::Draining(drain);
         } else if drain.peak.saturating_sub(drain.least) >= tolerance.max(Duration::from_millis(60)) {
-            self.drain(drain.before, drain.carried);
+            self.drain(drain.before, drain.carried, 1);
+        } else if drain.vain < TRIALS {
+            // The link may have become slower meanwhile, by as much as was tried.
+            self.drain(drain.before, drain.carried, drain.vain + 1);
         } else {
             self.delay.is_own(self.now, drain.least);
             self.resume(drain.before);

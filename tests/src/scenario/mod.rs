@@ -84,6 +84,10 @@ pub struct Flow {
     pub peers: Vec<&'static str>,
     /// `flow.bandwidth.limit_mbps`
     pub limit_mbps: f64,
+    /// More keys of `flow.bandwidth`.
+    pub bandwidth: &'static str,
+    /// More keys of `flow`.
+    pub keys: &'static str,
     /// Further lines of the node file.
     pub extra: &'static str,
 }

@@ -106,6 +106,8 @@ impl Running {
         spec.kind = flow.kind.to_owned();
         spec.limit_mbps = flow.limit_mbps;
         spec.extra = flow.extra.to_owned();
+        spec.bandwidth = flow.bandwidth.to_owned();
+        spec.flow = flow.keys.to_owned();
         spec.layer_domain = flow.layer_domain;
         for name in &flow.brokers {
             spec = match self.broker(name)? {

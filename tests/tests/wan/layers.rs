@@ -55,6 +55,8 @@ pub(super) fn flow(
         layer_domain,
         peers: peers.to_vec(),
         limit_mbps: 100.0,
+        bandwidth: "",
+        keys: "",
         extra: "",
     }
 }

@@ -3,6 +3,7 @@
 //! Needs root, iproute2 and `/dev/net/tun`; scenarios need `scripts/services install` as well. Most measure time, so they run
 //! one after another. `BLAZE_LONG` selects the full durations.
 
+mod budget;
 mod cuts;
 mod emulator;
 mod joins;

@@ -40,7 +40,7 @@ impl Delay {
             Some((since, current, previous)) => (since, current.min(round_trip), previous),
         };
         // A pause is not jitter: it counts as twice what counts as a queue at least, at most.
-        let change = round_trip.abs_diff(self.newest).min(LEAST_TOLERANCE * 2);
+        let change = round_trip.abs_diff(self.newest).min(LEAST_TOLERANCE);
         if self.base.is_some() {
             self.jitter = (self.jitter * 15 + change) / 16;
         }
