@@ -5,6 +5,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use blaze_domain::node_file::{AccessRules, AutoBool, BandwidthSection, Chunking, FlowSection, NodeFile};
 use blaze_domain::{FlowId, LayerKind};
 
+use crate::lane::press::CompressionRules;
 use crate::plan::PlanRules;
 
 /// The inter scope of a flow.
@@ -29,6 +30,10 @@ pub struct InterSettings {
 pub struct LiveSettings {
     /// What may be sent on the inter scope.
     pub bandwidth: BandwidthSection,
+    /// How payloads are compressed for the inter scope.
+    pub compression: CompressionRules,
+    /// Threads for compression; 0: cores of the control group.
+    pub pool_threads: u16,
     /// Rules for topics.
     pub rules: PlanRules,
     /// Who may advertise and request what.
@@ -39,6 +44,11 @@ impl From<&FlowSection> for LiveSettings {
     fn from(flow: &FlowSection) -> Self {
         Self {
             bandwidth: flow.bandwidth.clone(),
+            compression: CompressionRules {
+                base: flow.compression,
+                topics: flow.topics.clone(),
+            },
+            pool_threads: flow.pool_threads,
             rules: PlanRules {
                 topics: flow.topics.clone(),
             },

@@ -4,6 +4,7 @@ use std::time::Instant;
 
 use blaze_brokers::{Content, Received};
 use blaze_domain::{DropReason, Origin, Scope, WriterId};
+use blaze_proto::frame::Compression;
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
 
@@ -40,6 +41,7 @@ impl From<DropReason> for Refusal {
 }
 
 /// Where a message stands when it reaches the bridges.
+#[derive(Debug)]
 pub(super) struct Admitted {
     /// As a broker gets it: with the hop that writing it is, and its age.
     pub(super) frame: Frame,
@@ -49,6 +51,8 @@ pub(super) struct Admitted {
     pub(super) age_us: u64,
     /// Since it came to this flow.
     pub(super) here_us: u64,
+    /// When its age was right.
+    pub(super) came: Instant,
     /// Published before its bridges were there: only for those that take what was kept.
     pub(super) kept: bool,
     /// Which bridges it is for.
@@ -56,7 +60,7 @@ pub(super) struct Admitted {
 }
 
 impl Admitted {
-    pub(super) fn new(frame: Frame, born_here: bool, age_us: u64, here_us: u64) -> Self {
+    pub(super) fn new(now: Instant, frame: Frame, born_here: bool, age_us: u64, here_us: u64) -> Self {
         let hops = frame.hops();
         Self {
             frame: frame.with_hops_and_age(hops.saturating_add(1), age_us),
@@ -64,8 +68,20 @@ impl Admitted {
             born_here,
             age_us,
             here_us,
+            came: now,
             kept: false,
             meant: For::All,
+        }
+    }
+
+    /// The same so many microseconds later.
+    pub(super) fn older(&self, by_us: u64) -> Self {
+        let age_us = self.age_us.saturating_add(by_us);
+        Self {
+            frame: self.frame.clone().with_hops_and_age(self.frame.hops(), age_us),
+            age_us,
+            here_us: self.here_us.saturating_add(by_us),
+            ..*self
         }
     }
 }
@@ -91,6 +107,10 @@ impl DataCore {
             ),
         };
         if frame.topic() != self.path(topic).name.as_str() {
+            return Err(DropReason::DecodeError.into());
+        }
+        if frame.compression() != Compression::None {
+            // Of the inter scope alone: no consumer of a broker would know what to do with it.
             return Err(DropReason::DecodeError.into());
         }
         let born_here = frame.hops() == 0;
@@ -135,7 +155,7 @@ impl DataCore {
         Ok(Admitted {
             kept,
             meant,
-            ..Admitted::new(frame, born_here, age_us, here_us)
+            ..Admitted::new(now, frame, born_here, age_us, here_us)
         })
     }
 

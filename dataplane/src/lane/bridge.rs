@@ -34,6 +34,7 @@ impl BridgeState {
             allocated_hz: None,
             sent_bytes: 0,
             sink,
+            pressing: 0,
             submitted: false,
             held: None,
             unwritten: None,
@@ -151,15 +152,8 @@ impl BridgeState {
         }
     }
 
-    pub(super) fn pass(
-        &mut self,
-        now: Instant,
-        topic: TopicId,
-        message: &Admitted,
-        large: bool,
-        succession: &mut Succession,
-        link: &mut dyn LaneLink,
-    ) {
+    /// Takes a message that it wants: filters, counts, and writes it to a broker. Returns what is to go to its lane, if it has one.
+    pub(super) fn pass(&mut self, now: Instant, message: &Admitted, large: bool) -> Option<Waiting> {
         if let Phase::Draining { until, latest } = &mut self.phase {
             *until = (*until).max(now + DRAIN).min(*latest);
         }
@@ -172,14 +166,14 @@ impl BridgeState {
         };
         if lifespan_ms > 0 && message.age_us > u64::from(lifespan_ms) * 1000 {
             self.stats.dropped.add(DropReason::Lifespan, 1);
-            return;
+            return None;
         }
         match self.gate.admit(now) {
             // What is kept for late joiners comes at once and is not repeated: the budget is the pacer's then.
             Err(DropReason::RateLimit) if message.kept => {}
             Err(reason) => {
                 self.stats.dropped.add(reason, 1);
-                return;
+                return None;
             }
             Ok(()) => {}
         }
@@ -188,7 +182,7 @@ impl BridgeState {
             Sink::Publish { writer, bare, .. } => {
                 let Some(writer) = writer else {
                     self.stats.dropped.add(DropReason::BrokerError, 1);
-                    return;
+                    return None;
                 };
                 let deadline = (lifespan_ms > 0)
                     .then(|| now + Duration::from_millis(lifespan_ms.into()) - Duration::from_micros(message.age_us));
@@ -200,22 +194,33 @@ impl BridgeState {
                     PublishOutcome::Dropped => self.stats.dropped.add(DropReason::BrokerError, 1),
                     PublishOutcome::TooLarge => self.stats.dropped.add(DropReason::TooLarge, 1),
                 }
+                None
             }
-            Sink::Lane { .. } => {
-                let waiting = Waiting {
-                    large,
-                    frame: frame.clone().with_hops_and_age(message.hops, message.age_us),
-                    arrived: now,
-                    lifespan: (lifespan_ms > 0).then(|| Duration::from_millis(lifespan_ms.into())),
-                };
-                if self.held.is_some() {
-                    // It is counted when it leaves here: it may go to another bridge.
-                    self.stats.taken.remove(bytes);
-                    self.hold(waiting, succession);
-                } else {
-                    self.submit(now, topic, waiting, link);
-                }
-            }
+            Sink::Lane { .. } => Some(Waiting {
+                large,
+                bytes,
+                frame: frame.clone().with_hops_and_age(message.hops, message.age_us),
+                arrived: now,
+                lifespan: (lifespan_ms > 0).then(|| Duration::from_millis(lifespan_ms.into())),
+            }),
+        }
+    }
+
+    /// To the lane's queue, or behind what is held before it.
+    pub(super) fn queue(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        waiting: Waiting,
+        succession: &mut Succession,
+        link: &mut dyn LaneLink,
+    ) {
+        if self.held.is_some() {
+            // It is counted when it leaves here: it may go to another bridge.
+            self.stats.taken.remove(waiting.bytes);
+            self.hold(waiting, succession);
+        } else {
+            self.submit(now, topic, waiting, link);
         }
     }
 

@@ -22,6 +22,7 @@ use super::admit::{Admitted, Refusal};
 use super::early::Early;
 use super::kept::KeptMessages;
 use super::measure::micros;
+use super::press::{Press, ToLanes};
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use super::places::topic_id;
 use super::reading::For;
@@ -124,6 +125,8 @@ pub struct DataCore {
     pub(super) succession: Succession,
     /// Of transient_local writers, for bridges that begin later.
     pub(super) kept: KeptMessages,
+    /// Compression and decompression.
+    pub(super) press: Press,
     /// Durable bridges that have just begun: topic and place.
     pub(super) begun: Vec<(TopicId, usize)>,
     /// What could not be attributed to a topic.
@@ -154,6 +157,7 @@ impl DataCore {
             early: Early::default(),
             succession: Succession::default(),
             kept: KeptMessages::default(),
+            press: Press::default(),
             begun: Vec::new(),
             unattributed: Drops::default(),
             allocation_due: false,
@@ -290,8 +294,8 @@ impl DataCore {
             return;
         }
         let age_us = frame.age_us();
-        let message = Admitted::new(frame, false, age_us, 0);
-        self.fan_out(now, topic, Scope::Inter, &message, link);
+        let message = Admitted::new(now, frame, false, age_us, 0);
+        self.press_in(now, topic, message, link);
     }
 
     /// Delivers what waited for the bridges of a topic: what is kept for late joiners, and what came over the link before
@@ -394,17 +398,21 @@ impl DataCore {
         self.topics.get_mut(topic.0 as usize)?.bridges.get_mut(bridge)
     }
 
-    fn fan_out(&mut self, now: Instant, topic: TopicId, from: Scope, message: &Admitted, link: &mut dyn LaneLink) {
+    pub(super) fn fan_out(&mut self, now: Instant, topic: TopicId, from: Scope, message: &Admitted, link: &mut dyn LaneLink) {
         self.kept.keep(now, topic, from, message);
         let path = &mut self.topics[topic.0 as usize];
         let large = path.is_large(self.config.large_bytes);
-        if path.bridges.iter().any(|bridge| bridge.from == from && bridge.lane_id().is_some()) {
-            self.allocation_due |= path.sent_size.note(now, message.frame.payload().len() as u64);
-        }
-        for bridge in path.bridges.iter_mut().filter(|bridge| bridge.from == from) {
+        let mut lanes = ToLanes::new();
+        for (at, bridge) in path.bridges.iter_mut().enumerate().filter(|(_, bridge)| bridge.from == from) {
             if bridge.takes() && bridge.wants(message) && bridge.is_meant(message.meant) {
-                bridge.pass(now, topic, message, large, &mut self.succession, link);
+                lanes.extend(bridge.pass(now, message, large).map(|waiting| (at, waiting)));
             }
+        }
+        if path.bridges.iter().any(|bridge| bridge.from == from && bridge.lane_id().is_some()) {
+            self.note_size(now, topic, message.frame.payload().len());
+        }
+        if !lanes.is_empty() {
+            self.press_out(now, topic, &message.frame, lanes, link);
         }
     }
 }

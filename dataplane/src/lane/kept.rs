@@ -46,7 +46,7 @@ impl Kept {
         let frame = self.frame.clone().with_hops_and_age(self.hops, age_us);
         Admitted {
             kept: true,
-            ..Admitted::new(frame, self.born_here, age_us, 0)
+            ..Admitted::new(now, frame, self.born_here, age_us, 0)
         }
     }
 }
@@ -249,7 +249,7 @@ mod tests {
             ..Header::new("map", origin, WriterId([writer; 16]), sequence, 0)
         };
         let frame = Frame::new(&header, Bytes::from(vec![0; bytes])).unwrap();
-        Admitted::new(frame, true, 5, 0)
+        Admitted::new(Instant::now(), frame, true, 5, 0)
     }
 
     fn sequences(kept: &KeptMessages, now: Instant) -> Vec<(u8, u64)> {

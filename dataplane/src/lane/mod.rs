@@ -10,6 +10,7 @@ pub mod load;
 pub mod measure;
 pub mod path;
 mod places;
+pub mod press;
 pub mod reading;
 pub mod stats;
 mod succession;

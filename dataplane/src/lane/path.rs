@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use blaze_domain::control::LeaseKind;
-use blaze_domain::node_file::TopicAccess;
+use blaze_domain::node_file::{Compression, TopicAccess};
 use blaze_domain::{DropReason, FlowId, LayerName, Priority, Scope, TopicName, WriterId};
 use blaze_proto::Frame;
 
@@ -13,6 +13,7 @@ use super::allocation::Granted;
 use super::core::FORGET;
 use super::load::LoadMeter;
 use super::measure::RateMeter;
+use super::press::{PressStats, TopicEffort};
 use super::reading::Places;
 use super::stats::{BridgeStats, Drops};
 use super::succession::{Held, Unwritten};
@@ -177,6 +178,8 @@ pub struct BridgeState {
     pub sent_bytes: u64,
     /// Where it writes.
     pub sink: Sink,
+    /// Messages that are being compressed, or wait behind such.
+    pub(super) pressing: u64,
     /// It has given messages to its lane since it last ended.
     pub(super) submitted: bool,
     /// Messages that wait until the receiver before this one has written its own.
@@ -261,6 +264,12 @@ pub struct TopicPath {
     pub bridges: Vec<BridgeState>,
     /// Largest payload seen, in bytes.
     pub largest_bytes: u64,
+    /// How its payloads are compressed for the inter scope.
+    pub compression: Compression,
+    /// The level over time.
+    pub(super) effort: TopicEffort,
+    /// What compression did.
+    pub press: PressStats,
     /// Largest payload as sent on the inter scope.
     pub sent_size: SizeMeter,
     /// What was decided for it, where it leaves on the inter scope.
@@ -297,6 +306,9 @@ impl TopicPath {
             info: TopicInfo::default(),
             bridges: Vec::new(),
             largest_bytes: 0,
+            compression: Compression::default(),
+            effort: TopicEffort::default(),
+            press: PressStats::default(),
             sent_size: SizeMeter::default(),
             granted: None,
             believed_hz: 0.0,

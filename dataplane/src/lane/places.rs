@@ -6,6 +6,7 @@ use std::time::Instant;
 use blaze_domain::{TopicName, WriterId};
 
 use super::core::{DRAIN, DataCore, FORGET, LaneLink, MAX_TOPICS};
+use super::press::ToLanes;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
 use super::succession::LONGEST_WAIT;
 use super::writer::NewWriter;
@@ -51,7 +52,8 @@ impl DataCore {
         if let Some(id) = self.by_name.get(name) {
             return Some(*id);
         }
-        let path = TopicPath::new(name.clone(), self.placed + 1, now);
+        let mut path = TopicPath::new(name.clone(), self.placed + 1, now);
+        path.compression = self.press.find(name);
         let id = match self.vacant.pop() {
             Some(id) => {
                 self.topics[id.0 as usize] = path;
@@ -142,10 +144,14 @@ impl DataCore {
             for message in self.kept.of(now, topic, bridge.from) {
                 // The rules may have changed since it came.
                 if bridge.takes() && path.info.takes(&message.frame) && bridge.wants(&message) {
-                    bridge.pass(now, topic, &message, large, &mut self.succession, link);
+                    let lanes: ToLanes = bridge.pass(now, &message, large).map(|waiting| (at, waiting)).into_iter().collect();
+                    if !lanes.is_empty() {
+                        self.press_out(now, topic, &message.frame, lanes, link);
+                    }
                 }
             }
-            if let Some(held) = &mut bridge.held {
+            let path = &mut self.topics[topic.0 as usize];
+            if let Some(held) = path.bridges.get_mut(at).and_then(|bridge| bridge.held.as_mut()) {
                 held.append(passed_on);
             }
         }

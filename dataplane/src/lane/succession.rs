@@ -56,6 +56,8 @@ const LOOK_LATER: Duration = Duration::from_millis(50);
 pub(super) struct Waiting {
     /// Its topic is.
     pub large: bool,
+    /// Of its payload as it was published.
+    pub bytes: u64,
     pub frame: Frame,
     /// When the flow took it in.
     pub arrived: Instant,
@@ -185,7 +187,7 @@ impl BridgeState {
         let Some(Held(held)) = &mut self.held else { return };
         let stats = &mut self.stats;
         let mut drop_one = |message: &Waiting| {
-            stats.taken.add(message.frame.payload().len() as u64);
+            stats.taken.add(message.bytes);
             stats.dropped.add(DropReason::QueueFull, 1);
         };
         if message.large && keep > 0 {
@@ -225,7 +227,7 @@ impl BridgeState {
         let until = self.waits_for_answer(now, link).unwrap_or(until);
         let lane = self.lane_id();
         let queued = match lane {
-            Some(lane) => link.queued(lane),
+            Some(lane) => link.queued(lane) + self.pressing,
             None => self.settle(),
         };
         // What a bridge from the inter scope has to empty is on its way to it: it stays until the end.
@@ -239,7 +241,7 @@ impl BridgeState {
             let mut dropped = link.drop_lane(lane);
             for message in self.held.take().unwrap_or_default().0 {
                 succession.held_bytes -= message.cost();
-                self.stats.taken.add(message.frame.payload().len() as u64);
+                self.stats.taken.add(message.bytes);
                 dropped += 1;
             }
             self.stats.dropped.add(DropReason::NoDestination, dropped);
@@ -400,7 +402,7 @@ impl DataCore {
                     break;
                 }
                 self.succession.held_bytes -= message.cost();
-                bridge.stats.taken.add(message.frame.payload().len() as u64);
+                bridge.stats.taken.add(message.bytes);
                 bridge.submit(now, topic, message, link);
             }
         }
@@ -428,6 +430,9 @@ impl DataCore {
 
     /// Whether something that came over the link waits for a broker.
     pub fn has_unwritten(&mut self) -> bool {
+        if self.press.delays_any() {
+            return true;
+        }
         let bridges = self.topics.iter_mut().flat_map(|topic| &mut topic.bridges);
         bridges
             .filter(|bridge| bridge.from == Scope::Inter)
@@ -513,6 +518,9 @@ impl DataCore {
         let Some(topic) = self.find(&question.topic) else {
             return true;
         };
+        if self.press.delays(topic) {
+            return false;
+        }
         let bridges = &mut self.topics[topic.0 as usize].bridges;
         let marks = question.marks.get_or_insert_with(|| {
             let writes = bridges

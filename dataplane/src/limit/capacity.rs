@@ -25,10 +25,12 @@
 //! - The rate rises only while at least half of it is used, as RFC 7661 has it; else it doubles in half a minute, so that
 //!   what was learned is forgotten in the end, even if the traffic is thinned because of it.
 
+mod drain;
 mod path;
 
 use std::time::{Duration, Instant};
 
+use drain::{DRAINING, Drain, TRIALS, Verdict};
 use path::{Delay, Loss};
 
 /// The rate never falls below this, in bytes per second, unless the limit is lower: what is small must get through.
@@ -45,10 +47,6 @@ pub const LOSS: f64 = 0.1;
 const HIGHEST_LIMIT: f64 = 1e12;
 /// Used of the estimate after a back-off, so that the queue stays empty.
 const KEPT: f64 = 0.95;
-/// Sent of what is delivered, to see whether the delay goes.
-const DRAINING: f64 = 0.5;
-/// Trials in a row that must gain nothing for a delay to be the path's own.
-const TRIALS: u32 = 2;
 /// Sent of what is delivered, to see whether the loss goes.
 const SPARING: f64 = 0.85;
 /// Estimates nearer to one another than this are of one rate.
@@ -141,22 +139,6 @@ enum Phase {
 }
 
 #[derive(Debug, Clone)]
-struct Drain {
-    since: Instant,
-    /// The rate to return to.
-    before: f64,
-    /// Which trial this is without anything gained.
-    vain: u32,
-    /// What the bottleneck carries, if the delay is that of its queue.
-    carried: f64,
-    /// Seconds per second by which a queue of ours shrinks.
-    shrinking: f64,
-    /// Longest delay of what was sent before, least of what was sent a while after.
-    peak: Duration,
-    least: Duration,
-}
-
-#[derive(Debug, Clone)]
 struct Spare {
     before: f64,
     carried: f64,
@@ -223,9 +205,10 @@ impl Capacity {
         self.loss.lost += seen.lost_bytes as f64;
         // A Feedback of an idle class echoes a datagram of long ago: its delay is none of now.
         let sample = seen.round_trip.filter(|_| seen.delivered_bytes > 0);
+        self.delay.delivered(delivered);
         if let Some(round_trip) = sample.filter(|round_trip| *round_trip <= LONGEST_ROUND_TRIP) {
-            if std::env::var_os("SHOW").is_some() { println!("{:?} rt {round_trip:?} {delivered} q {:?} tol {:?}", self.now, self.delay.queue, self.delay.tolerance()); }
-            self.delayed(round_trip, delivered);
+            self.delay.take(self.now, round_trip);
+            self.judge_delay();
         }
         self.judge_loss();
         self.rise();
@@ -241,8 +224,9 @@ impl Capacity {
     /// What the link carries, in bytes per second, at most the limit. `None`: nothing is known to limit below the limit.
     #[must_use]
     pub fn measured(&self) -> Option<f64> {
-        // What has been reached since without a queue is carried too.
-        self.estimate.map(|estimate| estimate.max(self.rate).min(self.limit))
+        // The steps near the estimate are to find its end; what is far above it is carried too.
+        let reached = |estimate: f64| if self.rate > STEP_FAR * estimate { self.rate } else { estimate };
+        self.estimate.map(|estimate| reached(estimate).min(self.limit))
     }
 
     /// The state, for people.
@@ -286,74 +270,43 @@ impl Capacity {
         self.step_sent = 0.0;
     }
 
-    /// Takes the delay of a datagram, and what was delivered with it.
-    fn delayed(&mut self, round_trip: Duration, delivered: f64) {
-        self.delay.take(self.now, round_trip, delivered);
-        match &self.phase {
+    fn judge_delay(&mut self) {
+        let before = match &mut self.phase {
+            Phase::Rising => self.rate,
+            Phase::Sparing(spare) => spare.before,
             Phase::Draining(drain) => {
+                let elapsed = self.now.saturating_duration_since(self.step).as_secs_f64();
+                let sent = self.step_sent / elapsed.max(1e-3);
+                let verdict = drain.judge(self.now, &self.delay, sent);
                 let drain = drain.clone();
-                self.drained(drain);
+                self.conclude(verdict, &drain);
+                return;
             }
-            Phase::Rising => self.drain_if_queued(self.rate),
-            Phase::Sparing(spare) => self.drain_if_queued(spare.before),
-        }
-    }
-
-    fn drain_if_queued(&mut self, before: f64) {
+        };
         if let Some(carried) = self.delay.carried() {
-            if std::env::var_os("SHOW").is_some() { println!("drain {:?} {:?}", self.now, self.delay); }
             self.drain(before, carried, 1);
         }
     }
 
-    fn drain(&mut self, before: f64, carried: f64, vain: u32) {
-        self.phase = Phase::Draining(Drain {
-            since: self.now,
-            before,
-            vain,
-            carried,
-            shrinking: (1.0 - self.floor() / carried).clamp(0.05, DRAINING),
-            peak: self.delay.queue,
-            least: Duration::MAX,
-        });
+    fn drain(&mut self, before: f64, carried: f64, trial: u32) {
+        // The floor may be more than the half.
+        let shrinking = 1.0 - self.floor() / carried;
+        self.phase = Phase::Draining(Drain::new(self.now, &self.delay, before, carried, trial, shrinking));
         self.set_rate(carried * DRAINING);
     }
 
-    /// Looks whether the delay has gone, has become less, or stays.
-    fn drained(&mut self, mut drain: Drain) {
-        let (queue, tolerance) = (self.delay.queue, self.delay.tolerance());
-        // The longer the queue lasts, the better is known what comes out of it.
-        drain.carried = self.delay.carried().unwrap_or(drain.carried);
-        if queue <= tolerance * 3 / 4 {
-            self.learn(drain.carried);
-            return;
-        }
-        let elapsed = self.since(drain.since);
-        let sent = self.step_sent / elapsed.as_secs_f64().max(1e-3);
-        if elapsed >= STEP && drain.carried < 0.8 * sent && self.rate > self.floor() {
-            // The link has become slower still: that is more than it carries.
-            self.drain(drain.before, drain.carried, 1);
-            return;
-        }
-        // In the trial a queue of ours shrinks by 100 ms and the tolerance.
-        let trial = (Duration::from_millis(100) + tolerance).div_f64(drain.shrinking);
-        // How long the newest datagram was sent after the beginning.
-        let after = elapsed.saturating_sub(self.delay.newest);
-        if after.is_zero() {
-            drain.peak = drain.peak.max(queue);
-        } else if after >= trial {
-            drain.least = drain.least.min(queue);
-        }
-        if after < trial + Duration::from_millis(150) {
-            self.phase = Phase::Draining(drain);
-        } else if drain.peak.saturating_sub(drain.least) >= tolerance.max(Duration::from_millis(60)) {
-            self.drain(drain.before, drain.carried, 1);
-        } else if drain.vain < TRIALS {
+    fn conclude(&mut self, verdict: Verdict, drain: &Drain) {
+        match verdict {
+            Verdict::Open => {}
+            Verdict::Gone => self.learn(drain.carried),
+            Verdict::Slower if self.rate <= self.floor() => {}
+            Verdict::Slower | Verdict::Less => self.drain(drain.before, drain.carried, 1),
             // The link may have become slower meanwhile, by as much as was tried.
-            self.drain(drain.before, drain.carried, drain.vain + 1);
-        } else {
-            self.delay.is_own(self.now, drain.least);
-            self.resume(drain.before);
+            Verdict::Stays if drain.trial < TRIALS => self.drain(drain.before, drain.carried, drain.trial + 1),
+            Verdict::Stays => {
+                self.delay.is_own(self.now, drain.least);
+                self.resume(drain.before);
+            }
         }
     }
 

@@ -12,7 +12,6 @@ const SECTIONS: &[&str] = &[
     "config",
     "cache",
     "database",
-    "flow.compression",
     "monitor",
     "worker",
     "control_plane",
@@ -21,23 +20,7 @@ const SECTIONS: &[&str] = &[
 /// Keys without effect in sections that have one: one warning per section.
 const KEYS: &[(&str, &[&str])] = &[
     ("admin", &["worker", "monitor"]),
-    (
-        "flow.bandwidth",
-        &[
-            "per_message_share",
-            "overhead",
-            "min_rate_hz",
-            "share",
-            "wire_overhead",
-            "adaptive",
-            "links",
-        ],
-    ),
-    ("flow", &["pool_threads"]),
 ];
-
-/// Keys without effect in the entries of `flow.topics`.
-const TOPIC_KEYS: &[&str] = &["compression"];
 
 pub(super) fn warn_of_what_is_not_in_effect(tree: &Value, root: &Node<'_>) {
     let at = |path: String| root.at(path);
@@ -50,10 +33,6 @@ pub(super) fn warn_of_what_is_not_in_effect(tree: &Value, root: &Node<'_>) {
         if let Some(section) = find(tree, path) {
             warn_of_keys(section, keys, &at((*path).to_owned()));
         }
-    }
-    let rules = find(tree, "flow.topics").and_then(Value::as_array);
-    for (index, rule) in rules.into_iter().flatten().enumerate() {
-        warn_of_keys(rule, TOPIC_KEYS, &at(format!("flow.topics[{index}]")));
     }
 }
 

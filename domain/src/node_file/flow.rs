@@ -172,7 +172,7 @@ word_enum!(
 word_enum!(
     /// How payloads are compressed.
     Codec {
-        /// LZ4 frames.
+        /// LZ4 blocks.
         Lz4 = "lz4",
         /// Not at all.
         None = "none",
@@ -188,6 +188,8 @@ pub struct Compression {
     pub level: u8,
     /// Smaller payloads go as they are.
     pub min_bytes: u32,
+    /// Whether a lower level is taken while the pool cannot keep up at this one.
+    pub adaptive: bool,
 }
 
 impl Default for Compression {
@@ -201,6 +203,7 @@ impl Compression {
         codec: Codec::Lz4,
         level: 10,
         min_bytes: LARGE_BYTES,
+        adaptive: true,
     };
 
     fn section(s: &mut Section<'_>) -> Self {
@@ -214,6 +217,7 @@ impl Compression {
             codec: change.codec.unwrap_or(self.codec),
             level: change.level.unwrap_or(self.level),
             min_bytes: change.min_bytes.unwrap_or(self.min_bytes),
+            adaptive: change.adaptive.unwrap_or(self.adaptive),
         }
     }
 }
@@ -227,6 +231,8 @@ pub struct CompressionOverride {
     pub level: Option<u8>,
     /// Smaller payloads go as they are.
     pub min_bytes: Option<u32>,
+    /// Whether a lower level is taken while the pool cannot keep up.
+    pub adaptive: Option<bool>,
 }
 
 impl CompressionOverride {
@@ -235,6 +241,7 @@ impl CompressionOverride {
             codec: s.opt("codec", parsed),
             level: s.opt("level", whole(1, 12)),
             min_bytes: s.opt("min_bytes", whole(0, MAX_BYTES)),
+            adaptive: s.opt("adaptive", boolean),
         }
     }
 
@@ -243,6 +250,7 @@ impl CompressionOverride {
             codec: self.codec.or(other.codec),
             level: self.level.or(other.level),
             min_bytes: self.min_bytes.or(other.min_bytes),
+            adaptive: self.adaptive.or(other.adaptive),
         }
     }
 }

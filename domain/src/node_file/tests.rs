@@ -154,7 +154,8 @@ fn an_empty_file_has_the_documented_defaults() {
         Compression {
             codec: Codec::Lz4,
             level: 10,
-            min_bytes: 65_536
+            min_bytes: 65_536,
+            adaptive: true
         }
     );
     assert_eq!(file.admin.flow.to_string(), "127.0.0.1:9101");

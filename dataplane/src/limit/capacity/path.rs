@@ -5,6 +5,8 @@ use std::time::{Duration, Instant};
 /// What every sample must exceed to count as a queue, at least and at most.
 const LEAST_TOLERANCE: Duration = Duration::from_millis(25);
 const MOST_TOLERANCE: Duration = Duration::from_millis(150);
+/// From one sample to the next. What is more is a pause, not jitter.
+const LARGEST_CHANGE: Duration = Duration::from_millis(35);
 /// How long and in how many samples it must do so.
 const LASTING: Duration = Duration::from_millis(120);
 const LASTING_SAMPLES: u32 = 4;
@@ -32,15 +34,21 @@ pub(super) struct Delay {
 }
 
 impl Delay {
-    /// Takes the round trip of a datagram, and the bytes that were delivered with it.
-    pub(super) fn take(&mut self, now: Instant, round_trip: Duration, delivered: f64) {
+    /// Takes the bytes that were delivered.
+    pub(super) fn delivered(&mut self, bytes: f64) {
+        if let Some(run) = &mut self.run {
+            run.delivered += bytes;
+        }
+    }
+
+    /// Takes the round trip of a datagram.
+    pub(super) fn take(&mut self, now: Instant, round_trip: Duration) {
         let (since, current, previous) = match self.base {
             None => (now, round_trip, round_trip),
             Some((since, current, _)) if now.saturating_duration_since(since) > BASE_HOLDS => (now, round_trip, current),
             Some((since, current, previous)) => (since, current.min(round_trip), previous),
         };
-        // A pause is not jitter: it counts as twice what counts as a queue at least, at most.
-        let change = round_trip.abs_diff(self.newest).min(LEAST_TOLERANCE);
+        let change = round_trip.abs_diff(self.newest).min(LARGEST_CHANGE);
         if self.base.is_some() {
             self.jitter = (self.jitter * 15 + change) / 16;
         }
@@ -50,7 +58,7 @@ impl Delay {
         if self.queue <= self.tolerance() {
             self.run = None;
         } else if let Some(run) = self.run.as_mut().filter(|run| now - run.until <= APART) {
-            run.add(now, delivered);
+            run.add(now);
         } else {
             self.run = Some(Run {
                 since: now,
@@ -106,13 +114,12 @@ struct Run {
 }
 
 impl Run {
-    fn add(&mut self, now: Instant, delivered: f64) {
+    fn add(&mut self, now: Instant) {
         if now - self.counted >= TOGETHER {
             self.counted = now;
             self.samples += 1;
         }
         self.until = now;
-        self.delivered += delivered;
         if now - self.since >= BLOCK {
             self.carried = self.bytes_per_s();
             (self.since, self.delivered, self.samples) = (now, 0.0, 1);
