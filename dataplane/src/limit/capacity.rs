@@ -1,56 +1,45 @@
 //! How much a link carries: an estimate from what its peer reports. A state machine without I/O; time is passed in.
 //!
 //! ```text
-//!            at the limit, or rising          delay or loss lasts           it went: it was ours
-//! new ─────▶ unknown ───────────────────────▶ backing_off ────────────────▶ steady: 0.95 of what was delivered,
-//! outage ──▶ slow_start ────────────────────▶      │                        then in steps up to the limit
-//!                                                  └─ it stayed: not ours; it is the path's own, and the rate returns
+//! new ────▶ unknown: all of the limit ─┐                    it goes: it was ours
+//!                                      ├─ delay or loss ──▶ backing_off ──▶ steady: 0.95 of what was delivered, then
+//! outage ─▶ slow_start: 1/32 of it, ───┘  that lasts         │              in steps up to the limit or the next delay
+//!           then in steps                                    └─ it stays: it is the path's; the rate is as before
 //! ```
 //!
-//! Nothing is concluded from a delivered rate alone: it may be low because little was offered. What tells is a queue that
-//! does not go away. A delay above that of the empty path is a queue before the bottleneck, and as long as it lasts, what
-//! comes out of it is what the bottleneck carries (the delivery rate of BBR, draft-ietf-ccwg-bbr).
+//! Nothing is concluded from a delivered rate alone: it may be low because little was offered. What tells is a queue
+//! that does not go away (`path.rs`): as long as it lasts, what comes out of it is what the bottleneck carries, as the
+//! delivery rate of BBR (draft-ietf-ccwg-bbr). Whether the queue is ours is tried out (`trial.rs`).
 //!
-//! Whether a delay (or a loss) is that of a queue of ours cannot be seen from its size: a route may have become longer, or
-//! somebody else's traffic may stand in the way. So it is tried out: half of the delivered rate is sent, which must shorten
-//! a queue of ours by half a second per second. What does not go away then belongs to the path, is its own from then on, and
-//! costs no more than that trial. It does what BBR does with ProbeRTT, only when there is a reason, and never takes a
-//! standing queue of ours for the delay of the path.
-//!
-//! - Delay of the empty path: the least round trip of the last 30 to 60 s, as the base delay of LEDBAT (RFC 6817, 4.2).
-//! - A delay counts when it exceeds that by 25 ms, or by five times the jitter (RFC 3550, 6.4.1), in every sample for a
-//!   while, as the overuse time of draft-ietf-rmcat-gcc. So a pause of the receiver does not count: it ends in between.
-//! - Loss alone counts only above [`LOSS`], as in draft-ietf-rmcat-gcc: radio loses without being full, and to send less does
-//!   not help there. A bottleneck with a queue of more than 25 ms shows a delay before it loses.
-//! - The rate rises only while at least half of it is used, as RFC 7661 has it; else it doubles in half a minute, so that
-//!   what was learned is forgotten in the end, even if the traffic is thinned because of it.
+//! The rate rises in steps only while at least half of it is used, as RFC 7661 has it for windows; else it doubles in
+//! half a minute, so that an estimate is forgotten in the end even if the traffic is thinned because of it.
 
-mod drain;
 mod path;
+mod trial;
 
 use std::time::{Duration, Instant};
 
-use drain::{DRAINING, Drain, TRIALS, Verdict};
 use path::{Delay, Loss};
+use trial::{DRAINING, Drain, Phase, SPARING, Spare, TRIALS, Verdict};
 
 /// The rate never falls below this, in bytes per second, unless the limit is lower: what is small must get through.
 pub const FLOOR_BYTES_PER_S: f64 = 16.0 * 1024.0;
 /// Nor below this share of the limit.
 pub const FLOOR_SHARE: f64 = 0.01;
-/// Share of the limit that slow start begins with. Five doublings reach the limit, in about two seconds; and a path that
-/// has become a hundred times slower than the limit gets no more than three times what it carries.
+/// Share of the limit that slow start begins with: five doublings below, which take three seconds at a round trip of
+/// 50 ms. A path that now carries a hundredth of the limit gets three times that, not a hundred times.
 pub const START_SHARE: f64 = 1.0 / 32.0;
-/// Loss above the ordinary that counts as a sign of a full link.
+/// Loss above the ordinary that counts as the sign of a full link, as in draft-ietf-rmcat-gcc.
 pub const LOSS: f64 = 0.1;
 
 /// No limit is taken for more than this, in bytes per second.
 const HIGHEST_LIMIT: f64 = 1e12;
-/// Used of the estimate after a back-off, so that the queue stays empty.
+/// Sent of the estimate after a back-off, so that the queue stays empty.
 const KEPT: f64 = 0.95;
-/// Sent of what is delivered, to see whether the loss goes.
-const SPARING: f64 = 0.85;
 /// Estimates nearer to one another than this are of one rate.
 const SAME: f64 = 0.2;
+/// Share of what has been sent without a queue that the link carries for certain.
+const PROVES: f64 = 0.9;
 /// Share of the rate that must be used for it to rise by steps.
 const USED: f64 = 0.5;
 /// Steps: in slow start, up to 1.25 times the estimate, and beyond that.
@@ -62,15 +51,15 @@ const STEP: Duration = Duration::from_millis(250);
 /// In what time an unused rate doubles.
 const FORGET_S: f64 = 30.0;
 /// Time at the limit without a queue after which nothing limits.
-const PROVEN: Duration = Duration::from_secs(10);
+const UNLIMITED: Duration = Duration::from_secs(10);
 /// Pause before the first step after a back-off; doubled each time the same estimate comes out, to spare the dips.
 const HOLD: Duration = Duration::from_secs(2);
 const LONGEST_HOLD: Duration = Duration::from_secs(8);
 /// A round trip above this is a mistake.
 const LONGEST_ROUND_TRIP: Duration = Duration::from_secs(30);
 
-/// What a Feedback tells. Bytes are wire bytes, as for [`Capacity::sent`]: a caller that counts less multiplies by its wire
-/// factor.
+/// What a Feedback tells. Bytes are wire bytes, as for [`Capacity::sent`]: a caller that counts less multiplies by its
+/// wire factor.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Seen {
     /// Received since the last Feedback.
@@ -126,25 +115,8 @@ pub struct Capacity {
     /// Before the next step.
     pause: Duration,
     hold: Duration,
-}
-
-#[derive(Debug, Clone)]
-enum Phase {
-    /// The rate rises, or is at the limit.
-    Rising,
-    /// Half is sent until the delay is gone, or is seen to stay.
-    Draining(Drain),
-    /// Less is sent, to see whether less is lost.
-    Sparing(Spare),
-}
-
-#[derive(Debug, Clone)]
-struct Spare {
-    before: f64,
-    carried: f64,
-    share: f64,
-    /// What was on the way at the beginning has been counted.
-    settled: bool,
+    /// What has been sent without a queue since the estimate, less what may be in a queue that is not seen yet.
+    proven: f64,
 }
 
 impl Capacity {
@@ -165,16 +137,23 @@ impl Capacity {
             step_sent: 0.0,
             pause: Duration::ZERO,
             hold: HOLD,
+            proven: 0.0,
         }
     }
 
     /// Changes the limit in bytes per second from now on. Where nothing else limits, the rate follows at once.
     pub fn set_limit(&mut self, limit_bytes_per_s: f64, now: Instant) {
-        let unlimited = self.state() == State::Unknown;
-        self.limit = sane_limit(limit_bytes_per_s);
-        self.estimate = self.estimate.filter(|estimate| *estimate < self.limit);
         self.advance(now);
-        self.set_rate(if unlimited { self.limit } else { self.rate });
+        let limit = sane_limit(limit_bytes_per_s);
+        let unlimited = self.state() == State::Unknown;
+        // A step goes on if nothing changes for it, however often the limit is told.
+        let rate = if unlimited { limit } else { self.rate };
+        let is_same = limit == self.limit;
+        self.limit = limit;
+        self.estimate = self.estimate.filter(|estimate| *estimate < limit);
+        if !is_same {
+            self.set_rate(rate);
+        }
     }
 
     /// Takes what has left, of all classes and LinkControl too: one call per datagram.
@@ -201,8 +180,7 @@ impl Capacity {
     pub fn feedback(&mut self, now: Instant, seen: &Seen) {
         self.advance(now);
         let delivered = seen.delivered_bytes as f64;
-        self.loss.delivered += delivered;
-        self.loss.lost += seen.lost_bytes as f64;
+        self.loss.add(delivered, seen.lost_bytes as f64);
         // A Feedback of an idle class echoes a datagram of long ago: its delay is none of now.
         let sample = seen.round_trip.filter(|_| seen.delivered_bytes > 0);
         self.delay.delivered(delivered);
@@ -214,19 +192,20 @@ impl Capacity {
         self.rise();
     }
 
-    /// What may be sent now, in bytes per second: at most the limit, at least [`FLOOR_BYTES_PER_S`] and [`FLOOR_SHARE`] of the
-    /// limit, if the limit allows.
+    /// What may be sent now, in bytes per second: at most the limit, at least [`FLOOR_BYTES_PER_S`] and [`FLOOR_SHARE`]
+    /// of the limit, if the limit allows.
     #[must_use]
     pub fn bytes_per_s(&self) -> f64 {
         self.rate
     }
 
-    /// What the link carries, in bytes per second, at most the limit. `None`: nothing is known to limit below the limit.
+    /// What the link carries, in bytes per second, at most the limit. `None`: nothing is known to limit below that.
     #[must_use]
     pub fn measured(&self) -> Option<f64> {
+        let estimate = self.estimate?;
         // The steps near the estimate are to find its end; what is far above it is carried too.
-        let reached = |estimate: f64| if self.rate > STEP_FAR * estimate { self.rate } else { estimate };
-        self.estimate.map(|estimate| reached(estimate).min(self.limit))
+        let is_far = self.rate > STEP_FAR * estimate;
+        Some(if is_far { self.rate } else { estimate }.min(self.limit))
     }
 
     /// The state, for people.
@@ -264,6 +243,11 @@ impl Capacity {
         FLOOR_BYTES_PER_S.max(self.limit * FLOOR_SHARE).min(self.limit)
     }
 
+    /// Since the rate was set.
+    fn sent_bytes_per_s(&self) -> f64 {
+        self.step_sent / self.since(self.step).as_secs_f64().max(1e-3)
+    }
+
     fn set_rate(&mut self, bytes_per_s: f64) {
         self.rate = bytes_per_s.max(self.floor()).min(self.limit);
         self.step = self.now;
@@ -271,12 +255,13 @@ impl Capacity {
     }
 
     fn judge_delay(&mut self) {
+        // Below the floor it cannot go, whatever arrives.
+        let can_fall = self.rate > self.floor();
+        let sent = if can_fall { self.sent_bytes_per_s() } else { 0.0 };
         let before = match &mut self.phase {
             Phase::Rising => self.rate,
             Phase::Sparing(spare) => spare.before,
             Phase::Draining(drain) => {
-                let elapsed = self.now.saturating_duration_since(self.step).as_secs_f64();
-                let sent = self.step_sent / elapsed.max(1e-3);
                 let verdict = drain.judge(self.now, &self.delay, sent);
                 let drain = drain.clone();
                 self.conclude(verdict, &drain);
@@ -299,7 +284,6 @@ impl Capacity {
         match verdict {
             Verdict::Open => {}
             Verdict::Gone => self.learn(drain.carried),
-            Verdict::Slower if self.rate <= self.floor() => {}
             Verdict::Slower | Verdict::Less => self.drain(drain.before, drain.carried, 1),
             // The link may have become slower meanwhile, by as much as was tried.
             Verdict::Stays if drain.trial < TRIALS => self.drain(drain.before, drain.carried, drain.trial + 1),
@@ -313,13 +297,19 @@ impl Capacity {
     /// The back-off helped: the link carries so much.
     fn learn(&mut self, carried: f64) {
         let carried = carried / (1.0 - self.loss.ordinary);
-        let near = self.estimate.filter(|estimate| (carried / estimate - 1.0).abs() < SAME);
-        let estimate = near.map_or(carried, |estimate| f64::midpoint(estimate, carried));
+        let known = self.estimate.map(|estimate| estimate.max(self.proven));
+        let near = known.filter(|known| (carried / known - 1.0).abs() < SAME);
+        let estimate = near.map_or(carried, |known| f64::midpoint(known, carried));
         let estimate = estimate.max(self.floor()).min(self.limit);
         self.estimate = Some(estimate);
-        self.hold = if near.is_some() { (self.hold * 2).min(LONGEST_HOLD) } else { HOLD };
+        self.hold = if near.is_some() {
+            (self.hold * 2).min(LONGEST_HOLD)
+        } else {
+            HOLD
+        };
         self.resume(estimate * KEPT);
         self.pause = self.hold;
+        self.proven = 0.0;
     }
 
     fn resume(&mut self, bytes_per_s: f64) {
@@ -330,31 +320,33 @@ impl Capacity {
         self.set_rate(bytes_per_s);
     }
 
+    /// Where the link is known to limit, less is needed to see it again.
+    fn tolerated_loss(&self) -> f64 {
+        let excess = if self.estimate.is_some() { LOSS / 2.0 } else { LOSS };
+        self.loss.ordinary + excess
+    }
+
     fn judge_loss(&mut self) {
-        let Some((share, delivered)) = self.loss.judge(self.now, self.datagram_bytes) else {
+        let Some(lost) = self.loss.judge(self.now, self.datagram_bytes) else {
             return;
         };
-        let ordinary = self.loss.ordinary;
+        let (ordinary, tolerated) = (self.loss.ordinary, self.tolerated_loss());
         match &mut self.phase {
             Phase::Draining(_) => {}
-            Phase::Rising if share > ordinary + LOSS => {
-                self.phase = Phase::Sparing(Spare {
-                    before: self.rate,
-                    carried: delivered,
-                    share,
-                    settled: false,
-                });
-                self.set_rate(delivered / (1.0 - ordinary) * SPARING);
+            Phase::Rising if lost.lasting > tolerated => {
+                self.phase = Phase::Sparing(Spare::new(self.rate, lost));
+                self.set_rate(lost.delivered / (1.0 - ordinary) * SPARING);
             }
-            Phase::Rising => self.loss.ordinary = ordinary.min(share),
-            Phase::Sparing(spare) if !spare.settled => spare.settled = true,
+            Phase::Rising => self.loss.ordinary = ordinary.min(lost.share),
             Phase::Sparing(spare) => {
                 let (before, carried) = (spare.before, spare.carried);
-                if share - ordinary < (spare.share - ordinary) / 2.0 {
-                    self.learn(carried);
-                } else {
-                    self.loss.ordinary = share.min(0.9);
-                    self.resume(before);
+                match spare.judge(lost, ordinary) {
+                    Verdict::Gone => self.learn(carried),
+                    Verdict::Stays => {
+                        self.loss.ordinary = lost.share.min(0.9);
+                        self.resume(before);
+                    }
+                    Verdict::Open | Verdict::Less | Verdict::Slower => {}
                 }
             }
         }
@@ -363,28 +355,33 @@ impl Capacity {
     fn rise(&mut self) {
         let elapsed = self.since(self.step);
         let settled = elapsed >= self.pause.max(self.delay.newest + STEP);
-        if !settled || self.delay.is_queued() || !matches!(self.phase, Phase::Rising) {
+        let loses = self.loss.previous.is_some_and(|share| share > self.tolerated_loss());
+        if !settled || loses || self.delay.is_queued() || !matches!(self.phase, Phase::Rising) {
             return;
         }
         if self.rate >= self.limit {
             self.estimate = None;
         }
-        let elapsed = elapsed.as_secs_f64();
+        let sent = self.sent_bytes_per_s();
+        self.proven = self.proven.max(PROVES * sent.min(self.rate));
         let factor = match self.estimate {
-            _ if self.step_sent < USED * self.rate * elapsed => (elapsed.min(1.0) / FORGET_S).exp2(),
+            _ if sent < USED * self.rate => (elapsed.as_secs_f64().min(1.0) / FORGET_S).exp2(),
             None => STEP_START,
             Some(estimate) if self.rate < STEP_FAR * estimate => STEP_NEAR,
             Some(_) => STEP_FAR,
         };
         self.set_rate(self.rate * factor);
         let trial = self.estimate.is_some() && self.rate >= self.limit;
-        self.pause = if trial { PROVEN } else { Duration::ZERO };
+        self.pause = if trial { UNLIMITED } else { Duration::ZERO };
     }
 }
 
 fn sane_limit(bytes_per_s: f64) -> f64 {
-    // The larger of NaN and a number is the number.
-    bytes_per_s.max(1.0).min(HIGHEST_LIMIT)
+    if bytes_per_s.is_nan() {
+        1.0
+    } else {
+        bytes_per_s.clamp(1.0, HIGHEST_LIMIT)
+    }
 }
 
 #[cfg(test)]

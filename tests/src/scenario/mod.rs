@@ -118,6 +118,8 @@ pub struct Stream {
     pub bytes: usize,
     /// Zero = for ever.
     pub lifespan: Duration,
+    /// Whether its payload is like a raw picture; else nothing in it can be compressed.
+    pub image: bool,
 }
 
 /// What breaks, or is mended.

@@ -490,9 +490,11 @@ fn words(stream: &Stream) -> String {
         hz,
         bytes,
         lifespan,
+        image,
         ..
     } = stream;
-    format!("{topic},{reliability},{hz},{bytes},{}", lifespan.as_millis())
+    let payload = if *image { "image" } else { "noise" };
+    format!("{topic},{reliability},{hz},{bytes},{},{payload}", lifespan.as_millis())
 }
 
 fn of_topic<'a>(row: &'a Value, topic: &str) -> &'a Value {

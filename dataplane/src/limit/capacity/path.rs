@@ -1,15 +1,21 @@
 //! What a path does to datagrams: how long it takes, and what it loses.
+//!
+//! - Delay of the empty path: the least round trip of the last 30 to 60 s, as the base delay of LEDBAT (RFC 6817, 4.2).
+//! - A delay counts when each round trip of a while exceeds that by 25 ms, or by five times the jitter (smoothed as in
+//!   RFC 3550, 6.4.1). It must last, as the overuse of draft-ietf-rmcat-gcc: a pause of the receiver ends before.
+//! - Loss counts less than delay: radio loses without being full, and to send less does not help it. A bottleneck with
+//!   a queue of more than 25 ms shows a delay before it loses.
 
 use std::time::{Duration, Instant};
 
 /// What every sample must exceed to count as a queue, at least and at most.
 const LEAST_TOLERANCE: Duration = Duration::from_millis(25);
 const MOST_TOLERANCE: Duration = Duration::from_millis(150);
-/// From one sample to the next. What is more is a pause, not jitter.
-const LARGEST_CHANGE: Duration = Duration::from_millis(35);
 /// How long and in how many samples it must do so.
 const LASTING: Duration = Duration::from_millis(120);
 const LASTING_SAMPLES: u32 = 4;
+/// A larger change from one sample to the next is a pause, and counts as jitter with no more than this.
+const LARGEST_CHANGE: Duration = Duration::from_millis(35);
 /// Over what time it is measured what comes out of the queue, later on.
 const BLOCK: Duration = Duration::from_millis(300);
 /// Samples nearer to one another count once: after a pause of the sender's many come at a time.
@@ -20,7 +26,7 @@ const APART: Duration = Duration::from_secs(1);
 const BASE_HOLDS: Duration = Duration::from_secs(30);
 /// Loss is judged over this time, and over so many datagrams.
 const LOSS_WINDOW: Duration = Duration::from_secs(1);
-const LOSS_DATAGRAMS: f64 = 200.0;
+const LOSS_DATAGRAMS: f64 = 400.0;
 
 /// Round trips of a path, and how much of the newest is queueing.
 #[derive(Debug, Clone, Default)]
@@ -45,7 +51,9 @@ impl Delay {
     pub(super) fn take(&mut self, now: Instant, round_trip: Duration) {
         let (since, current, previous) = match self.base {
             None => (now, round_trip, round_trip),
-            Some((since, current, _)) if now.saturating_duration_since(since) > BASE_HOLDS => (now, round_trip, current),
+            Some((since, current, _)) if now.saturating_duration_since(since) > BASE_HOLDS => {
+                (now, round_trip, current)
+            }
             Some((since, current, previous)) => (since, current.min(round_trip), previous),
         };
         let change = round_trip.abs_diff(self.newest).min(LARGEST_CHANGE);
@@ -141,12 +149,25 @@ impl Run {
 /// Share of bytes that are lost.
 #[derive(Debug, Clone)]
 pub(super) struct Loss {
-    pub(super) since: Instant,
-    pub(super) delivered: f64,
-    pub(super) lost: f64,
+    since: Instant,
+    delivered: f64,
+    lost: f64,
+    /// Of the last window, for people.
     pub(super) newest: f64,
+    /// Of the window before, if it counts.
+    pub(super) previous: Option<f64>,
     /// What is lost whether much is sent or little.
     pub(super) ordinary: f64,
+}
+
+/// A window.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Lost {
+    pub(super) share: f64,
+    /// Lesser share of this one and the one before: a rate that changed in between would be mistaken.
+    pub(super) lasting: f64,
+    /// In bytes per second.
+    pub(super) delivered: f64,
 }
 
 impl Loss {
@@ -156,25 +177,41 @@ impl Loss {
             delivered: 0.0,
             lost: 0.0,
             newest: 0.0,
+            previous: None,
             ordinary: 0.0,
         }
     }
 
+    /// Begins to count anew.
     pub(super) fn restart(&mut self, now: Instant) {
+        self.begin(now);
+        self.previous = None;
+    }
+
+    fn begin(&mut self, now: Instant) {
         (self.since, self.delivered, self.lost) = (now, 0.0, 0.0);
     }
 
-    /// The share, and the bytes per second delivered, once there is enough to tell.
-    pub(super) fn judge(&mut self, now: Instant, datagram_bytes: f64) -> Option<(f64, f64)> {
+    pub(super) fn add(&mut self, delivered: f64, lost: f64) {
+        self.delivered += delivered;
+        self.lost += lost;
+    }
+
+    /// The window, once there is enough in it to tell.
+    pub(super) fn judge(&mut self, now: Instant, datagram_bytes: f64) -> Option<Lost> {
         let elapsed = now.saturating_duration_since(self.since);
         let total = self.delivered + self.lost;
         if elapsed < LOSS_WINDOW || total < (LOSS_DATAGRAMS * datagram_bytes).max(1.0) {
             return None;
         }
-        self.newest = self.lost / total;
-        let delivered = self.delivered / elapsed.as_secs_f64();
-        self.restart(now);
-        Some((self.newest, delivered))
+        let share = self.lost / total;
+        let lost = Lost {
+            share,
+            lasting: self.previous.map_or(0.0, |previous| previous.min(share)),
+            delivered: self.delivered / elapsed.as_secs_f64(),
+        };
+        (self.newest, self.previous) = (share, Some(share));
+        self.begin(now);
+        Some(lost)
     }
 }
-

@@ -73,6 +73,16 @@ pub(crate) struct Topic {
     pub(crate) hz: f64,
     pub(crate) bytes: usize,
     pub(crate) lifespan: Duration,
+    pub(crate) payload: Payload,
+}
+
+/// What is in a payload.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Payload {
+    /// Nothing that could be compressed.
+    Noise,
+    /// Like a raw picture: smooth, with the noise of a sensor.
+    Image,
 }
 
 impl FromStr for Topic {
@@ -80,8 +90,13 @@ impl FromStr for Topic {
 
     fn from_str(text: &str) -> anyhow::Result<Self> {
         let parts: Vec<&str> = text.split(',').collect();
+        let (parts, payload) = match parts[..] {
+            [.., "image"] => (&parts[..parts.len() - 1], Payload::Image),
+            [.., "noise"] => (&parts[..parts.len() - 1], Payload::Noise),
+            _ => (&parts[..], Payload::Noise),
+        };
         let [name, reliability, hz, bytes, lifespan] = parts[..] else {
-            anyhow::bail!("{text}: NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS is expected")
+            anyhow::bail!("{text}: NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS[,noise|image] is expected")
         };
         Ok(Self {
             name: name.parse()?,
@@ -93,6 +108,7 @@ impl FromStr for Topic {
             hz: hz.parse()?,
             bytes: bytes.parse()?,
             lifespan: Duration::from_millis(lifespan.parse()?),
+            payload,
         })
     }
 }

@@ -6,7 +6,7 @@ use blaze_sdk::{Advertise, Lease, PublishOptions, Publisher, ServiceManager};
 use bytes::Bytes;
 use tokio::signal::unix::{SignalKind, signal};
 
-use crate::{LARGE_BYTES, Options, Topic};
+use crate::{LARGE_BYTES, Options, Payload, Topic};
 
 const ROW: Duration = Duration::from_secs(1);
 
@@ -36,12 +36,29 @@ impl Source {
         };
         Ok(Self {
             publisher: service.broker().publisher(&topic.name, &terms)?,
-            payload: Bytes::from(vec![7; topic.bytes]),
+            payload: payload(topic.payload, topic.bytes),
             period: Duration::from_secs_f64(1.0 / topic.hz),
             due: Instant::now(),
             _lease: service.flow().advertise(advertise).await?,
         })
     }
+}
+
+/// Bytes that are the same in each run.
+fn payload(kind: Payload, bytes: usize) -> Bytes {
+    // A linear congruential generator (Knuth, MMIX): its upper bits are as good as random here.
+    let mut state = 0x9e37_79b9_7f4a_7c15u64;
+    let mut random = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 56) as u8
+    };
+    // Rows of 640 pixels of three bytes.
+    let pixel = |at: usize| (at % 1920 / 12 + at / 1920 / 4) as u8;
+    let content = (0..bytes).map(|at| match kind {
+        Payload::Noise => random(),
+        Payload::Image => pixel(at).wrapping_add(random() % 3),
+    });
+    content.collect::<Vec<u8>>().into()
 }
 
 /// Publishes until SIGUSR1 or the end of its time; the leases stay until the end of its time.

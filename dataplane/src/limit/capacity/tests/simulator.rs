@@ -1,4 +1,4 @@
-//! A sender that is paced by an estimate, a bottleneck with a queue, and a receiver that reports. In steps of a millisecond.
+//! A sender that is paced by an estimate, a bottleneck with a queue, and a receiver that reports. In steps of 1 ms.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -357,7 +357,10 @@ impl Simulator {
 
     /// Longest wait before the bottleneck, in milliseconds.
     pub(super) fn longest_queue(&self, from: f64, to: f64) -> f64 {
-        self.between(from, to).iter().map(|entry| entry.queue).fold(0.0, f64::max)
+        self.between(from, to)
+            .iter()
+            .map(|entry| entry.queue)
+            .fold(0.0, f64::max)
     }
 
     pub(super) fn least_rate(&self, from: f64, to: f64) -> f64 {
