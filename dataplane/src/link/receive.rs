@@ -1,6 +1,6 @@
 //! What the engine takes: LinkControl, and datagrams of messages.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use blaze_domain::{FlowId, Priority};
 use blaze_proto::link::LinkControl;
@@ -16,6 +16,9 @@ use super::sender::{FeedbackView, SendContext};
 use super::transport::Endpoint;
 use super::wire::{Datagram, LinkHeader, SenderId, VERSION, class_code, class_index};
 use crate::limit::capacity::Seen;
+
+/// Without Feedback for this long the way to a peer may have become another one.
+const LONG_SILENCE: Duration = Duration::from_secs(1);
 
 /// What a Feedback lists, checked for form.
 struct Told {
@@ -326,10 +329,13 @@ impl Engine {
             round_trip,
         };
         peer.path.feedback(now, &seen);
-        peer.last_feedback = Some(now);
+        let silent = peer.last_feedback.replace(now).map(|last| now.saturating_duration_since(last));
         if peer.phase == Phase::Suspect {
             peer.phase = Phase::Up;
-            peer.path.outage(now);
+            // After a moment the way is the same one; a slow start would cost more than it spares.
+            if silent.is_none_or(|silent| silent >= LONG_SILENCE) {
+                peer.path.outage(now);
+            }
             let flow = peer.endpoint.flow.clone();
             self.ledger.events.push_back(LinkEvent::PeerRecovered { flow });
         }
