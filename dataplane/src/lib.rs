@@ -2,6 +2,7 @@
 //!
 //! See `ARCHITECTURE.md` for the map.
 
+pub mod codec;
 pub mod control;
 pub mod flow;
 pub mod lane;

@@ -1,15 +1,15 @@
 //! LZ4 blocks: payloads are compressed for the inter scope, and what comes from there is taken apart with distrust.
 //!
-//! A block does not say how long it was; the message header does (`uncompressed_bytes`). Whoever sent it may have written any
-//! number there and any bytes after it, so nothing is believed: the size is checked before memory is taken for it, and the
-//! result must have that size exactly.
+//! A block does not say how long it was; the message header does (`uncompressed_bytes`). Whoever sent it may have
+//! written any number there and any bytes after it, so nothing is believed: the size is checked before memory is taken
+//! for it, and the result must have that size exactly.
 
 use ::lz4::block::{CompressionMode, compress_to_buffer, decompress_to_buffer};
 use blaze_domain::MAX_PAYLOAD_BYTES;
 use bytes::Bytes;
 
 #[cfg(test)]
-mod image;
+pub(super) mod image;
 #[cfg(test)]
 mod tests;
 
@@ -19,7 +19,11 @@ pub const HIGHEST_LEVEL: u8 = 12;
 const FIRST_HIGH_LEVEL: u8 = 3;
 /// What one byte of a block can expand to at most: one that lengthens a match by 255 bytes.
 const MOST_OF_ONE_BYTE: u64 = 255;
-/// A payload that stays larger than this part of it, in percent, goes as it is: to take it apart would cost more than it saves.
+/// LZ4 finds nothing in fewer bytes. Its levels above 9 must not even be given nothing: they read from the address of
+/// an empty slice, and there is no memory.
+const SMALLEST: usize = 13;
+/// A payload that stays larger than this part of it, in percent, goes as it is: to take it apart would cost more than
+/// it saves.
 const WORTHWHILE_PERCENT: usize = 97;
 
 /// Why a payload from the inter scope is not taken apart.
@@ -63,14 +67,15 @@ pub enum Refused {
     },
 }
 
-/// Compresses a payload at a level of the node file: 1 and 2 are LZ4's fast mode (LZ4 has no step between them), 3 to 12 its high
-/// compression; others count as the nearest one.
+/// Compresses a payload at a level of the node file: 1 and 2 are LZ4's fast mode (LZ4 has no step between them), 3 to
+/// 12 its high compression; others count as the nearest one.
 ///
-/// `None`: it goes as it is, because it would not become at least 3 % smaller (less a few bytes that LZ4 keeps free at its
-/// end), or is larger than a payload may be. Takes no more memory than the payload has, besides 256 KiB that LZ4 works with.
+/// `None`: it goes as it is, because it would not become at least 3 % smaller (less a few bytes that LZ4 keeps free at
+/// its end), or is larger than a payload may be. Takes no more memory than the payload has, besides 256 KiB that LZ4
+/// works with.
 #[must_use]
 pub fn compress(payload: &[u8], level: u8) -> Option<Bytes> {
-    if payload.len() > MAX_PAYLOAD_BYTES {
+    if !(SMALLEST..=MAX_PAYLOAD_BYTES).contains(&payload.len()) {
         return None;
     }
     let mode = if level < FIRST_HIGH_LEVEL {
@@ -87,17 +92,16 @@ pub fn compress(payload: &[u8], level: u8) -> Option<Bytes> {
     Some(block.into())
 }
 
-/// Takes a block apart that announces its size. No memory is taken before that size is checked against `most`, against the
-/// largest payload and against what so many bytes can hold at all; then exactly the announced size, whatever the block holds.
-/// The time is linear in both sizes.
+/// Takes a block apart that announces its size. No memory is taken before that size is checked against `most`, against
+/// the largest payload and against what so many bytes can hold at all; then exactly the announced size, whatever the
+/// block holds. The time is linear in both sizes.
 ///
 /// # Errors
 /// [`Refused`]; nothing of the block is given then.
 pub fn decompress(block: &[u8], announced: u64, most: usize) -> Result<Bytes, Refused> {
     let (size, narrow) = check(block.len(), announced, most)?;
     let mut payload = vec![0; size];
-    let found =
-        decompress_to_buffer(block, Some(narrow), &mut payload).map_err(|_| Refused::Damaged { announced })?;
+    let found = decompress_to_buffer(block, Some(narrow), &mut payload).map_err(|_| Refused::Damaged { announced })?;
     if found == size {
         Ok(payload.into())
     } else {

@@ -7,8 +7,8 @@
 //! received ─────────────────► pool: lz4, first of all ─► ingress
 //! ```
 //!
-//! Each part is whole by itself: [`lz4`] is the codec, [`order`] keeps messages in order while some of them are with the pool,
-//! [`pool`] are the threads, and [`effort`] picks the level. What connects them is not here.
+//! Each part is whole by itself: [`lz4`] is the codec, [`order`] keeps messages in order while some of them are with
+//! the pool, [`pool`] are the threads, and [`effort`] picks the level. What connects them is not here.
 
 use std::time::{Duration, Instant};
 
@@ -34,7 +34,8 @@ pub struct Compressed {
     pub before: usize,
     /// Time on the processor.
     pub processor: Duration,
-    /// Time that a thread of the pool was taken, waiting for a processor included: what [`effort::Effort`] wants to know.
+    /// Time that a thread of the pool was taken, waiting for a processor included: what [`effort::Effort`] wants to
+    /// know.
     pub taken: Duration,
 }
 

@@ -5,9 +5,9 @@
 //!   pop_ready ◄─┘         └─ finish      └─ may be withdrawn
 //! ```
 //!
-//! Each key (a topic) has a queue of places. What is finished waits in its place until all before it have left; other keys do not
-//! notice. Without clock, threads or locks: whoever owns it holds it behind a lock of his own. Everything costs O(log n) in the
-//! places of one key at most.
+//! Each key (a topic) has a queue of places. What is finished waits in its place until all before it have left; other
+//! keys do not notice. Without clock, threads or locks: whoever owns it holds it behind a lock of his own. Everything
+//! costs O(log n) in the places of one key at most.
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -77,8 +77,8 @@ pub enum Full {
     All,
 }
 
-/// A place that is pending. Of use for the [`InOrder`] that gave it only; one that is finished, given up, withdrawn or removed
-/// means nothing any more.
+/// A place that is pending. Of use for the [`InOrder`] that gave it only; one that is finished, given up, withdrawn or
+/// removed means nothing any more.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Ticket<K> {
     key: K,
@@ -201,7 +201,10 @@ impl<K: Copy + Eq + Hash, W: Clone + Eq + Hash, T> InOrder<K, W, T> {
 
     fn room(&self, key: &K, bytes: usize) -> Result<(), Full> {
         let bounds = &self.bounds;
-        if !self.waiting_of(key).has_room(bytes, bounds.items_of_one, bounds.bytes_of_one) {
+        if !self
+            .waiting_of(key)
+            .has_room(bytes, bounds.items_of_one, bounds.bytes_of_one)
+        {
             return Err(Full::Key);
         }
         if !self.held.has_room(bytes, bounds.items, bounds.bytes) {
@@ -220,7 +223,8 @@ impl<K: Copy + Eq + Hash, W: Clone + Eq + Hash, T> InOrder<K, W, T> {
         number
     }
 
-    /// Somebody begins to work on it: from now on it is not withdrawn. `false`: it is not wanted any more, the work can be spared.
+    /// Somebody begins to work on it: from now on it is not withdrawn. `false`: it is not wanted any more, the work can
+    /// be spared.
     pub fn begin(&mut self, ticket: &Ticket<K>) -> bool {
         let Some(queue) = self.queues.get_mut(&ticket.key) else {
             return false;
@@ -280,8 +284,8 @@ impl<K: Copy + Eq + Hash, W: Clone + Eq + Hash, T> InOrder<K, W, T> {
         true
     }
 
-    /// The oldest item of a key, if it is ready. To be called until there is none, after each push, [`InOrder::finish`],
-    /// [`InOrder::give_up`] and [`InOrder::keep_newest`].
+    /// The oldest item of a key, if it is ready. To be called until there is none, after each push,
+    /// [`InOrder::finish`], [`InOrder::give_up`] and [`InOrder::keep_newest`].
     pub fn pop_ready(&mut self, key: &K) -> Option<T> {
         let queue = self.queues.get_mut(key)?;
         let first = queue.places.first_entry()?;
@@ -300,14 +304,17 @@ impl<K: Copy + Eq + Hash, W: Clone + Eq + Hash, T> InOrder<K, W, T> {
         }
     }
 
-    /// Of one writer's places that nobody works on yet only the newest `keep` stay. Returns what was withdrawn, for the caller to
-    /// count.
+    /// Of one writer's places that nobody works on yet only the newest `keep` stay. Returns what was withdrawn, for the
+    /// caller to count.
     pub fn keep_newest(&mut self, key: &K, writer: &W, keep: usize) -> Waiting {
         let mut withdrawn = Waiting::default();
         let Some(queue) = self.queues.get_mut(key) else {
             return withdrawn;
         };
-        let surplus = queue.waits.get(writer).map_or(0, |waits| waits.len().saturating_sub(keep));
+        let surplus = queue
+            .waits
+            .get(writer)
+            .map_or(0, |waits| waits.len().saturating_sub(keep));
         for _ in 0..surplus {
             let Some(oldest) = queue.waits.get(writer).and_then(|waits| waits.front().copied()) else {
                 break;

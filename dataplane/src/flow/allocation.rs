@@ -27,6 +27,10 @@ impl Shared {
             if moved {
                 limiter.touch();
             }
+            if let Some(pool) = self.plane.codec() {
+                let threads = pool.counters().threads;
+                self.plane.read(|state| state.core.share_pool(now, threads));
+            }
             let (all, links) = self.totals(&sent);
             let measured = self.capacities();
             limiter.look(now, all, &links, measured);

@@ -42,6 +42,7 @@ use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
+use crate::codec::pool::CodecPool;
 use crate::control::{ControlConfig, ControlCore};
 use crate::lane::core::{DataConfig, DataCore};
 use crate::limit::limiter::Limiter;
@@ -258,8 +259,12 @@ pub async fn start_with(
         started_s: wall_ns() as f64 / 1e9,
     });
 
-    let bandwidth = shared.live.lock().bandwidth.clone();
-    shared.set_bandwidth(now, &bandwidth);
+    let live = shared.live.lock().clone();
+    shared.set_bandwidth(now, &live.bandwidth);
+    shared.plane.read(|state| state.core.set_compression(live.compression.clone()));
+    if shared.inter.is_some() {
+        shared.plane.compress_with(start_pool(live.pool_threads, &supervisor)?);
+    }
     let metrics_of = Arc::clone(&shared);
     let admin = AdminServer::bind(
         settings.admin,
@@ -330,6 +335,14 @@ impl RunningFlow {
     pub fn reload(&self, live: LiveSettings) {
         let now = Instant::now();
         self.shared.set_bandwidth(now, &live.bandwidth);
+        self.shared
+            .plane
+            .read(|state| state.core.set_compression(live.compression.clone()));
+        if let Some(pool) = self.shared.plane.codec()
+            && let Err(error) = pool.resize(crate::codec::pool::threads(live.pool_threads))
+        {
+            tracing::warn!(%error, "the compression pool keeps the threads that it has");
+        }
         {
             let mut control = self.shared.control.lock();
             control.set_rules(now, live.rules.clone());
@@ -386,6 +399,9 @@ impl RunningFlow {
             }
         }
         shared.egress.stop();
+        if let Some(pool) = shared.plane.codec() {
+            pool.stop();
+        }
         shared.plane.wake();
         if let Some(pacer) = &self.pacer {
             pacer.finished().await;
@@ -397,6 +413,15 @@ impl RunningFlow {
         self.drain().await;
         self.supervisor.shutdown(Duration::from_secs(1)).await;
     }
+}
+
+/// Starts the threads that compress.
+fn start_pool(threads: u16, supervisor: &Supervisor) -> anyhow::Result<CodecPool> {
+    let supervisor = supervisor.clone();
+    let spawner = move |name: String, run: Box<dyn FnOnce() + Send>| {
+        supervisor.spawn_thread(name, TaskPolicy::MayEnd, run).map(|_| ())
+    };
+    CodecPool::start(crate::codec::pool::threads(threads), Box::new(spawner)).context("starting the compression pool")
 }
 
 /// Starts the threads of the inter scope; gives that of the pacer.

@@ -4,18 +4,21 @@
 //! they wait. What the link has to say to the control core is put into a bounded inbox.
 
 use std::collections::VecDeque;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock, Weak};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::Received;
-use blaze_domain::{DropReason, FlowId, Priority, Scope};
+use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Priority, Scope};
 use blaze_proto::link::link_control::Body;
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::Notify;
 
+use crate::codec::pool::{CodecPool, Completion, Job, Urgency};
+use crate::codec::{Compressed, lz4, processor_time};
 use crate::lane::core::{DataCore, LaneLink};
 use crate::lane::load::Loads;
+use crate::lane::press::{PressJob, PressWork, Pressed};
 use crate::lane::path::TopicId;
 use crate::link::transport::{Endpoint, TransportEvent};
 use crate::link::{Engine, LaneId, LinkEvent, Submit, Transmit};
@@ -92,6 +95,14 @@ impl PlaneState {
         }
     }
 
+    /// Takes what became of a job of the pool.
+    pub fn pressed(&mut self, now: Instant, job: PressJob, pressed: Pressed) {
+        match &mut self.engine {
+            Some(engine) => self.core.pressed(now, job, pressed, engine),
+            None => self.core.pressed(now, job, pressed, &mut NoLink),
+        }
+    }
+
     /// Takes a sample of what every bridge carries; to be called once a second.
     pub fn measure(&mut self, now: Instant) -> Loads {
         match &self.engine {
@@ -160,6 +171,9 @@ impl PlaneState {
 
 /// Message path and link of one flow.
 pub struct Plane {
+    /// Itself, for jobs of the pool.
+    this: Weak<Self>,
+    codec: OnceLock<CodecPool>,
     state: Mutex<PlaneState>,
     /// The pacer waits here while it has nothing to send.
     work: Condvar,
@@ -172,7 +186,9 @@ impl Plane {
     /// Puts a message path and a link behind their lock.
     #[must_use]
     pub fn new(core: DataCore, engine: Option<Engine>) -> Arc<Self> {
-        Arc::new(Self {
+        Arc::new_cyclic(|this| Self {
+            this: Weak::clone(this),
+            codec: OnceLock::new(),
             state: Mutex::new(PlaneState { core, engine }),
             work: Condvar::new(),
             news: Mutex::default(),
@@ -183,7 +199,7 @@ impl Plane {
 
     /// Does something under the lock, carries out what the link then wants, and wakes the pacer.
     pub fn with<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> R {
-        let (result, told) = {
+        let (result, told, jobs) = {
             let mut state = self.state.lock();
             let result = action(&mut state);
             // Told under the lock: who is up and who is down must reach the control core in the order of its happening.
@@ -192,13 +208,62 @@ impl Plane {
                 told = true;
                 self.tell(event);
             });
-            (result, told)
+            (result, told, state.core.take_press_jobs())
         };
+        self.give_to_pool(jobs);
         self.work.notify_one();
         if told {
             self.news_waits.notify_one();
         }
         result
+    }
+
+    /// Payloads are compressed from now on, by this pool.
+    pub fn compress_with(&self, pool: CodecPool) {
+        if self.codec.set(pool).is_ok() {
+            self.state.lock().core.enable_compression();
+        }
+    }
+
+    /// The pool, if there is one.
+    pub fn codec(&self) -> Option<&CodecPool> {
+        self.codec.get()
+    }
+
+    /// Called without the lock: a job that is not taken comes back at once.
+    fn give_to_pool(&self, jobs: Vec<PressJob>) {
+        for job in jobs {
+            let (ticket, work, payload) = (job.ticket(), job.work, job.payload.clone());
+            let plane = Weak::clone(&self.this);
+            let told = Weak::clone(&self.this);
+            let done = Completion::new(move |pressed: Option<Pressed>| {
+                if let Some(plane) = told.upgrade() {
+                    plane.pressed(job, pressed.unwrap_or(Pressed::NotDone));
+                }
+            });
+            let (urgency, bytes) = match work {
+                PressWork::Compress(_) => (Urgency::Compress, payload.len()),
+                PressWork::Decompress(announced) => {
+                    let result = usize::try_from(announced).unwrap_or(usize::MAX).min(MAX_PAYLOAD_BYTES);
+                    (Urgency::Decompress, payload.len() + result)
+                }
+            };
+            let run = move || {
+                let wanted = plane.upgrade().is_some_and(|plane| plane.read(|state| state.core.begins(ticket)));
+                if wanted {
+                    done.give(press(&payload, work));
+                }
+            };
+            if let Some(pool) = self.codec.get()
+                && let Err((job, _)) = pool.submit(Job::new(urgency, bytes, run))
+            {
+                drop(job);
+            }
+        }
+    }
+
+    fn pressed(&self, job: PressJob, pressed: Pressed) {
+        self.with(|state| state.pressed(Instant::now(), job, pressed));
     }
 
     /// Looks at the state without changing what the link does.
@@ -337,5 +402,26 @@ impl Plane {
             return;
         }
         news.push_back(News::Link(Box::new(event)));
+    }
+}
+
+/// Does what is to be done with a payload.
+fn press(payload: &bytes::Bytes, work: PressWork) -> Pressed {
+    match work {
+        PressWork::Compress(level) => {
+            let (began, began_on_processor) = (Instant::now(), processor_time());
+            let block = lz4::compress(payload, level);
+            Pressed::Compressed(Compressed {
+                block,
+                level,
+                before: payload.len(),
+                processor: processor_time().saturating_sub(began_on_processor),
+                taken: began.elapsed(),
+            })
+        }
+        PressWork::Decompress(announced) => match lz4::decompress(payload, announced, MAX_PAYLOAD_BYTES) {
+            Ok(payload) => Pressed::Decompressed(payload),
+            Err(_) => Pressed::Refused,
+        },
     }
 }

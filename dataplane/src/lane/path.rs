@@ -267,7 +267,7 @@ pub struct TopicPath {
     /// How its payloads are compressed for the inter scope.
     pub compression: Compression,
     /// The level over time.
-    pub(super) effort: TopicEffort,
+    pub effort: TopicEffort,
     /// What compression did.
     pub press: PressStats,
     /// Largest payload as sent on the inter scope.

@@ -21,7 +21,7 @@ use super::admit::Admitted;
 use super::core::{DataCore, LaneLink};
 use super::path::{Phase, TopicId};
 use super::succession::Waiting;
-use crate::codec::effort::Effort;
+use crate::codec::effort::{Effort, shares};
 use crate::codec::order::{Bounds, InOrder, Ticket};
 
 /// How payloads are compressed, by topic.
@@ -60,6 +60,24 @@ pub struct PressJob {
     pub payload: Bytes,
     /// What is to be done with it.
     pub work: PressWork,
+}
+
+/// Which job.
+#[derive(Debug, Clone, Copy)]
+pub struct PressTicket {
+    ticket: Ticket<TopicId>,
+    outward: bool,
+}
+
+impl PressJob {
+    /// To ask whether it is still wanted.
+    #[must_use]
+    pub fn ticket(&self) -> PressTicket {
+        PressTicket {
+            ticket: self.ticket,
+            outward: matches!(self.item, Item::Out(_)),
+        }
+    }
 }
 
 /// What is to be done with a payload.
@@ -162,10 +180,30 @@ impl DataCore {
     }
 
     /// Somebody begins with a job. `false`: it is not wanted any more; it is to be given back as [`Pressed::NotDone`].
-    pub fn begins(&mut self, job: &PressJob) -> bool {
-        match job.item {
-            Item::Out(_) => self.press.out.begin(&job.ticket),
-            Item::In(_) => self.press.into.begin(&job.ticket),
+    pub fn begins(&mut self, job: PressTicket) -> bool {
+        match job.outward {
+            true => self.press.out.begin(&job.ticket),
+            false => self.press.into.begin(&job.ticket),
+        }
+    }
+
+    /// Divides the pool among topics by what they need; to be called about twice a second.
+    pub fn share_pool(&mut self, now: Instant, threads: usize) {
+        let mut topics = Vec::new();
+        let mut wanted = Vec::new();
+        for (at, path) in self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant) {
+            let Some((_, _, effort)) = &mut path.effort.0 else { continue };
+            let published = path.in_rate.rate(now).0;
+            let lanes = path.bridges.iter().filter(|bridge| bridge.lane_id().is_some());
+            let admitted = lanes.map(|bridge| bridge.allocated_hz.unwrap_or(published).min(published));
+            effort.demand(now, admitted.fold(0.0, f64::max));
+            topics.push(at);
+            wanted.push(effort.wanted());
+        }
+        for (at, share) in topics.into_iter().zip(shares(threads as f64, &wanted)) {
+            if let Some((_, _, effort)) = &mut self.topics[at].effort.0 {
+                effort.set_threads(share);
+            }
         }
     }
 
@@ -404,6 +442,12 @@ impl TopicEffort {
         }
         let (_, _, effort) = self.0.as_mut()?;
         effort.next(now)
+    }
+
+    /// Whether payloads are not compressed for now.
+    #[must_use]
+    pub fn goes_as_it_is(&self) -> bool {
+        self.0.as_ref().is_some_and(|(_, _, effort)| effort.goes_as_it_is())
     }
 
     fn compressed(&mut self, now: Instant, done: &crate::codec::Compressed) {

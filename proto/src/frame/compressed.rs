@@ -5,8 +5,9 @@
 //!                         ◄─decompressed─
 //! ```
 //!
-//! The two fields are put behind the others and cut out again, so that the header that comes back is, byte for byte, the one that
-//! went in: with fields that this version does not know, and in the order that another implementation chose.
+//! The two fields are put behind the others and cut out again, so that the header that comes back is, byte for byte,
+//! the one that went in: with fields that this version does not know, and in the order that another implementation
+//! chose.
 
 use std::ops::Range;
 
@@ -48,18 +49,20 @@ impl Frame {
         }
     }
 
-    /// Bytes of the payload before it was compressed, as the sender says; 0 where it is not compressed. Any number may stand
-    /// there: it is to be checked before memory is taken for it.
+    /// Bytes of the payload before it was compressed, as the sender says; 0 where it is not compressed. Any number may
+    /// stand there: it is to be checked before memory is taken for it.
     #[must_use]
     pub fn uncompressed_bytes(&self) -> u64 {
         self.index.uncompressed_bytes
     }
 
-    /// The same message with its payload as an LZ4 block that was `uncompressed_bytes` long. Hops and age stay beside it.
+    /// The same message with its payload as an LZ4 block that was `uncompressed_bytes` long. Hops and age stay beside
+    /// it.
     ///
     /// # Errors
-    /// [`FrameError::HeaderTooLarge`] if the header has no room for the two fields (at most 7 bytes): then the message goes as it
-    /// is. [`FrameError::Field`] if it is compressed already, [`FrameError::PayloadTooLarge`] if one of the sizes is not allowed.
+    /// [`FrameError::HeaderTooLarge`] if the header has no room for the two fields (at most 7 bytes): then the message
+    /// goes as it is. [`FrameError::Field`] if it is compressed already, [`FrameError::PayloadTooLarge`] if one of the
+    /// sizes is not allowed.
     pub fn compressed(&self, payload: Bytes, uncompressed_bytes: u64) -> Result<Self, FrameError> {
         if self.is_compressed() {
             return Err(FrameError::Field {
@@ -72,7 +75,8 @@ impl Frame {
             return Err(FrameError::PayloadTooLarge(uncompressed));
         }
         let header = &self.head[PREFIX_BYTES..];
-        let added = key_len(COMPRESSION_TAG) + 1 + key_len(UNCOMPRESSED_BYTES_TAG) + encoded_len_varint(uncompressed_bytes);
+        let added =
+            key_len(COMPRESSION_TAG) + 1 + key_len(UNCOMPRESSED_BYTES_TAG) + encoded_len_varint(uncompressed_bytes);
         let mut head = begin(header.len() + added)?;
         head.put_slice(header);
         // Written even if it is 0, so that what is cut out again is what was added.
@@ -86,8 +90,8 @@ impl Frame {
     /// The same message with its payload as it was before [`Frame::compressed`]. Hops and age stay beside it.
     ///
     /// # Errors
-    /// [`FrameError::Field`] if it is not an LZ4 block, says so twice, or announced another size than that of `payload`;
-    /// [`FrameError::PayloadTooLarge`].
+    /// [`FrameError::Field`] if it is not an LZ4 block, says so twice, or announced another size than that of
+    /// `payload`; [`FrameError::PayloadTooLarge`].
     pub fn decompressed(&self, payload: Bytes) -> Result<Self, FrameError> {
         if self.compression() != Compression::Lz4Block {
             return Err(FrameError::Field {
@@ -139,8 +143,8 @@ fn begin(header_bytes: usize) -> Result<BytesMut, FrameError> {
     Ok(head)
 }
 
-/// Where the last `compression` and the last `uncompressed_bytes` stand; of several the last one counts, and is the one that
-/// [`Frame::compressed`] has added. Empty where there is none.
+/// Where the last `compression` and the last `uncompressed_bytes` stand; of several the last one counts, and is the one
+/// that [`Frame::compressed`] has added. Empty where there is none.
 fn places(header: &[u8]) -> Result<[Range<usize>; 2], FrameError> {
     let mut places = [0..0, 0..0];
     let mut rest = header;

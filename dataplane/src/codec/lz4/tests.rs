@@ -5,6 +5,13 @@ use super::*;
 use proptest::prelude::*;
 use std::time::{Duration, Instant};
 
+impl Noise {
+    /// A number below `bound`, which is not 0.
+    fn below(&mut self, bound: usize) -> usize {
+        usize::try_from(self.next() % bound as u64).unwrap()
+    }
+}
+
 fn inputs() -> usize {
     if std::env::var_os("BLAZE_LONG").is_some() {
         100_000
@@ -16,7 +23,12 @@ fn inputs() -> usize {
 /// What a payload becomes on its way, and that it fits.
 fn there_and_back(payload: &[u8], level: u8) -> Option<usize> {
     let block = compress(payload, level)?;
-    assert!(block.len() * 100 <= payload.len() * 97, "level {level}: {} of {}", block.len(), payload.len());
+    assert!(
+        block.len() * 100 <= payload.len() * 97,
+        "level {level}: {} of {}",
+        block.len(),
+        payload.len()
+    );
     let back = decompress(&block, payload.len() as u64, payload.len()).unwrap();
     assert!(back == payload, "level {level}, {} bytes", payload.len());
     Some(block.len())
@@ -43,8 +55,13 @@ fn every_level_gives_back_a_camera_frame() {
 #[test]
 fn every_level_takes_what_is_small_long_or_repeats() {
     for level in 1..=12 {
-        assert_eq!(compress(b"", level), None);
-        assert_eq!(compress(b"x", level), None);
+        for length in 0..40 {
+            let few = vec![b'x'; length];
+            assert!(
+                there_and_back(&few, level).is_none_or(|_| length >= SMALLEST),
+                "{length}"
+            );
+        }
         let repeated = vec![7; 300_000];
         let length = there_and_back(&repeated, level).unwrap();
         assert!(length < 1_500, "{length}");
@@ -81,15 +98,36 @@ fn the_result_holds_no_more_memory_than_it_has_bytes() {
 #[test]
 fn a_size_is_checked_before_memory_is_taken_for_it() {
     let refused = |block, announced, most| check(block, announced, most).unwrap_err();
-    assert!(matches!(refused(100, 1_001, 1_000), Refused::TooLarge { most: 1_000, .. }));
-    assert!(matches!(refused(1 << 20, u64::MAX, usize::MAX), Refused::TooLarge { most: MAX_PAYLOAD_BYTES, .. }));
-    assert!(matches!(refused(1 << 20, MAX_PAYLOAD_BYTES as u64 + 1, usize::MAX), Refused::TooLarge { .. }));
-    assert!(matches!(refused(10, 2_551, 10_000), Refused::Impossible { found: 10, .. }));
+    assert!(matches!(
+        refused(100, 1_001, 1_000),
+        Refused::TooLarge { most: 1_000, .. }
+    ));
+    assert!(matches!(
+        refused(1 << 20, u64::MAX, usize::MAX),
+        Refused::TooLarge {
+            most: MAX_PAYLOAD_BYTES,
+            ..
+        }
+    ));
+    assert!(matches!(
+        refused(1 << 20, MAX_PAYLOAD_BYTES as u64 + 1, usize::MAX),
+        Refused::TooLarge { .. }
+    ));
+    assert!(matches!(
+        refused(10, 2_551, 10_000),
+        Refused::Impossible { found: 10, .. }
+    ));
     assert!(matches!(refused(0, 1, 10_000), Refused::Impossible { .. }));
-    assert!(matches!(refused(MAX_PAYLOAD_BYTES + 1, 1, 10_000), Refused::BlockTooLarge { .. }));
+    assert!(matches!(
+        refused(MAX_PAYLOAD_BYTES + 1, 1, 10_000),
+        Refused::BlockTooLarge { .. }
+    ));
     assert!(matches!(refused(usize::MAX, 1, 10_000), Refused::BlockTooLarge { .. }));
     assert_eq!(check(10, 2_550, 10_000), Ok((2_550, 2_550)));
-    assert_eq!(check(MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES as u64, usize::MAX).map(|size| size.0), Ok(MAX_PAYLOAD_BYTES));
+    assert_eq!(
+        check(MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES as u64, usize::MAX).map(|size| size.0),
+        Ok(MAX_PAYLOAD_BYTES)
+    );
 }
 
 #[test]
@@ -109,10 +147,22 @@ fn only_the_announced_size_is_accepted() {
     for announced in [0, 1, 1_599, 1_601, 3_000] {
         assert!(decompress(&block, announced, 100_000).is_err(), "{announced}");
     }
-    assert!(matches!(decompress(&block, 1_600, 1_599), Err(Refused::TooLarge { .. })));
+    assert!(matches!(
+        decompress(&block, 1_600, 1_599),
+        Err(Refused::TooLarge { .. })
+    ));
     assert_eq!(decompress(&block, 1_600, 1_600).unwrap(), payload);
-    assert_eq!(decompress(&block, 1_700, 100_000), Err(Refused::OtherSize { announced: 1_700, found: 1_600 }));
-    assert_eq!(decompress(&block, 1_500, 100_000), Err(Refused::Damaged { announced: 1_500 }));
+    assert_eq!(
+        decompress(&block, 1_700, 100_000),
+        Err(Refused::OtherSize {
+            announced: 1_700,
+            found: 1_600
+        })
+    );
+    assert_eq!(
+        decompress(&block, 1_500, 100_000),
+        Err(Refused::Damaged { announced: 1_500 })
+    );
     assert!(decompress(b"", 0, 10).is_err());
     assert_eq!(decompress(&[0], 0, 10).unwrap(), Bytes::new());
 }
@@ -121,9 +171,9 @@ fn only_the_announced_size_is_accepted() {
 fn strange_block(noise: &mut Noise, good: &[(Bytes, usize)]) -> (Vec<u8>, u64) {
     let (block, size) = &good[noise.below(good.len())];
     let (mut bytes, mut announced) = (block.to_vec(), *size as u64);
-    match noise.below(7) {
+    match noise.below(8) {
         0 => {
-            for _ in 0..=noise.below(8) {
+            for _ in 0..=noise.below(3) {
                 let at = noise.below(bytes.len());
                 bytes[at] = noise.next().to_le_bytes()[0];
             }
@@ -146,18 +196,20 @@ fn strange_block(noise: &mut Noise, good: &[(Bytes, usize)]) -> (Vec<u8>, u64) {
             bytes.extend_from_slice(&other[noise.below(other.len())..]);
         }
         // Offsets that point before the beginning.
-        _ => {
+        6 => {
             for _ in 0..4 {
                 let at = noise.below(bytes.len());
                 bytes[at..].iter_mut().take(2).for_each(|byte| *byte = 0xff);
             }
         }
+        // A good one.
+        _ => {}
     }
     (bytes, announced)
 }
 
-/// 5,000 inputs, or 100,000 with `BLAZE_LONG`. What is given has the announced size, which is within the bound, and no other memory
-/// is taken: that for the result is the only one, and [`check`] comes before it.
+/// 5,000 inputs, or 100,000 with `BLAZE_LONG`. What is given has the announced size, which is within the bound, and no
+/// other memory is taken: that for the result is the only one, and [`check`] comes before it.
 #[test]
 fn codec_inputs() {
     let mut noise = Noise(20_261_122);
@@ -194,7 +246,10 @@ fn codec_inputs() {
         }
         longest = longest.max(began.elapsed());
     }
-    assert!(taken > inputs() / 50 && refused > inputs() / 2, "{taken} taken, {refused} refused");
+    assert!(
+        taken > inputs() / 20 && refused > inputs() / 2,
+        "{taken} taken, {refused} refused"
+    );
     assert!(longest < Duration::from_secs(5), "{longest:?}");
     println!("{taken} taken, {refused} refused, longest {longest:?}");
 }

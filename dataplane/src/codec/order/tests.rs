@@ -36,7 +36,10 @@ fn what_is_ready_waits_for_what_came_before() {
     assert_eq!(queue.waiting(), Waiting { items: 3, bytes: 160 });
     queue.finish(&first, 2, 50).unwrap();
     assert_eq!(pop_all(&mut queue, 1), [2, 3, 4]);
-    assert_eq!((queue.waiting(), queue.waiting_of(&1)), (Waiting::default(), Waiting::default()));
+    assert_eq!(
+        (queue.waiting(), queue.waiting_of(&1)),
+        (Waiting::default(), Waiting::default())
+    );
 }
 
 #[test]
@@ -115,9 +118,16 @@ fn a_removed_key_is_gone_and_comes_back_empty() {
     let old = queue.push_pending(1, 'a', 10).unwrap();
     queue.push_ready(1, 2, 5).unwrap();
     assert_eq!(queue.remove_key(&1), Waiting { items: 2, bytes: 15 });
-    assert_eq!((queue.remove_key(&1), queue.waiting()), (Waiting::default(), Waiting::default()));
+    assert_eq!(
+        (queue.remove_key(&1), queue.waiting()),
+        (Waiting::default(), Waiting::default())
+    );
     queue.push_pending(1, 'a', 10).unwrap();
-    assert_eq!(queue.finish(&old, 1, 1), Err(1), "the old ticket is not one of the new life");
+    assert_eq!(
+        queue.finish(&old, 1, 1),
+        Err(1),
+        "the old ticket is not one of the new life"
+    );
     assert_eq!(old.key(), &1);
 }
 
@@ -157,18 +167,30 @@ impl Model {
 
     fn pop(&mut self, key: u8) -> Option<u32> {
         let first = self.all.iter().position(|place| place.1 == key)?;
-        let Step::Ready(item) = self.all[first].4 else { return None };
+        let Step::Ready(item) = self.all[first].4 else {
+            return None;
+        };
         self.all.remove(first);
         Some(item)
     }
 
     fn keep_newest(&mut self, key: u8, writer: char, keep: usize) -> Waiting {
-        let waits = |place: &(u64, u8, char, usize, Step)| place.1 == key && place.2 == writer && place.4 == Step::Waits;
-        let surplus = self.all.iter().filter(|place| waits(place)).count().saturating_sub(keep);
+        let waits =
+            |place: &(u64, u8, char, usize, Step)| place.1 == key && place.2 == writer && place.4 == Step::Waits;
+        let surplus = self
+            .all
+            .iter()
+            .filter(|place| waits(place))
+            .count()
+            .saturating_sub(keep);
         let (mut left, mut bytes) = (surplus, 0);
         self.all.retain(|place| {
             let goes = left > 0 && waits(place);
-            (left, bytes) = if goes { (left - 1, bytes + place.3) } else { (left, bytes) };
+            (left, bytes) = if goes {
+                (left - 1, bytes + place.3)
+            } else {
+                (left, bytes)
+            };
             !goes
         });
         Waiting { items: surplus, bytes }
@@ -189,7 +211,8 @@ enum Act {
 
 fn act() -> impl Strategy<Value = Act> {
     let (key, writer, bytes) = (0u8..3, prop_oneof![Just('a'), Just('b')], 0usize..40);
-    let pending = (key.clone(), writer.clone(), bytes.clone()).prop_map(|(key, writer, bytes)| Act::Pending(key, writer, bytes));
+    let pending =
+        (key.clone(), writer.clone(), bytes.clone()).prop_map(|(key, writer, bytes)| Act::Pending(key, writer, bytes));
     prop_oneof![
         3 => (key.clone(), bytes.clone()).prop_map(|(key, bytes)| Act::Ready(key, bytes)),
         6 => pending,
@@ -265,7 +288,8 @@ proptest! {
             for key in 0..3 {
                 prop_assert_eq!(queue.waiting_of(&key), model.held(Some(key)));
                 prop_assert_eq!(queue.is_clear(&key), model.held(Some(key)).items == 0);
-                let waits: usize = queue.queues.get(&key).map_or(0, |queue| queue.waits.values().map(VecDeque::len).sum());
+                let queue = queue.queues.get(&key);
+                let waits: usize = queue.map_or(0, |queue| queue.waits.values().map(VecDeque::len).sum());
                 let expected = model.all.iter().filter(|place| place.1 == key && place.4 == Step::Waits).count();
                 prop_assert_eq!(waits, expected, "nothing is left behind");
             }

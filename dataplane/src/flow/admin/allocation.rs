@@ -63,8 +63,21 @@ fn topic_row(now: Instant, path: &mut TopicPath) -> Option<Value> {
     }
     Some(json!({
         "topic": path.name, "class": granted.class.as_str(), "size_bytes": granted.size_bytes,
-        "advertised_hz": rounded(granted.advertised_hz), "published_hz": rounded(path.in_rate.rate(now).0), "lanes": lanes,
+        "compression": compression(path), "advertised_hz": rounded(granted.advertised_hz), "published_hz": rounded(path.in_rate.rate(now).0), "lanes": lanes,
     }))
+}
+
+/// What compression does to a topic; null where it does nothing.
+fn compression(path: &TopicPath) -> Value {
+    let press = &path.press;
+    if press.messages == 0 {
+        return Value::Null;
+    }
+    json!({
+        "level": press.level, "messages": press.messages, "bytes_before": press.before, "bytes_after": press.after,
+        "ratio": rounded(press.after as f64 / press.before.max(1) as f64),
+        "cpu_ms": rounded(press.seconds * 1e3 / press.messages as f64), "as_it_is": path.effort.goes_as_it_is(),
+    })
 }
 
 fn lane_row(now: Instant, bridge: &mut BridgeState) -> Option<Value> {

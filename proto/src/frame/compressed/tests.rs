@@ -41,11 +41,20 @@ fn field(error: &FrameError) -> &'static str {
 #[test]
 fn compressed_and_back_is_the_same_frame() {
     let original = frame();
-    assert_eq!((original.compression(), original.uncompressed_bytes()), (Compression::None, 0));
+    assert_eq!(
+        (original.compression(), original.uncompressed_bytes()),
+        (Compression::None, 0)
+    );
     let packed = original.compressed(Bytes::from_static(b"packed"), 8).unwrap();
-    assert_eq!((packed.compression(), packed.uncompressed_bytes()), (Compression::Lz4Block, 8));
+    assert_eq!(
+        (packed.compression(), packed.uncompressed_bytes()),
+        (Compression::Lz4Block, 8)
+    );
     assert_eq!(packed.head().len(), original.head().len() + 4);
-    assert_eq!((packed.topic(), packed.writer(), packed.sequence()), ("camera/image_raw", original.writer(), 42));
+    assert_eq!(
+        (packed.topic(), packed.writer(), packed.sequence()),
+        ("camera/image_raw", original.writer(), 42)
+    );
     let received = Frame::parse(packed.to_bytes()).unwrap();
     assert_eq!(received, packed);
     let back = received.decompressed(original.payload().clone()).unwrap();
@@ -58,7 +67,11 @@ fn hops_and_age_stay_beside_the_header() {
     let original = frame().with_hops_and_age(3, 5_000);
     let packed = original.compressed(Bytes::from_static(b"packed"), 8).unwrap();
     assert_eq!((packed.hops(), packed.age_us()), (3, 5_000));
-    assert!(packed.head().starts_with(&[MAGIC.as_slice(), &packed.head()[4..8], &original.head()[8..]].concat()));
+    assert!(
+        packed
+            .head()
+            .starts_with(&[MAGIC.as_slice(), &packed.head()[4..8], &original.head()[8..]].concat())
+    );
     let packed = packed.with_hops_and_age(4, 6_000);
     let back = packed.decompressed(original.payload().clone()).unwrap();
     assert_eq!(back, original.clone().with_hops_and_age(4, 6_000));
@@ -78,7 +91,12 @@ fn a_header_without_room_is_an_error() {
         let short = Frame::new(&of(3_000), Bytes::new()).unwrap().head().len() - PREFIX_BYTES;
         Frame::new(&of(3_000 + bytes - short), Bytes::new()).unwrap()
     };
-    for (free, size, fits) in [(4, 127, true), (4, 128, false), (7, MAX_PAYLOAD_BYTES as u64, true), (0, 0, false)] {
+    for (free, size, fits) in [
+        (4, 127, true),
+        (4, 128, false),
+        (7, MAX_PAYLOAD_BYTES as u64, true),
+        (0, 0, false),
+    ] {
         let original = with_header_bytes(MAX_HEADER_BYTES - free);
         let packed = original.compressed(Bytes::from_static(b"p"), size);
         assert_eq!(packed.is_ok(), fits, "{free} bytes free, size {size}: {packed:?}");
@@ -93,11 +111,19 @@ fn a_header_without_room_is_an_error() {
 fn what_is_not_as_announced_is_refused() {
     let original = frame();
     let packed = original.compressed(Bytes::from_static(b"packed"), 8).unwrap();
-    assert_eq!(field(&packed.compressed(Bytes::new(), 6).unwrap_err()), "is set already");
-    assert_eq!(field(&original.decompressed(Bytes::new()).unwrap_err()), "is not LZ4_BLOCK");
+    assert_eq!(
+        field(&packed.compressed(Bytes::new(), 6).unwrap_err()),
+        "is set already"
+    );
+    assert_eq!(
+        field(&original.decompressed(Bytes::new()).unwrap_err()),
+        "is not LZ4_BLOCK"
+    );
     let other_size = packed.decompressed(Bytes::from_static(b"seven b")).unwrap_err();
     assert_eq!(field(&other_size), "is not the size of the payload");
-    let too_large = original.compressed(Bytes::new(), MAX_PAYLOAD_BYTES as u64 + 1).unwrap_err();
+    let too_large = original
+        .compressed(Bytes::new(), MAX_PAYLOAD_BYTES as u64 + 1)
+        .unwrap_err();
     assert_eq!(too_large, FrameError::PayloadTooLarge(MAX_PAYLOAD_BYTES + 1));
     assert!(original.compressed(Bytes::new(), u64::MAX).is_err());
     let header = |more: &[u8]| [&original.head()[PREFIX_BYTES..], more].concat();
@@ -106,8 +132,14 @@ fn what_is_not_as_announced_is_refused() {
     assert_eq!(field(&twice.decompressed(Bytes::new()).unwrap_err()), "is given twice");
     let unknown = from_header_bytes(&header(&[0x38, 9]), b"p").unwrap();
     assert_eq!(unknown.compression(), Compression::Unknown(9));
-    assert_eq!(field(&unknown.decompressed(Bytes::new()).unwrap_err()), "is not LZ4_BLOCK");
-    assert_eq!(field(&unknown.compressed(Bytes::new(), 1).unwrap_err()), "is set already");
+    assert_eq!(
+        field(&unknown.decompressed(Bytes::new()).unwrap_err()),
+        "is not LZ4_BLOCK"
+    );
+    assert_eq!(
+        field(&unknown.compressed(Bytes::new(), 1).unwrap_err()),
+        "is set already"
+    );
     let negative = [&[0x38][..], &[0xff; 9], &[1]].concat();
     let negative = from_header_bytes(&header(&negative), b"p").unwrap();
     assert_eq!(negative.compression(), Compression::Unknown(i32::MAX));
@@ -138,8 +170,11 @@ fn strange_field() -> impl Strategy<Value = Vec<u8>> {
         out
     };
     prop_oneof![
-        (17u32..20_000, proptest::collection::vec(any::<u8>(), 0..40))
-            .prop_map(move |(tag, value)| bytes(tag, WireType::LengthDelimited, &value)),
+        (17u32..20_000, proptest::collection::vec(any::<u8>(), 0..40)).prop_map(move |(tag, value)| bytes(
+            tag,
+            WireType::LengthDelimited,
+            &value
+        )),
         (17u32..20_000, any::<u64>()).prop_map(|(tag, value)| {
             let mut out = Vec::new();
             encode_key(tag, WireType::Varint, &mut out);
