@@ -9,7 +9,7 @@
 //! ```
 //!
 //! What a frame takes is measured at the level in use, and every ten seconds with one frame at the next higher one. For
-//! the others it is what they took, compared with these, when they were in use lately, else what they take as a rule.
+//! the others it is what they took, compared with these, when they were last in use, or else what they take as a rule.
 //! So a processor that becomes slow, or a picture that becomes difficult, changes all of them.
 //!
 //! A stream that does not become smaller goes as it is, and one frame in ten seconds is tried. Pure: time is given.
@@ -60,8 +60,6 @@ const LEARNING: u32 = 10;
 /// A level takes this many times what it takes as a rule at most, and not less than its inverse: else not the level is
 /// another, but the processor.
 const UNUSUAL: f64 = 4.0;
-/// How long what a level took is remembered, in seconds; then it is as usual again.
-const MEMORY_SECONDS: f64 = 600.0;
 /// Frames whose median is believed: of a few the thread may have been without a processor.
 const RECENT: usize = 9;
 /// What one frame more changes the estimate by …
@@ -164,10 +162,12 @@ impl Effort {
         self.changes
     }
 
-    /// Threads that would be busy all the time at the configured level; 0 until that is known.
+    /// Threads that would be busy all the time at the configured level; 0 until that is known, and while the stream does
+    /// not become smaller.
     #[must_use]
     pub fn wanted(&self) -> f64 {
-        self.work(self.top) * self.threads
+        let top = if self.incompressible { 0 } else { self.top };
+        self.work(top) * self.threads
     }
 
     /// The level for the next frame; `None`: it goes as it is. To be called once per frame: a trial is handed out once.
@@ -190,7 +190,6 @@ impl Effort {
         if let Some(before) = self.rate_at {
             let passed = now.saturating_duration_since(before).as_secs_f64();
             self.rate_hz += (rate_hz - self.rate_hz) * (1.0 - (-passed / RATE_SECONDS).exp());
-            self.forget(passed);
         } else {
             self.rate_hz = rate_hz;
         }
@@ -283,14 +282,6 @@ impl Effort {
             }
             // It was begun before the level changed.
             Some(_) => {}
-        }
-    }
-
-    /// All levels become as usual again, slowly: what made them different may be over.
-    fn forget(&mut self, seconds: f64) {
-        let part = 1.0 - (-seconds / MEMORY_SECONDS).exp();
-        for (weight, (_, usual)) in self.weights.iter_mut().zip(STEPS) {
-            *weight += (usual - *weight) * part;
         }
     }
 

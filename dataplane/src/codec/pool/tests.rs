@@ -238,6 +238,19 @@ fn more_and_fewer_threads_while_it_runs() {
 }
 
 #[test]
+fn threads_that_wait_for_work_end_as_well() {
+    let pool = CodecPool::start(6, on_threads()).unwrap();
+    // So that they wait; if one does not yet it is all the easier.
+    let a_moment = Duration::from_millis(50);
+    std::thread::sleep(a_moment);
+    pool.resize(2).unwrap();
+    eventually(|| pool.counters().threads == 2);
+    std::thread::sleep(a_moment);
+    pool.stop();
+    eventually(|| pool.counters().threads == 0);
+}
+
+#[test]
 fn without_threads_there_is_no_pool_and_with_fewer_it_goes_on() {
     let none: Spawner = Box::new(|_, _| Err(io::Error::other("no thread")));
     assert!(CodecPool::start(2, none).is_err());
