@@ -141,14 +141,16 @@ impl DataCore {
             };
             // What is kept is older than what another bridge has held for this one.
             let passed_on = bridge.held.as_mut().map(std::mem::take);
+            let mut passed = Vec::new();
             for message in self.kept.of(now, topic, bridge.from) {
                 // The rules may have changed since it came.
                 if bridge.takes() && path.info.takes(&message.frame) && bridge.wants(&message) {
-                    let lanes: ToLanes = bridge.pass(now, &message, large).map(|waiting| (at, waiting)).into_iter().collect();
-                    if !lanes.is_empty() {
-                        self.press_out(now, topic, &message.frame, lanes, link);
-                    }
+                    let waiting = bridge.pass(now, &message, large);
+                    passed.extend(waiting.map(|waiting| (message.frame, ToLanes::from_iter([(at, waiting)]))));
                 }
+            }
+            for (frame, lanes) in passed {
+                self.press_out(now, topic, &frame, lanes, link);
             }
             let path = &mut self.topics[topic.0 as usize];
             if let Some(held) = path.bridges.get_mut(at).and_then(|bridge| bridge.held.as_mut()) {

@@ -46,13 +46,14 @@ impl Gate {
     /// # Errors
     /// `rate_limit` where the budget is what holds it back, `max_rate` where nobody asks for more.
     pub fn admit(&mut self, now: Instant) -> Result<(), DropReason> {
+        let limited = self.is_limited();
         match &mut self.bucket {
-            Some(bucket) if !bucket.admit(now) => Err(if self.is_limited() {
-                DropReason::RateLimit
-            } else {
-                DropReason::MaxRate
-            }),
-            _ => Ok(()),
+            Some(bucket) => match (bucket.admit(now), limited) {
+                (true, _) => Ok(()),
+                (false, true) => Err(DropReason::RateLimit),
+                (false, false) => Err(DropReason::MaxRate),
+            },
+            None => Ok(()),
         }
     }
 
