@@ -320,7 +320,7 @@ impl Plane {
 
     fn transmit(&self, idle: Duration, next: impl Fn(&mut Engine, Instant) -> Option<Transmit>) -> Option<Transmit> {
         let mut told = false;
-        let transmit = {
+        let (transmit, jobs) = {
             let mut state = self.state.lock();
             let now = Instant::now();
             let due = state.run_timers(now);
@@ -336,8 +336,9 @@ impl Plane {
                 let until = [due, paced].into_iter().flatten().fold(now + idle, Instant::min);
                 self.work.wait_until(&mut state, until);
             }
-            transmit
+            (transmit, state.core.take_press_jobs())
         };
+        self.give_to_pool(jobs);
         if told {
             self.news_waits.notify_one();
         }

@@ -196,13 +196,14 @@ impl DataCore {
             let published = path.in_rate.rate(now).0;
             let lanes = path.bridges.iter().filter(|bridge| bridge.lane_id().is_some());
             let admitted = lanes.map(|bridge| bridge.allocated_hz.unwrap_or(published).min(published));
-            effort.demand(now, admitted.fold(0.0, f64::max));
-            topics.push(at);
+            topics.push((at, admitted.fold(0.0, f64::max)));
             wanted.push(effort.wanted());
         }
-        for (at, share) in topics.into_iter().zip(shares(threads as f64, &wanted)) {
+        // First what a topic may use, then what it is to do with it.
+        for ((at, admitted), share) in topics.into_iter().zip(shares(threads as f64, &wanted)) {
             if let Some((_, _, effort)) = &mut self.topics[at].effort.0 {
                 effort.set_threads(share);
+                effort.demand(now, admitted);
             }
         }
     }
@@ -317,12 +318,11 @@ impl DataCore {
 
     fn pressed_out(&mut self, now: Instant, ticket: &Ticket<TopicId>, mut lanes: ToLanes, pressed: Pressed) {
         let topic = *ticket.key();
-        let mut bytes = lanes.first().map_or(0, |(_, waiting)| waiting.frame.payload().len());
         if let Pressed::Compressed(done) = pressed {
             let path = &mut self.topics[topic.0 as usize];
             path.effort.compressed(now, &done);
             path.press.note(&done);
-            bytes = done.after();
+            let bytes = done.after();
             self.allocation_due |= path.sent_size.note(now, bytes as u64);
             if let Some(block) = done.block {
                 for (_, waiting) in &mut lanes {
