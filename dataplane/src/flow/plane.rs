@@ -331,7 +331,7 @@ impl Plane {
             state.pump(now, &mut tell);
             let transmit = state.engine.as_mut().and_then(|engine| next(engine, now));
             state.pump(now, &mut tell);
-            if transmit.is_none() && !told && !idle.is_zero() {
+            if transmit.is_none() && !told && !idle.is_zero() && !state.core.has_press_jobs() {
                 let paced = state.engine.as_ref().and_then(Engine::paced_until);
                 let until = [due, paced].into_iter().flatten().fold(now + idle, Instant::min);
                 self.work.wait_until(&mut state, until);
