@@ -45,7 +45,11 @@ struct Page {
     queue_bytes: GaugeVec,
     rate: GaugeVec,
     budget: GaugeVec,
+    wire_factor: GaugeVec,
     wire_bytes: CounterVec,
+    compression_bytes: CounterVec,
+    compression_seconds: CounterVec,
+    compression_level: GaugeVec,
     peer_up: GaugeVec,
     peer_rtt: GaugeVec,
     leases: GaugeVec,
@@ -112,6 +116,30 @@ impl Page {
                 "blaze_flow_budget_bytes_per_second",
                 "Wire bytes per second.",
                 &["to", "kind"],
+            )?,
+            wire_factor: gauge(
+                &r,
+                "blaze_flow_wire_factor",
+                "Wire bytes for each byte that the allocation reckons with.",
+                &[],
+            )?,
+            compression_bytes: counter(
+                &r,
+                "blaze_flow_compression_bytes_total",
+                "Payload bytes before and after compression.",
+                &["topic", "stage"],
+            )?,
+            compression_seconds: counter(
+                &r,
+                "blaze_flow_compression_seconds",
+                "Processor time of compression.",
+                &["topic"],
+            )?,
+            compression_level: gauge(
+                &r,
+                "blaze_flow_compression_level",
+                "Level of now; 0: payloads go as they are.",
+                &["topic"],
             )?,
             wire_bytes: counter(
                 &r,
@@ -214,6 +242,24 @@ impl Page {
             self.dropped
                 .with_label_values(&[topic, "", reason.as_str()])
                 .inc_by(count as f64);
+        }
+        let press = &path.press;
+        if press.messages > 0 {
+            for (stage, bytes) in [("before", press.before), ("after", press.after)] {
+                self.compression_bytes
+                    .with_label_values(&[topic, stage])
+                    .inc_by(bytes as f64);
+            }
+            self.compression_seconds
+                .with_label_values(&[topic])
+                .inc_by(press.seconds);
+            // Topics that share a label have no level in common.
+            if topic != OTHER {
+                let level = if path.effort.goes_as_it_is() { 0 } else { press.level };
+                self.compression_level
+                    .with_label_values(&[topic])
+                    .set(f64::from(level));
+            }
         }
         let measured = path.in_rate.rate(now).0;
         let granted = path.granted.map(|granted| granted.advertised_hz);
@@ -331,6 +377,22 @@ impl Page {
             .with_label_values(&["inter", "limit"])
             .set(shared.egress.budget());
         self.budget.with_label_values(&["inter", "used"]).set(used);
+        let limiter = shared.limiter.lock();
+        for layer in limiter.bandwidth().links.keys() {
+            if let Some(limit) = limiter.bandwidth().link_limit_bytes_per_s(layer) {
+                self.budget
+                    .with_label_values(&[&format!("inter/{layer}"), "limit"])
+                    .set(limit);
+            }
+        }
+        for (layer, capacity) in &limiter.measured().capacity_bytes_per_s {
+            self.budget
+                .with_label_values(&[&format!("inter/{layer}"), "measured"])
+                .set(*capacity);
+        }
+        self.wire_factor
+            .with_label_values::<&str>(&[])
+            .set(limiter.budgets().0.wire_factor());
     }
 
     fn fill_control(&self, shared: &Shared) {
