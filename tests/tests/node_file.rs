@@ -63,14 +63,6 @@ fn the_documented_example_has_no_fault_and_a_warning_for_each_section_without_ef
             (10, "config", NOT_YET),
             (11, "cache", NOT_YET),
             (12, "database", NOT_YET),
-            (13, "flow", &keys("pool_threads")),
-            (
-                14,
-                "flow.bandwidth",
-                &keys("per_message_share, overhead, min_rate_hz, share, wire_overhead, adaptive, links")
-            ),
-            (17, "flow.compression", NOT_YET),
-            (18, "flow.topics[0]", &keys("compression")),
             (21, "monitor", NOT_YET),
         ]
     );

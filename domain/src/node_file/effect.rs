@@ -18,9 +18,7 @@ const SECTIONS: &[&str] = &[
 ];
 
 /// Keys without effect in sections that have one: one warning per section.
-const KEYS: &[(&str, &[&str])] = &[
-    ("admin", &["worker", "monitor"]),
-];
+const KEYS: &[(&str, &[&str])] = &[("admin", &["worker", "monitor"])];
 
 pub(super) fn warn_of_what_is_not_in_effect(tree: &Value, root: &Node<'_>) {
     let at = |path: String| root.at(path);

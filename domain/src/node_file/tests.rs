@@ -87,19 +87,11 @@ fn the_example_is_read_whole() {
             "config",
             "cache",
             "database",
-            "flow.compression",
             "monitor",
             "admin",
-            "flow.bandwidth",
-            "flow",
-            "flow.topics[0]"
         ]
     );
-    assert_eq!(warnings[6].detail, "worker, monitor: not in effect in this version");
-    assert_eq!(
-        warnings[7].detail,
-        "per_message_share, overhead, min_rate_hz, share, wire_overhead, adaptive, links: not in effect in this version"
-    );
+    assert_eq!(warnings[5].detail, "worker, monitor: not in effect in this version");
 }
 
 #[test]
