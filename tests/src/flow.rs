@@ -160,7 +160,7 @@ pub struct FlowProcess {
     file: PathBuf,
     process: Process,
     admin: Option<Admin>,
-    _folder: tempfile::TempDir,
+    folder: tempfile::TempDir,
 }
 
 impl FlowProcess {
@@ -178,7 +178,7 @@ impl FlowProcess {
             file,
             process,
             admin: None,
-            _folder: folder,
+            folder,
         })
     }
 
@@ -190,6 +190,16 @@ impl FlowProcess {
         let mut flow = Self::launch(spec)?;
         flow.wait_ready()?;
         Ok(flow)
+    }
+
+    /// Writes another node file, which it is to notice by itself.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn edit(&mut self, change: impl FnOnce(&mut FlowSpec)) -> anyhow::Result<()> {
+        change(&mut self.spec);
+        std::fs::write(&self.file, self.spec.to_yaml(self.folder.path()))?;
+        Ok(())
     }
 
     /// Waits until it is ready.

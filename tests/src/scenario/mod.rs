@@ -118,8 +118,8 @@ pub struct Stream {
     pub bytes: usize,
     /// Zero = for ever.
     pub lifespan: Duration,
-    /// Whether its payload is like a raw picture; else nothing in it can be compressed.
-    pub image: bool,
+    /// A file with payloads that are published in turn; without it they are noise, which cannot be compressed.
+    pub payloads: Option<&'static str>,
 }
 
 /// What breaks, or is mended.

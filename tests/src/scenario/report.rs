@@ -17,6 +17,8 @@ pub struct Route {
     pub sent: u64,
     /// Messages received.
     pub received: u64,
+    /// Seconds in which the latencies were measured.
+    pub seconds: usize,
     /// Number of the last message received.
     pub last: u64,
     /// Missing between the first received and the last published.
@@ -39,6 +41,12 @@ impl Route {
     pub fn latency_ms(&self, share: f64) -> Option<f64> {
         let rank = ((share * self.latencies_ms.len() as f64).ceil() as usize).max(1);
         self.latencies_ms.get(rank - 1).copied()
+    }
+
+    /// Messages per second while latencies were measured.
+    #[must_use]
+    pub fn rate_hz(&self) -> f64 {
+        self.latencies_ms.len() as f64 / self.seconds.max(1) as f64
     }
 
     fn faults(&self, expect: &Expect) -> Option<String> {

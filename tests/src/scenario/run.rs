@@ -340,6 +340,14 @@ impl Running {
         self.flows.get(node).with_context(|| format!("{node} is no flow"))
     }
 
+    /// Changes what the node file of a flow says while it runs.
+    ///
+    /// # Errors
+    /// When there is no such flow, or its node file cannot be written.
+    pub fn edit(&mut self, node: &str, change: impl FnOnce(&mut FlowSpec)) -> anyhow::Result<()> {
+        self.flow_mut(node)?.edit(change)
+    }
+
     fn flow_mut(&mut self, node: &str) -> anyhow::Result<&mut FlowProcess> {
         self.flows.get_mut(node).with_context(|| format!("{node} is no flow"))
     }
@@ -384,6 +392,7 @@ impl Probe {
             topic: topic.to_owned(),
             sent,
             received: self.last(topic, "received"),
+            seconds: rows.len(),
             last: self.last(topic, "last"),
             // What never came after the last one is missing as well.
             lost: self.last(topic, "lost") + sent.saturating_sub(self.last(topic, "last")),
@@ -490,11 +499,10 @@ fn words(stream: &Stream) -> String {
         hz,
         bytes,
         lifespan,
-        image,
-        ..
+        payloads,
     } = stream;
-    let payload = if *image { "image" } else { "noise" };
-    format!("{topic},{reliability},{hz},{bytes},{},{payload}", lifespan.as_millis())
+    let file = payloads.map(|file| format!(",@{file}")).unwrap_or_default();
+    format!("{topic},{reliability},{hz},{bytes},{}{file}", lifespan.as_millis())
 }
 
 fn of_topic<'a>(row: &'a Value, topic: &str) -> &'a Value {

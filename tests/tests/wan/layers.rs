@@ -27,7 +27,7 @@ pub(super) fn stream(topic: &'static str, hz: f64, bytes: usize) -> Stream {
         hz,
         bytes,
         lifespan: Duration::ZERO,
-        image: false,
+        payloads: None,
     }
 }
 

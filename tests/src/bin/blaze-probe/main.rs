@@ -7,6 +7,7 @@ mod site;
 mod source;
 
 use std::net::Ipv4Addr;
+use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -58,7 +59,7 @@ pub(crate) struct Options {
     pub(crate) node: Option<NodeName>,
     #[arg(long, default_value = "probe")]
     pub(crate) service: ServiceName,
-    /// NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS
+    /// `NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS[,@FILE]`; without a file of payloads they are noise
     #[arg(long, required = true)]
     pub(crate) topic: Vec<Topic>,
     /// Seconds
@@ -77,12 +78,12 @@ pub(crate) struct Topic {
 }
 
 /// What is in a payload.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Payload {
     /// Nothing that could be compressed.
     Noise,
-    /// Like a raw picture: smooth, with the noise of a sensor.
-    Image,
+    /// The parts of this file, each as long as a payload, one after another.
+    File(PathBuf),
 }
 
 impl FromStr for Topic {
@@ -91,12 +92,11 @@ impl FromStr for Topic {
     fn from_str(text: &str) -> anyhow::Result<Self> {
         let parts: Vec<&str> = text.split(',').collect();
         let (parts, payload) = match parts[..] {
-            [.., "image"] => (&parts[..parts.len() - 1], Payload::Image),
-            [.., "noise"] => (&parts[..parts.len() - 1], Payload::Noise),
-            _ => (&parts[..], Payload::Noise),
+            [ref terms @ .., file] if file.starts_with('@') => (terms, Payload::File(file[1..].into())),
+            ref terms => (terms, Payload::Noise),
         };
-        let [name, reliability, hz, bytes, lifespan] = parts[..] else {
-            anyhow::bail!("{text}: NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS[,noise|image] is expected")
+        let [name, reliability, hz, bytes, lifespan] = *parts else {
+            anyhow::bail!("{text}: NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS[,@FILE] is expected")
         };
         Ok(Self {
             name: name.parse()?,

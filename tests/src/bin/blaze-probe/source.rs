@@ -2,8 +2,11 @@
 
 use std::time::{Duration, Instant};
 
+use anyhow::Context as _;
 use blaze_sdk::{Advertise, Lease, PublishOptions, Publisher, ServiceManager};
 use bytes::Bytes;
+use rand::rngs::StdRng;
+use rand::{Rng as _, SeedableRng as _};
 use tokio::signal::unix::{SignalKind, signal};
 
 use crate::{LARGE_BYTES, Options, Payload, Topic};
@@ -13,7 +16,8 @@ const ROW: Duration = Duration::from_secs(1);
 /// One topic that is published.
 struct Source {
     publisher: Publisher,
-    payload: Bytes,
+    payloads: Vec<Bytes>,
+    published: usize,
     period: Duration,
     due: Instant,
     _lease: Lease,
@@ -36,7 +40,8 @@ impl Source {
         };
         Ok(Self {
             publisher: service.broker().publisher(&topic.name, &terms)?,
-            payload: payload(topic.payload, topic.bytes),
+            payloads: payloads(&topic.payload, topic.bytes)?,
+            published: 0,
             period: Duration::from_secs_f64(1.0 / topic.hz),
             due: Instant::now(),
             _lease: service.flow().advertise(advertise).await?,
@@ -44,21 +49,21 @@ impl Source {
     }
 }
 
-/// Bytes that are the same in each run.
-fn payload(kind: Payload, bytes: usize) -> Bytes {
-    // A linear congruential generator (Knuth, MMIX): its upper bits are as good as random here.
-    let mut state = 0x9e37_79b9_7f4a_7c15u64;
-    let mut random = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 56) as u8
-    };
-    // Rows of 640 pixels of three bytes.
-    let pixel = |at: usize| (at % 1920 / 12 + at / 1920 / 4) as u8;
-    let content = (0..bytes).map(|at| match kind {
-        Payload::Noise => random(),
-        Payload::Image => pixel(at).wrapping_add(random() % 3),
-    });
-    content.collect::<Vec<u8>>().into()
+/// Payloads that are the same in each run.
+fn payloads(kind: &Payload, bytes: usize) -> anyhow::Result<Vec<Bytes>> {
+    match kind {
+        Payload::Noise => {
+            let mut payload = vec![0; bytes];
+            StdRng::seed_from_u64(0).fill_bytes(&mut payload);
+            Ok(vec![payload.into()])
+        }
+        Payload::File(path) => {
+            let parts = std::fs::read(path).with_context(|| format!("{}", path.display()))?;
+            let parts: Vec<Bytes> = parts.chunks_exact(bytes.max(1)).map(Bytes::copy_from_slice).collect();
+            anyhow::ensure!(!parts.is_empty(), "{} is shorter than {bytes} bytes", path.display());
+            Ok(parts)
+        }
+    }
 }
 
 /// Publishes until SIGUSR1 or the end of its time; the leases stay until the end of its time.
@@ -73,7 +78,8 @@ pub(crate) async fn publish(service: &ServiceManager, options: &Options) -> anyh
     while let Some(next) = sources.iter_mut().min_by_key(|source| source.due) {
         tokio::select! {
             () = tokio::time::sleep_until(next.due.into()) => {
-                next.publisher.publish(next.payload.clone());
+                next.publisher.publish(next.payloads[next.published % next.payloads.len()].clone());
+                next.published += 1;
                 next.due += next.period;
             }
             _ = rows.tick() => print(&sources, false),
