@@ -17,6 +17,8 @@ pub(crate) struct Route<'a> {
     pub(crate) topic: &'a str,
     pub(crate) rate_hz: Option<f64>,
     pub(crate) bytes: usize,
+    /// `limit_mbps` of the flows.
+    pub(crate) limit_mbps: f64,
 }
 
 /// Running flows; they end with this.
@@ -44,14 +46,14 @@ impl Flows {
                     .on_kafka(route.kafka, route.kafka_prefix),
             ]
         };
-        let unlimited = |spec| FlowSpec {
-            limit_mbps: 20_000.0,
+        let limited = |spec| FlowSpec {
+            limit_mbps: route.limit_mbps,
             extra: "log: { level: warn }\n".to_owned(),
             ..spec
         };
         let mut running = Vec::new();
         for spec in specs {
-            running.push(FlowProcess::launch(unlimited(spec))?);
+            running.push(FlowProcess::launch(limited(spec))?);
         }
         for flow in &mut running {
             flow.wait_ready()?;

@@ -1,5 +1,5 @@
-//! What a hop costs: Redis alone, Kafka alone, Redis to Kafka on one flow, Redis over DDS to Kafka on two flows, all in one
-//! run on one machine.
+//! What a hop costs: Redis alone, Kafka alone, Redis to Kafka on one flow, Redis over DDS to Kafka on two flows, the same where the limit
+//! leaves room for some of the messages only, all in one run on one machine.
 //!
 //! ```text
 //! source (plain client) ─► server ─► blaze-flow … ─► server ─► sink (plain client): latency, loss, rate
@@ -56,10 +56,34 @@ enum PathKind {
     KafkaAlone,
     OneFlow,
     TwoFlows,
+    Limited,
 }
 
+/// What no load here reaches.
+const UNLIMITED_MBPS: f64 = 20_000.0;
+/// Where there is a limit: payload bytes that it leaves room for, of those that are published.
+const ROOM: f64 = 0.6;
+
 impl PathKind {
-    const ALL: [Self; 4] = [Self::RedisAlone, Self::KafkaAlone, Self::OneFlow, Self::TwoFlows];
+    const ALL: [Self; 5] = [
+        Self::RedisAlone,
+        Self::KafkaAlone,
+        Self::OneFlow,
+        Self::TwoFlows,
+        Self::Limited,
+    ];
+
+    /// Whether it can be measured under a load: a limit is one of a rate.
+    fn takes(self, load: Load) -> bool {
+        self != Self::Limited || load.rate_hz().is_some_and(|rate| rate * load.bytes() as f64 > 1e6)
+    }
+
+    fn limit_mbps(self, load: Load) -> f64 {
+        match (self, load.rate_hz()) {
+            (Self::Limited, Some(rate)) => rate * load.bytes() as f64 * ROOM * 8.0 / 1_048_576.0,
+            _ => UNLIMITED_MBPS,
+        }
+    }
 
     fn name(self) -> &'static str {
         match self {
@@ -67,6 +91,7 @@ impl PathKind {
             Self::KafkaAlone => "kafka",
             Self::OneFlow => "redis>flow>kafka",
             Self::TwoFlows => "redis>flow>dds>flow>kafka",
+            Self::Limited => "… with a limit",
         }
     }
 }
@@ -96,9 +121,9 @@ fn main() -> anyhow::Result<()> {
     {
         for load in Load::all()
             .into_iter()
-            .filter(|load| load.name().contains(&arguments.load))
+            .filter(|load| kind.takes(*load) && load.name().contains(&arguments.load))
         {
-            let name = format!("{run}-{}", kind.name().replace('>', "-"));
+            let name = format!("{run}-{kind:?}");
             let (figures, dropped) = measure(kind, &name, load, duration, &redis, &kafka)?;
             print_row(kind, load, &figures, &dropped);
         }
@@ -129,8 +154,9 @@ fn measure(
             make_topic(kafka, &kafka_topic, &settings)?;
             None
         }
-        PathKind::OneFlow | PathKind::TwoFlows => Some(Flows::start(&Route {
-            two: kind == PathKind::TwoFlows,
+        PathKind::OneFlow | PathKind::TwoFlows | PathKind::Limited => Some(Flows::start(&Route {
+            two: kind != PathKind::OneFlow,
+            limit_mbps: kind.limit_mbps(load),
             redis,
             redis_prefix: &redis_prefix,
             kafka,
@@ -155,7 +181,7 @@ fn measure(
 }
 
 fn print_row(kind: PathKind, load: Load, figures: &Figures, dropped: &str) {
-    let cpu = if matches!(kind, PathKind::OneFlow | PathKind::TwoFlows) {
+    let cpu = if matches!(kind, PathKind::OneFlow | PathKind::TwoFlows | PathKind::Limited) {
         format!("{:.1}", figures.flow_cpu_us_per_message)
     } else {
         "-".to_owned()
