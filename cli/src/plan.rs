@@ -69,7 +69,8 @@ pub fn run(options: &PlanOptions, format: Format) -> Result<Exit, CliError> {
 fn read(file: &Path) -> Result<PlanFile, CliError> {
     let remarks =
         |faults: Vec<Fault>| -> Vec<_> { faults.into_iter().map(|fault| (fault.path, fault.detail)).collect() };
-    let schema: Schema<PlanFile> = Arc::new(move |tree| PlanFile::read(tree).map(|plan| (plan, Vec::new())).map_err(remarks));
+    let schema: Schema<PlanFile> =
+        Arc::new(move |tree| PlanFile::read(tree).map(|plan| (plan, Vec::new())).map_err(remarks));
     load_typed(&Sources::of_file(file), &schema)
         .map(|loaded| loaded.value)
         .map_err(|faults| {
@@ -116,6 +117,7 @@ impl Planned {
                 .keys()
                 .filter_map(|layer| Some((layer.clone(), bandwidth.link_limit_bytes_per_s(layer)? / wire_factor)))
                 .collect(),
+            ..Budgets::default()
         };
         let rates = rates(&budgets, &terms(&bandwidth), &demands);
         Ok(Self {
@@ -130,7 +132,9 @@ impl Planned {
     /// What the link to a layer may carry: its own limit, else that of the process.
     fn limit(&self, layer: &LayerName) -> f64 {
         let process = self.bandwidth.limit_bytes_per_s();
-        self.bandwidth.link_limit_bytes_per_s(layer).map_or(process, |own| own.min(process))
+        self.bandwidth
+            .link_limit_bytes_per_s(layer)
+            .map_or(process, |own| own.min(process))
     }
 
     fn load(&self, layer: &LayerName) -> f64 {
@@ -153,9 +157,7 @@ impl Planned {
     /// As `/v1/allocation` of the running flow would say it; what only a running flow knows is null.
     fn allocation(&self) -> Value {
         let topic = |(topic, rates): (&PlannedTopic, &blaze_flow::limit::rates::TopicRates)| {
-            let lane = |(lane, hz): (&blaze_domain::node_file::PlannedLane, &f64)| {
-                json!({"layer": lane.layer, "allocated_hz": hz, "actual_hz": null, "skipped": null})
-            };
+            let lane = |(lane, hz): (&blaze_domain::node_file::PlannedLane, &f64)| json!({"layer": lane.layer, "allocated_hz": hz, "actual_hz": null, "skipped": null});
             json!({
                 "topic": topic.topic, "class": rates.class.as_str(), "size_bytes": topic.bytes,
                 "advertised_hz": advertised_hz(topic),
@@ -208,6 +210,7 @@ fn demand(topic: &PlannedTopic) -> Demand<'_> {
             .iter()
             .map(|lane| LaneDemand {
                 layer: &lane.layer,
+                receiver: None,
                 max_rate_hz: lane.max_rate_hz,
             })
             .collect(),
@@ -248,7 +251,7 @@ fn table(planned: &[Planned], width: Option<u16>) -> String {
             }
         }
         text.push_str(&render_table(&columns, rows, width));
-        for (layer, _) in &flow.rates.load_bytes_per_s {
+        for layer in flow.rates.load_bytes_per_s.keys() {
             let (load, limit) = (flow.load(layer), flow.limit(layer));
             let own = if flow.rates.infeasible_links.contains(layer) {
                 "; its own limit is not kept"
@@ -278,7 +281,10 @@ mod tests {
         let node_file = "layer: {name: edge, kind: edge}\nnode: {name: robot-1}\nflow: {bandwidth: {limit_mbps: 8}, topics: [{match: 'camera/**', max_rate_hz: 1}]}\n";
         std::fs::write(folder.path().join("robot-1.yaml"), node_file).unwrap();
         let plan = read(&file).map_err(|error| error.to_string())?;
-        plan.flows.iter().map(|flow| Planned::new(flow, folder.path(), 1.0)).collect()
+        plan.flows
+            .iter()
+            .map(|flow| Planned::new(flow, folder.path(), 1.0))
+            .collect()
     }
 
     /// The three layers of the paper: 160 Mbit/s, a camera of 30 Hz with images of 0.7 MB after compression, and an IMU.
@@ -295,9 +301,15 @@ mod tests {
         assert_eq!(lanes[0]["allocated_hz"], 10.0);
         // β · 20,971,520 B/s are 27.9 images of 714,000 B: ten of them go to the fog.
         let cloud = lanes[1]["allocated_hz"].as_f64().unwrap();
-        assert!((cloud - (0.95 * 20_971_520.0 / 714_000.0 - 10.0)).abs() < 1e-9, "{cloud}");
+        assert!(
+            (cloud - (0.95 * 20_971_520.0 / 714_000.0 - 10.0)).abs() < 1e-9,
+            "{cloud}"
+        );
         let links = planned[0].links();
-        let load: f64 = links.iter().map(|link| link["load_bytes_per_s"].as_f64().unwrap()).sum();
+        let load: f64 = links
+            .iter()
+            .map(|link| link["load_bytes_per_s"].as_f64().unwrap())
+            .sum();
         assert!(load <= 20_971_520.0, "{load}");
     }
 
@@ -308,16 +320,27 @@ mod tests {
                 .unwrap();
         assert_eq!(planned[0].flow.to_string(), "edge/robot-1");
         assert_eq!(planned[0].rates.topics[0].lanes_hz, [1.0]);
-        assert!(table(&planned, None).contains("link to fog: 69.7 KiB/s of 1.0 MiB/s, 6.8 %"), "{}", table(&planned, None));
+        assert!(
+            table(&planned, None).contains("link to fog: 69.7 KiB/s of 1.0 MiB/s, 6.8 %"),
+            "{}",
+            table(&planned, None)
+        );
     }
 
     #[test]
     fn faults_come_with_file_and_line() {
-        let error = plan_of("flows:\n- layer: edge\n  node: a\n  topics:\n  - {topic: imu, rate_hz: x, bytes: 1, lanes: []}\n")
-            .err()
-            .unwrap();
-        assert!(error.contains("plan.yaml:5: flows[0].topics[0].rate_hz: expected a number"), "{error}");
+        let error =
+            plan_of("flows:\n- layer: edge\n  node: a\n  topics:\n  - {topic: imu, rate_hz: x, bytes: 1, lanes: []}\n")
+                .err()
+                .unwrap();
+        assert!(
+            error.contains("plan.yaml:5: flows[0].topics[0].rate_hz: expected a number"),
+            "{error}"
+        );
         let missing = plan_of("flows: [{node_file: none.yaml, topics: []}]").err().unwrap();
-        assert!(missing.contains("none.yaml") && missing.contains("cannot be opened"), "{missing}");
+        assert!(
+            missing.contains("none.yaml") && missing.contains("cannot be opened"),
+            "{missing}"
+        );
     }
 }

@@ -59,7 +59,7 @@ fn print_level(level: u8, frames: &[Vec<u8>]) -> anyhow::Result<()> {
         };
         after += block.len();
         let began = processor_time();
-        let payload = lz4::decompress(&block, frame.len() as u64, frame.len())?;
+        let payload = lz4::decompress(&block, frame.len() as u64)?;
         back += processor_time().saturating_sub(began);
         if payload != *frame {
             bail!("level {level} does not give back what went in");

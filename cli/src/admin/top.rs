@@ -71,6 +71,8 @@ struct Lane {
     #[serde(default)]
     allocated_hz: Option<f64>,
     actual_hz: f64,
+    #[serde(default)]
+    exceeds_advertised: bool,
     skipped: u64,
     #[serde(default)]
     queued: u64,
@@ -137,7 +139,11 @@ fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String
             .measured_bytes_per_s
             .map(|measured| format!(", measured {}/s", bytes(measured)))
             .unwrap_or_default(),
-        if answer.feasible == Some(false) { ", NOT feasible" } else { "" },
+        if answer.feasible == Some(false) {
+            ", NOT feasible"
+        } else {
+            ""
+        },
     ));
     if answer.topics.is_empty() {
         text.push_str("Nothing leaves on the inter scope. `blaze why TOPIC --to LAYER` says what is missing.\n");
@@ -155,7 +161,18 @@ fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String
             ("QUEUED", Align::Right),
             ("p99/ms", Align::Right),
         ];
-        text.push_str(&render_table(&columns, answer.topics.iter().flat_map(rows).collect(), width));
+        text.push_str(&render_table(
+            &columns,
+            answer.topics.iter().flat_map(rows).collect(),
+            width,
+        ));
+    }
+    let exceeds = |topic: &&Topic| topic.lanes.iter().any(|lane| lane.exceeds_advertised);
+    for topic in answer.topics.iter().filter(exceeds) {
+        text.push_str(&format!(
+            "{}: more is published than was advertised, and is skipped; let it advertise its true rate\n",
+            topic.topic
+        ));
     }
     for link in &answer.links {
         let limit = link.limit_bytes_per_s.unwrap_or(answer.budget_bytes_per_s);
@@ -216,6 +233,22 @@ mod tests {
              TOPIC             CLASS   BYTES  LZ4  TO   ADVERTISED/Hz  PLANNED/Hz  ACTUAL/Hz  SKIPPED  QUEUED  p99/ms\n\
              camera/image_raw  large  921600    -  fog          30.00        4.85       4.80      252       1  190.50\n\
              link to fog: 4.9 MiB/s of 5.0 MiB/s, 98.0 %\n"
+        );
+    }
+
+    #[test]
+    fn whoever_publishes_more_than_it_says_is_named() {
+        let lane = |exceeds: bool| json!({"layer": "fog", "allocated_hz": 10, "actual_hz": 10, "exceeds_advertised": exceeds, "skipped": 40});
+        let topic = |name: &str, exceeds: bool| json!({"topic": name, "class": "standard", "size_bytes": 100, "advertised_hz": 10, "lanes": [lane(exceeds)]});
+        let value = json!({
+            "flow": "edge/robot-1", "limit_mbps": 40, "budget_bytes_per_s": 5_242_880, "wire_factor": null,
+            "topics": [topic("imu", true), topic("odom", false)], "links": [],
+        });
+        let flow = "127.0.0.1:9101".parse().unwrap();
+        let text = table(&flow, &value, None).unwrap();
+        assert!(
+            text.contains("\nimu: more is published") && !text.contains("odom: more"),
+            "{text}"
         );
     }
 

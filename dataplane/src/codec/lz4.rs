@@ -29,13 +29,11 @@ const WORTHWHILE_PERCENT: usize = 97;
 /// Why a payload from the inter scope is not taken apart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
-    /// The announced size is not allowed.
-    #[error("announces {announced} bytes, at most {most} are allowed")]
+    /// The announced size is that of no payload.
+    #[error("announces {announced} bytes, at most {MAX_PAYLOAD_BYTES} are allowed")]
     TooLarge {
         /// What the header says.
         announced: u64,
-        /// What the caller, or a message at all, allows.
-        most: usize,
     },
     /// The announced size cannot come from so few bytes.
     #[error("announces {announced} bytes, {found} compressed ones cannot be so many")]
@@ -92,14 +90,13 @@ pub fn compress(payload: &[u8], level: u8) -> Option<Bytes> {
     Some(block.into())
 }
 
-/// Takes a block apart that announces its size. No memory is taken before that size is checked against `most`, against
-/// the largest payload and against what so many bytes can hold at all; then exactly the announced size, whatever the
-/// block holds. The time is linear in both sizes.
+/// Takes a block apart that announces its size. No memory is taken before that size is [checked](announced_size); then
+/// exactly the announced size, whatever the block holds. The time is linear in both sizes.
 ///
 /// # Errors
 /// [`Refused`]; nothing of the block is given then.
-pub fn decompress(block: &[u8], announced: u64, most: usize) -> Result<Bytes, Refused> {
-    let (size, narrow) = check(block.len(), announced, most)?;
+pub fn decompress(block: &[u8], announced: u64) -> Result<Bytes, Refused> {
+    let (size, narrow) = check(block.len(), announced)?;
     let mut payload = vec![0; size];
     let found = decompress_to_buffer(block, Some(narrow), &mut payload).map_err(|_| Refused::Damaged { announced })?;
     if found == size {
@@ -109,15 +106,23 @@ pub fn decompress(block: &[u8], announced: u64, most: usize) -> Result<Bytes, Re
     }
 }
 
-/// The announced size, if a block of so many bytes may have it; the second time as LZ4 wants it.
-fn check(block: usize, announced: u64, most: usize) -> Result<(usize, i32), Refused> {
+/// The size that a block of so many bytes announces, if it may have it: that of a payload, and no more than so many
+/// bytes can hold at all.
+///
+/// # Errors
+/// [`Refused`].
+pub fn announced_size(block: usize, announced: u64) -> Result<usize, Refused> {
+    check(block, announced).map(|(size, _)| size)
+}
+
+/// The announced size, the second time as LZ4 wants it.
+fn check(block: usize, announced: u64) -> Result<(usize, i32), Refused> {
     if block > MAX_PAYLOAD_BYTES {
         return Err(Refused::BlockTooLarge { found: block });
     }
-    let most = most.min(MAX_PAYLOAD_BYTES);
-    let too_large = Refused::TooLarge { announced, most };
+    let too_large = Refused::TooLarge { announced };
     let size = usize::try_from(announced).map_err(|_| too_large)?;
-    if size > most {
+    if size > MAX_PAYLOAD_BYTES {
         return Err(too_large);
     }
     if announced > block as u64 * MOST_OF_ONE_BYTE {

@@ -1,15 +1,17 @@
 //! Compression of payloads for the inter scope (F8).
 //!
 //! ```text
-//!                 effort: at which level? ◄── what it cost
-//!                    │                             ▲
-//! admitted ─► order: a place ─► pool: lz4 ─► order: finished ─► in the order of admission ─► lanes
-//! received ─────────────────► pool: lz4, first of all ─► ingress
+//!                 effort: at which level? ◄──────────── what it cost
+//!                    │                                       ▲
+//! admitted ─► order: a place ─► pool: a turn ─► lz4 ─► order: finished ─► in the order of each writer ─► lanes
+//! received, and not seen before ─► order: a place ─► pool: a turn, first ─► lz4 ─► in order ─► bridges to brokers
 //! ```
 //!
 //! Each part is whole by itself: [`lz4`] is the codec, [`order`] keeps messages in order while some of them are with
-//! the pool, [`pool`] are the threads, and [`effort`] picks the level. What connects them is not here.
+//! the pool, and says whose turn it is, [`pool`] are the threads, and [`effort`] picks the level. What connects them is
+//! [`press`](crate::lane::press), without threads, and [`plane`](crate::flow::plane).
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -20,8 +22,30 @@ pub mod lz4;
 pub mod order;
 pub mod pool;
 
-use lz4::Refused;
-use pool::{Completion, Job, Urgency};
+#[cfg(test)]
+mod tests;
+
+/// What is to be done with a payload.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Work {
+    /// Compress it at a level.
+    Compress(u8),
+    /// Decompress it; so large it says that it will be.
+    Decompress(u64),
+}
+
+/// What became of it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Done {
+    /// It was compressed, or goes as it is.
+    Compressed(Compressed),
+    /// It was decompressed.
+    Decompressed(Bytes),
+    /// It cannot be.
+    Refused(lz4::Refused),
+    /// The codec has panicked.
+    Failed,
+}
 
 /// What became of a payload that was to be compressed.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -47,28 +71,38 @@ impl Compressed {
     }
 }
 
-/// A job that compresses a payload. `done` is told nothing if the job is never run.
-#[must_use]
-pub fn compress_job(payload: Bytes, level: u8, done: Completion<Compressed>) -> Job {
-    Job::new(Urgency::Compress, payload.len(), move || {
-        let (began, began_on_processor) = (Instant::now(), processor_time());
-        let block = lz4::compress(&payload, level);
-        done.give(Compressed {
-            block,
-            level,
-            before: payload.len(),
-            processor: processor_time().saturating_sub(began_on_processor),
-            taken: began.elapsed(),
-        });
-    })
+impl Work {
+    /// Does it, on the thread of the caller.
+    #[must_use]
+    pub fn run(self, payload: &[u8]) -> Done {
+        match self {
+            Self::Compress(level) => {
+                let (began, began_on_processor) = (Instant::now(), processor_time());
+                let block = lz4::compress(payload, level);
+                Done::Compressed(Compressed {
+                    block,
+                    level,
+                    before: payload.len(),
+                    processor: processor_time().saturating_sub(began_on_processor),
+                    taken: began.elapsed(),
+                })
+            }
+            Self::Decompress(announced) => match lz4::decompress(payload, announced) {
+                Ok(payload) => Done::Decompressed(payload),
+                Err(reason) => Done::Refused(reason),
+            },
+        }
+    }
 }
 
-/// A job that decompresses a payload, see [`lz4::decompress`]. `done` is told nothing if the job is never run.
-#[must_use]
-pub fn decompress_job(payload: Bytes, announced: u64, most: usize, done: Completion<Result<Bytes, Refused>>) -> Job {
-    let result = usize::try_from(announced).unwrap_or(usize::MAX).min(most);
-    Job::new(Urgency::Decompress, payload.len().max(result), move || {
-        done.give(lz4::decompress(&payload, announced, most));
+/// What a codec gives; where it panics that is [`Done::Failed`]. Only the codec is to run in here: a panic of anything
+/// else must end the process.
+pub fn guarded(work: impl FnOnce() -> Done) -> Done {
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
+        tracing::error!("the codec panicked");
+        // To drop what was thrown may throw again.
+        std::mem::forget(panic);
+        Done::Failed
     })
 }
 

@@ -1,47 +1,55 @@
-//! Results in order: a message that is being compressed is not overtaken by those that came after it.
+//! Results in order: a message that is being compressed is not overtaken by those of its writer that came after it.
 //!
 //! ```text
-//! key ─► [ ready ] [ pending, begun ] [ pending ] [ ready ] ◄── push
-//!   pop_ready ◄─┘         └─ finish      └─ may be withdrawn
+//! group (a topic) ─┬─ line (a writer) ─► [ ready ] [ begun ] [ waits ] [ ready ] ◄── push
+//!                  └─ line …            pop_ready ◄┘  └ finish  └ begin, or it gives way to a newer one
 //! ```
 //!
-//! Each key (a topic) has a queue of places. What is finished waits in its place until all before it have left; other
-//! keys do not notice. Without clock, threads or locks: whoever owns it holds it behind a lock of his own. Everything
-//! costs O(log n) in the places of one key at most.
+//! Each writer of a topic has a line of places. What is finished waits in its place until all before it have left; other
+//! lines do not notice. Who is begun with next goes in rounds: one place of each group, and within a group one of each
+//! line, so that nobody who has much to do keeps the others waiting. A place that gives way to a newer one of its line
+//! leaves its turn to that. Without clock, threads or locks: whoever owns it holds it behind a lock of his own.
+//! Everything costs O(log n) in the places of one line at most.
 
-use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::Hash;
+
+use super::pool::{URGENCIES, Urgency};
 
 #[cfg(test)]
 mod tests;
 
-/// What may wait at most. A place that is alone always fits as far as bytes go.
+const MIB: usize = 1024 * 1024;
+
+/// What may be held at most. A place that is alone always fits as far as bytes go.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bounds {
-    /// Places of all keys.
+    /// Places of all groups.
     pub items: usize,
-    /// Bytes of all keys.
+    /// Bytes of all groups.
     pub bytes: usize,
-    /// Places of one key.
+    /// Places of one group.
     pub items_of_one: usize,
-    /// Bytes of one key.
+    /// Bytes of one group.
     pub bytes_of_one: usize,
+    /// Bytes of one group that nobody works on yet.
+    pub waiting_of_one: usize,
 }
 
 impl Default for Bounds {
-    /// 16,384 places and 64 MiB, of which one key may have a quarter and a half.
+    /// 16,384 places and 64 MiB, of which one group may have a quarter and a half, and 8 MiB that nobody works on yet.
     fn default() -> Self {
         Self {
             items: 16_384,
-            bytes: 64 * 1024 * 1024,
+            bytes: 64 * MIB,
             items_of_one: 4_096,
-            bytes_of_one: 32 * 1024 * 1024,
+            bytes_of_one: 32 * MIB,
+            waiting_of_one: 8 * MIB,
         }
     }
 }
 
-/// How much waits, or was removed.
+/// How much is held, or waits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Waiting {
     /// Places.
@@ -61,6 +69,13 @@ impl Waiting {
         self.bytes -= bytes;
     }
 
+    fn without(self, other: Self) -> Self {
+        Self {
+            items: self.items.saturating_sub(other.items),
+            bytes: self.bytes.saturating_sub(other.bytes),
+        }
+    }
+
     fn has_room(self, bytes: usize, items_bound: usize, bytes_bound: usize) -> bool {
         self.items < items_bound && (self.items == 0 || self.bytes.saturating_add(bytes) <= bytes_bound)
     }
@@ -69,283 +84,357 @@ impl Waiting {
 /// Nothing was put in its place: the caller drops the message, and counts it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Full {
-    /// The key has used up its own part.
-    #[error("too much waits for this key")]
-    Key,
-    /// All keys together have.
-    #[error("too much waits for all keys")]
+    /// The group has used up its own part.
+    #[error("too much waits for this group")]
+    Group,
+    /// All groups together have.
+    #[error("too much waits for all groups")]
     All,
 }
 
-/// A place that is pending. Of use for the [`InOrder`] that gave it only; one that is finished, given up, withdrawn or
-/// removed means nothing any more.
+/// What came of [`InOrder::push_waiting`].
+#[derive(Debug)]
+pub struct Pushed<T> {
+    /// Older ones that gave way, for the caller to count.
+    pub gave_way: Vec<T>,
+    /// The item itself where there was no room for it; nothing gave way then.
+    pub refused: Option<(T, Full)>,
+}
+
+/// A place that is begun. Of use for the [`InOrder`] that gave it only; one that is finished or given up means nothing
+/// any more.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Ticket<K> {
-    key: K,
+pub struct Ticket<G, L> {
+    key: (G, L),
     number: u64,
 }
 
-impl<K> Ticket<K> {
-    /// The key that it belongs to.
+impl<G, L> Ticket<G, L> {
+    /// Group and line that it belongs to.
     #[must_use]
-    pub fn key(&self) -> &K {
+    pub fn key(&self) -> &(G, L) {
         &self.key
     }
 }
 
-struct Place<W, T> {
-    bytes: usize,
-    state: State<W, T>,
-}
-
-enum State<W, T> {
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Stage {
     /// Nobody works on it yet.
-    Waits(W),
+    Waits,
     Begun,
-    Ready(T),
+    Ready,
 }
 
-struct Queue<W, T> {
+struct Place<T> {
+    bytes: usize,
+    stage: Stage,
+    item: T,
+}
+
+struct Line<T> {
     /// By number: numbers only grow, so this is the order of arrival.
-    places: BTreeMap<u64, Place<W, T>>,
-    /// Per writer, its places that nobody works on yet, oldest first.
-    waits: HashMap<W, VecDeque<u64>>,
-    held: Waiting,
+    places: BTreeMap<u64, Place<T>>,
+    /// By urgency, the places that nobody works on yet, oldest first.
+    waits: [VecDeque<u64>; URGENCIES],
+    /// Whether it is in the rounds of its group.
+    in_rounds: [bool; URGENCIES],
 }
 
-impl<W: Eq + Hash, T> Queue<W, T> {
+impl<T> Line<T> {
     fn new() -> Self {
         Self {
             places: BTreeMap::new(),
-            waits: HashMap::new(),
-            held: Waiting::default(),
-        }
-    }
-
-    /// Somebody works on it, or nobody will.
-    fn waits_no_more(&mut self, writer: &W, number: u64) {
-        if let Some(waits) = self.waits.get_mut(writer) {
-            // Nearly always the first: the oldest is worked on first.
-            if let Some(at) = waits.iter().position(|other| *other == number) {
-                waits.remove(at);
-            }
-            if waits.is_empty() {
-                self.waits.remove(writer);
-            }
+            waits: Default::default(),
+            in_rounds: Default::default(),
         }
     }
 }
 
-/// Queues of places, one per key. `W` tells the writers of a key apart.
-pub struct InOrder<K, W, T> {
-    bounds: Bounds,
-    queues: HashMap<K, Queue<W, T>>,
+struct Group<L, T> {
+    lines: HashMap<L, Line<T>>,
+    /// By urgency, the lines of which something waits, each once.
+    rounds: [VecDeque<L>; URGENCIES],
+    /// Whether it is in the rounds of all groups.
+    in_rounds: [bool; URGENCIES],
     held: Waiting,
+    waits: Waiting,
+}
+
+impl<L, T> Group<L, T> {
+    fn new() -> Self {
+        Self {
+            lines: HashMap::new(),
+            rounds: Default::default(),
+            in_rounds: Default::default(),
+            held: Waiting::default(),
+            waits: Waiting::default(),
+        }
+    }
+}
+
+/// Lines of places, in groups.
+pub struct InOrder<G, L, T> {
+    bounds: Bounds,
+    groups: HashMap<G, Group<L, T>>,
+    /// By urgency, the groups of which something waits, each once.
+    rounds: [VecDeque<G>; URGENCIES],
+    held: Waiting,
+    waits: [Waiting; URGENCIES],
     next: u64,
 }
 
-impl<K: Copy + Eq + Hash, W: Clone + Eq + Hash, T> InOrder<K, W, T> {
+impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
     /// Without any places.
     #[must_use]
     pub fn new(bounds: Bounds) -> Self {
         Self {
             bounds,
-            queues: HashMap::new(),
+            groups: HashMap::new(),
+            rounds: Default::default(),
             held: Waiting::default(),
+            waits: Default::default(),
             next: 0,
         }
     }
 
-    /// Whether nothing of the key waits: what is ready may go on without a place.
+    /// Whether nothing of a line is held: what is ready may go on without a place.
     #[must_use]
-    pub fn is_clear(&self, key: &K) -> bool {
-        !self.queues.contains_key(key)
+    pub fn is_clear(&self, (group, line): &(G, L)) -> bool {
+        let lines = self.groups.get(group).map(|group| &group.lines);
+        lines.is_none_or(|lines| !lines.contains_key(line))
     }
 
-    /// What waits, of all keys.
+    /// Whether something of a group is held.
     #[must_use]
-    pub fn waiting(&self) -> Waiting {
+    pub fn holds(&self, group: &G) -> bool {
+        self.groups.contains_key(group)
+    }
+
+    /// What is held, of all groups.
+    #[must_use]
+    pub fn held(&self) -> Waiting {
         self.held
     }
 
-    /// What waits of one key.
+    /// What nobody works on yet, of all groups.
     #[must_use]
-    pub fn waiting_of(&self, key: &K) -> Waiting {
-        self.queues.get(key).map(|queue| queue.held).unwrap_or_default()
+    pub fn waits(&self, urgency: Urgency) -> Waiting {
+        self.waits[urgency as usize]
     }
 
-    /// Puts something that is ready behind what waits.
+    /// Everything that is held of a group.
+    pub fn items_mut(&mut self, group: &G) -> impl Iterator<Item = &mut T> {
+        let group = self.groups.get_mut(group);
+        let lines = group.into_iter().flat_map(|group| group.lines.values_mut());
+        lines.flat_map(|line| line.places.values_mut().map(|place| &mut place.item))
+    }
+
+    /// Puts something that is ready behind what its line holds.
     ///
     /// # Errors
     /// The item, and what is full.
-    pub fn push_ready(&mut self, key: K, item: T, bytes: usize) -> Result<(), (T, Full)> {
-        if let Err(full) = self.room(&key, bytes) {
+    pub fn push_ready(&mut self, key: (G, L), item: T, bytes: usize) -> Result<(), (T, Full)> {
+        if let Err(full) = self.room(&key.0, bytes, false, Waiting::default()) {
             return Err((item, full));
         }
-        self.put(key, bytes, State::Ready(item));
+        let place = Place {
+            bytes,
+            stage: Stage::Ready,
+            item,
+        };
+        self.put(key, place, None);
         Ok(())
     }
 
-    /// Keeps a place behind what waits for something that is yet to be done. `bytes`: what it holds until then.
-    ///
-    /// # Errors
-    /// What is full.
-    pub fn push_pending(&mut self, key: K, writer: W, bytes: usize) -> Result<Ticket<K>, Full> {
-        self.room(&key, bytes)?;
-        let number = self.put(key, bytes, State::Waits(writer.clone()));
-        if let Some(queue) = self.queues.get_mut(&key) {
-            queue.waits.entry(writer).or_default().push_back(number);
+    /// Keeps a place, behind what its line holds, for something that is yet to be done. `bytes`: what it holds until
+    /// then. Of the places of the line and urgency that nobody works on yet only the newest `keep` stay, this one among
+    /// them; 0: all of them.
+    pub fn push_waiting(
+        &mut self,
+        key: (G, L),
+        urgency: Urgency,
+        item: T,
+        bytes: usize,
+        keep: usize,
+    ) -> Pushed<T> {
+        let freed = self.surplus(&key, urgency, keep);
+        if let Err(full) = self.room(&key.0, bytes, true, freed) {
+            return Pushed {
+                gave_way: Vec::new(),
+                refused: Some((item, full)),
+            };
         }
-        Ok(Ticket { key, number })
+        let gave_way = self.withdraw(&key, urgency, freed.items);
+        let place = Place {
+            bytes,
+            stage: Stage::Waits,
+            item,
+        };
+        self.put(key, place, Some(urgency));
+        Pushed {
+            gave_way,
+            refused: None,
+        }
     }
 
-    fn room(&self, key: &K, bytes: usize) -> Result<(), Full> {
-        let bounds = &self.bounds;
-        if !self
-            .waiting_of(key)
-            .has_room(bytes, bounds.items_of_one, bounds.bytes_of_one)
-        {
-            return Err(Full::Key);
+    /// What has to give way if one more comes and only `keep` may stay.
+    fn surplus(&self, (group, line): &(G, L), urgency: Urgency, keep: usize) -> Waiting {
+        let mut surplus = Waiting::default();
+        let line = self.groups.get(group).and_then(|group| group.lines.get(line));
+        let Some(line) = line.filter(|_| keep > 0) else {
+            return surplus;
+        };
+        let waits = &line.waits[urgency as usize];
+        for number in waits.iter().take((waits.len() + 1).saturating_sub(keep)) {
+            surplus.add(line.places.get(number).map_or(0, |place| place.bytes));
         }
-        if !self.held.has_room(bytes, bounds.items, bounds.bytes) {
+        surplus
+    }
+
+    fn room(&self, group: &G, bytes: usize, waits: bool, freed: Waiting) -> Result<(), Full> {
+        let bounds = &self.bounds;
+        let (held, waiting) = self
+            .groups
+            .get(group)
+            .map(|group| (group.held.without(freed), group.waits.without(freed)))
+            .unwrap_or_default();
+        let fits = held.has_room(bytes, bounds.items_of_one, bounds.bytes_of_one);
+        if !fits || (waits && !waiting.has_room(bytes, bounds.items_of_one, bounds.waiting_of_one)) {
+            return Err(Full::Group);
+        }
+        if !self.held.without(freed).has_room(bytes, bounds.items, bounds.bytes) {
             return Err(Full::All);
         }
         Ok(())
     }
 
-    fn put(&mut self, key: K, bytes: usize, state: State<W, T>) -> u64 {
-        let number = self.next;
-        self.next += 1;
-        let queue = self.queues.entry(key).or_insert_with(Queue::new);
-        queue.places.insert(number, Place { bytes, state });
-        queue.held.add(bytes);
-        self.held.add(bytes);
-        number
+    /// Takes the oldest waiting places out of a line. The line stays where it is in the rounds: a newer place follows.
+    fn withdraw(&mut self, (group, line): &(G, L), urgency: Urgency, count: usize) -> Vec<T> {
+        let at = urgency as usize;
+        let mut gone = Vec::new();
+        let Some(group) = self.groups.get_mut(group) else {
+            return gone;
+        };
+        let Some(line) = group.lines.get_mut(line) else {
+            return gone;
+        };
+        for _ in 0..count {
+            let oldest = line.waits[at].pop_front();
+            let Some(place) = oldest.and_then(|number| line.places.remove(&number)) else {
+                break;
+            };
+            group.held.remove(place.bytes);
+            group.waits.remove(place.bytes);
+            self.held.remove(place.bytes);
+            self.waits[at].remove(place.bytes);
+            gone.push(place.item);
+        }
+        gone
     }
 
-    /// Somebody begins to work on it: from now on it is not withdrawn. `false`: it is not wanted any more, the work can
-    /// be spared.
-    pub fn begin(&mut self, ticket: &Ticket<K>) -> bool {
-        let Some(queue) = self.queues.get_mut(&ticket.key) else {
-            return false;
-        };
-        let Some(place) = queue.places.get_mut(&ticket.number) else {
-            return false;
-        };
-        if let State::Waits(_) = place.state
-            && let State::Waits(writer) = std::mem::replace(&mut place.state, State::Begun)
-        {
-            queue.waits_no_more(&writer, ticket.number);
+    fn put(&mut self, (name, writer): (G, L), place: Place<T>, urgency: Option<Urgency>) {
+        let number = self.next;
+        self.next += 1;
+        let bytes = place.bytes;
+        self.held.add(bytes);
+        let group = self.groups.entry(name).or_insert_with(Group::new);
+        group.held.add(bytes);
+        let line = group.lines.entry(writer).or_insert_with(Line::new);
+        line.places.insert(number, place);
+        let Some(urgency) = urgency else { return };
+        let at = urgency as usize;
+        self.waits[at].add(bytes);
+        group.waits.add(bytes);
+        line.waits[at].push_back(number);
+        if !std::mem::replace(&mut line.in_rounds[at], true) {
+            group.rounds[at].push_back(writer);
         }
-        true
+        if !std::mem::replace(&mut group.in_rounds[at], true) {
+            self.rounds[at].push_back(name);
+        }
+    }
+
+    /// Somebody begins to work on the place whose turn it is: from now on it does not give way. Its item is his to look
+    /// at. `None`: nothing waits.
+    pub fn begin(&mut self, urgency: Urgency) -> Option<(Ticket<G, L>, &mut T)> {
+        let at = urgency as usize;
+        let name = self.rounds[at].pop_front()?;
+        let group = self.groups.get_mut(&name)?;
+        let writer = group.rounds[at].pop_front()?;
+        let line = group.lines.get_mut(&writer)?;
+        let number = line.waits[at].pop_front()?;
+        line.in_rounds[at] = !line.waits[at].is_empty();
+        if line.in_rounds[at] {
+            group.rounds[at].push_back(writer);
+        }
+        group.in_rounds[at] = !group.rounds[at].is_empty();
+        if group.in_rounds[at] {
+            self.rounds[at].push_back(name);
+        }
+        let place = line.places.get_mut(&number)?;
+        place.stage = Stage::Begun;
+        group.waits.remove(place.bytes);
+        self.waits[at].remove(place.bytes);
+        let key = (name, writer);
+        Some((Ticket { key, number }, &mut place.item))
+    }
+
+    /// The item of a place that is begun.
+    pub fn begun(&mut self, ticket: &Ticket<G, L>) -> Option<&mut T> {
+        let group = self.groups.get_mut(&ticket.key.0)?;
+        let line = group.lines.get_mut(&ticket.key.1)?;
+        let place = line.places.get_mut(&ticket.number)?;
+        (place.stage == Stage::Begun).then_some(&mut place.item)
     }
 
     /// What was to be done is done. `bytes`: what the item holds from now on; this is taken whatever the bounds are.
-    ///
-    /// # Errors
-    /// The item, if its place is gone: it was withdrawn or removed, and counted there.
-    pub fn finish(&mut self, ticket: &Ticket<K>, item: T, bytes: usize) -> Result<(), T> {
-        if !self.begin(ticket) {
-            return Err(item);
-        }
-        let Some(queue) = self.queues.get_mut(&ticket.key) else {
-            return Err(item);
-        };
-        match queue.places.get_mut(&ticket.number) {
-            Some(place) if matches!(place.state, State::Begun) => {
-                for held in [&mut queue.held, &mut self.held] {
-                    held.remove(place.bytes);
-                    held.add(bytes);
-                }
-                *place = Place {
-                    bytes,
-                    state: State::Ready(item),
-                };
-                Ok(())
-            }
-            _ => Err(item),
-        }
-    }
-
-    /// Nothing comes of it: those behind it wait no longer. `false`: its place was gone.
-    pub fn give_up(&mut self, ticket: &Ticket<K>) -> bool {
-        let Entry::Occupied(mut queue) = self.queues.entry(ticket.key) else {
+    /// `false`: it was not begun.
+    pub fn finish(&mut self, ticket: &Ticket<G, L>, bytes: usize) -> bool {
+        let Some(group) = self.groups.get_mut(&ticket.key.0) else {
             return false;
         };
-        let is_pending = |place: &Place<W, T>| !matches!(place.state, State::Ready(_));
-        if !queue.get().places.get(&ticket.number).is_some_and(is_pending) {
+        let line = group.lines.get_mut(&ticket.key.1);
+        let place = line.and_then(|line| line.places.get_mut(&ticket.number));
+        let Some(place) = place.filter(|place| place.stage == Stage::Begun) else {
             return false;
+        };
+        for held in [&mut group.held, &mut self.held] {
+            held.remove(place.bytes);
+            held.add(bytes);
         }
-        let bytes = remove(queue.get_mut(), ticket.number);
-        self.held.remove(bytes);
-        if queue.get().places.is_empty() {
-            queue.remove();
-        }
+        place.bytes = bytes;
+        place.stage = Stage::Ready;
         true
     }
 
-    /// The oldest item of a key, if it is ready. To be called until there is none, after each push,
-    /// [`InOrder::finish`], [`InOrder::give_up`] and [`InOrder::keep_newest`].
-    pub fn pop_ready(&mut self, key: &K) -> Option<T> {
-        let queue = self.queues.get_mut(key)?;
-        let first = queue.places.first_entry()?;
-        if !matches!(first.get().state, State::Ready(_)) {
-            return None;
-        }
-        let Place { bytes, state } = first.remove();
-        queue.held.remove(bytes);
-        self.held.remove(bytes);
-        if queue.places.is_empty() {
-            self.queues.remove(key);
-        }
-        match state {
-            State::Ready(item) => Some(item),
-            State::Waits(_) | State::Begun => None,
-        }
+    /// Nothing comes of a place that was begun: those behind it wait no longer. `None`: it was not begun.
+    pub fn give_up(&mut self, ticket: &Ticket<G, L>) -> Option<T> {
+        self.begun(ticket)?;
+        self.take(&ticket.key, ticket.number)
     }
 
-    /// Of one writer's places that nobody works on yet only the newest `keep` stay. Returns what was withdrawn, for the
-    /// caller to count.
-    pub fn keep_newest(&mut self, key: &K, writer: &W, keep: usize) -> Waiting {
-        let mut withdrawn = Waiting::default();
-        let Some(queue) = self.queues.get_mut(key) else {
-            return withdrawn;
-        };
-        let surplus = queue
-            .waits
-            .get(writer)
-            .map_or(0, |waits| waits.len().saturating_sub(keep));
-        for _ in 0..surplus {
-            let Some(oldest) = queue.waits.get(writer).and_then(|waits| waits.front().copied()) else {
-                break;
-            };
-            let bytes = remove(queue, oldest);
-            self.held.remove(bytes);
-            withdrawn.add(bytes);
-        }
-        if queue.places.is_empty() {
-            self.queues.remove(key);
-        }
-        withdrawn
+    /// The oldest item of a line, if it is ready. To be called until there is none, after each push,
+    /// [`InOrder::finish`] and [`InOrder::give_up`].
+    pub fn pop_ready(&mut self, key: &(G, L)) -> Option<T> {
+        let line = self.groups.get(&key.0)?.lines.get(&key.1)?;
+        let (number, first) = line.places.first_key_value()?;
+        let number = (first.stage == Stage::Ready).then_some(*number)?;
+        self.take(key, number)
     }
 
-    /// Forgets a key with all its places. Returns what that was, for the caller to count.
-    pub fn remove_key(&mut self, key: &K) -> Waiting {
-        let removed = self.queues.remove(key).map(|queue| queue.held).unwrap_or_default();
-        self.held.items -= removed.items;
-        self.held.bytes -= removed.bytes;
-        removed
+    /// Takes a place out of its line that does not wait.
+    fn take(&mut self, (name, writer): &(G, L), number: u64) -> Option<T> {
+        let group = self.groups.get_mut(name)?;
+        let line = group.lines.get_mut(writer)?;
+        let place = line.places.remove(&number)?;
+        if line.places.is_empty() {
+            group.lines.remove(writer);
+        }
+        group.held.remove(place.bytes);
+        self.held.remove(place.bytes);
+        if group.lines.is_empty() {
+            self.groups.remove(name);
+        }
+        Some(place.item)
     }
-}
-
-/// Takes a place that is pending out of its queue. Returns its bytes.
-fn remove<W: Eq + Hash, T>(queue: &mut Queue<W, T>, number: u64) -> usize {
-    let Some(place) = queue.places.remove(&number) else {
-        return 0;
-    };
-    if let State::Waits(writer) = &place.state {
-        queue.waits_no_more(writer, number);
-    }
-    queue.held.remove(place.bytes);
-    place.bytes
 }

@@ -7,10 +7,11 @@ use blaze_domain::LayerName;
 use blaze_domain::node_file::BandwidthSection;
 
 use super::Shared;
+use crate::lane::allocation::Reckoned;
 use crate::limit::capacity::State;
-use crate::limit::limiter::Measured;
+use crate::limit::limiter::{LinkRate, Measured};
 use crate::limit::wire_factor::Totals;
-use crate::link::{LinkBudgets, PacketSize, PeerInfo, PeerState};
+use crate::link::{Engine, LinkBudgets, LinkCapacity, PacketSize};
 
 impl Shared {
     /// Works out the rates of lanes where something has changed that they depend on; to be called every few milliseconds. The work is
@@ -20,9 +21,10 @@ impl Shared {
         if limiter.is_time_to_look(now) {
             let seconds = limiter.bandwidth().size_window_s;
             let window = (seconds > 0).then(|| Duration::from_secs(seconds.into()));
-            let (moved, sent) = self.plane.read(|state| {
+            let (moved, reckoned, capacities) = self.plane.read(|state| {
                 let moved = state.core.look_at_rates(now, window);
-                (moved, state.core.sent_payload())
+                let capacities = state.engine.as_ref().map(Engine::capacities);
+                (moved, state.core.reckoned().clone(), capacities.unwrap_or_default())
             });
             if moved {
                 limiter.touch();
@@ -31,11 +33,18 @@ impl Shared {
                 let threads = pool.counters().threads;
                 self.plane.read(|state| state.core.share_pool(now, threads));
             }
-            let (all, links) = self.totals(&sent);
-            let measured = self.capacities();
+            let (all, links) = self.totals(&reckoned);
+            let rates = capacities.into_iter().map(|(flow, capacity)| (flow, rate_of(capacity)));
+            let measured = Measured { links: rates.collect() };
             limiter.look(now, all, &links, measured);
         }
-        if self.plane.read(|state| state.core.take_allocation_due()) {
+        let (grown, changed) = self
+            .plane
+            .read(|state| (state.core.take_allocation_due(), state.core.take_lanes_changed()));
+        if grown {
+            limiter.size_grown();
+        }
+        if changed {
             limiter.touch();
         }
         if !limiter.is_due(now) {
@@ -44,13 +53,22 @@ impl Shared {
         let wanted = self.plane.read(|state| state.core.wanted(now));
         let rates = limiter.run(now, &wanted.demands());
         self.plane.read(|state| state.core.set_rates(now, &wanted, rates));
+        let needed = limiter.standard_wire_bytes_per_s();
+        self.plane.read(|state| {
+            if let Some(engine) = &mut state.engine {
+                engine.set_needed(now, needed);
+            }
+        });
     }
 
     /// Takes what the node file says now: the pacer follows at once, the rates of lanes in a moment.
     pub(super) fn set_bandwidth(&self, now: Instant, bandwidth: &BandwidthSection) {
         self.egress.set_budget(bandwidth.limit_bytes_per_s());
         self.limiter.lock().set_bandwidth(bandwidth.clone());
-        let budgets = self.inter.as_ref().map(|inter| link_budgets(bandwidth, inter.packets()));
+        let budgets = self
+            .inter
+            .as_ref()
+            .map(|inter| link_budgets(bandwidth, inter.packets()));
         self.plane.with(|state| {
             state.core.set_large_bytes(bandwidth.large_bytes.into());
             if let Some((engine, budgets)) = state.engine.as_mut().zip(budgets) {
@@ -59,43 +77,34 @@ impl Shared {
         });
     }
 
-    /// What the links to each layer can carry, for those where one of them was seen to carry less than its limit.
-    fn capacities(&self) -> Measured {
-        let peers = self
-            .plane
-            .read(|state| state.engine.as_ref().map(crate::link::Engine::peers).unwrap_or_default());
-        let mut capacity: BTreeMap<LayerName, (f64, bool)> = BTreeMap::new();
-        for PeerInfo { flow, capacity: link, .. } in peers.into_iter().filter(|peer| peer.state == PeerState::Up) {
-            let Some(link) = link else { continue };
-            let sum = capacity.entry(flow.layer).or_default();
-            // The rate of the moment dips when the estimate is tried out; images need not follow that.
-            sum.0 += link.measured_bytes_per_s.unwrap_or(link.bytes_per_s);
-            sum.1 |= link.state != State::Unknown;
-        }
-        let limited = capacity.into_iter().filter(|(_, (_, limited))| *limited);
-        Measured {
-            capacity_bytes_per_s: limited.map(|(layer, (sum, _))| (layer, sum)).collect(),
-        }
-    }
-
     /// What has left since the start: of all links, and of those to each layer.
-    fn totals(&self, sent: &BTreeMap<LayerName, u64>) -> (Totals, BTreeMap<LayerName, Totals>) {
-        let mut links: BTreeMap<LayerName, Totals> = BTreeMap::new();
-        for destination in self.egress.traffic().by_destination {
-            let link = links.entry(destination.flow.layer).or_default();
-            let wire: u64 = destination.wire_bytes.iter().sum();
-            link.control_wire += destination.control_bytes;
-            link.user_wire += wire - destination.control_bytes;
-        }
-        for (layer, payload) in sent {
-            links.entry(layer.clone()).or_default().payload += payload;
-        }
-        let all = links.values().fold(Totals::default(), |all, link| Totals {
-            user_wire: all.user_wire + link.user_wire,
-            control_wire: all.control_wire + link.control_wire,
-            payload: all.payload + link.payload,
+    fn totals(&self, reckoned: &Reckoned) -> (Totals, BTreeMap<LayerName, Totals>) {
+        let traffic = self.egress.traffic();
+        let all = Totals {
+            user_wire: traffic.wire_bytes - traffic.control_bytes,
+            control_wire: traffic.control_bytes,
+            reckoned: reckoned.all,
+        };
+        let links = traffic.by_layer.into_iter().map(|(layer, link)| {
+            let wire: u64 = link.wire_bytes.iter().sum();
+            let totals = Totals {
+                user_wire: wire - link.control_bytes,
+                control_wire: link.control_bytes,
+                reckoned: reckoned.by_layer.get(&layer).copied().unwrap_or(0),
+            };
+            (layer, totals)
         });
-        (all, links)
+        (all, links.collect())
+    }
+}
+
+/// What the allocation makes of what is known of a link.
+fn rate_of(capacity: LinkCapacity) -> LinkRate {
+    // The rate of the moment dips when the estimate is tried out; images need not follow that.
+    match (capacity.measured_bytes_per_s, capacity.state) {
+        (Some(carries), _) => LinkRate::Carries(carries),
+        (None, State::Unknown) => LinkRate::Free,
+        (None, State::SlowStart | State::Steady | State::BackingOff) => LinkRate::Passing(capacity.bytes_per_s),
     }
 }
 

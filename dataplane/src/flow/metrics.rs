@@ -12,6 +12,7 @@ use prometheus::{CounterVec, Encoder, GaugeVec, Opts, Registry, TextEncoder};
 use super::inter::InterScope;
 use super::routes::SourceState;
 use super::{Shared, class_label};
+use crate::codec::pool::CodecPool;
 use crate::control::MoveReason;
 use crate::lane::path::{Phase, TopicId, TopicPath};
 use crate::registry::Terms;
@@ -45,11 +46,14 @@ struct Page {
     queue_bytes: GaugeVec,
     rate: GaugeVec,
     budget: GaugeVec,
+    feasible: GaugeVec,
     wire_factor: GaugeVec,
     wire_bytes: CounterVec,
     compression_bytes: CounterVec,
     compression_seconds: CounterVec,
     compression_level: GaugeVec,
+    compression_pool: GaugeVec,
+    compression_pool_seconds: CounterVec,
     peer_up: GaugeVec,
     peer_rtt: GaugeVec,
     leases: GaugeVec,
@@ -117,6 +121,12 @@ impl Page {
                 "Wire bytes per second.",
                 &["to", "kind"],
             )?,
+            feasible: gauge(
+                &r,
+                "blaze_flow_feasible",
+                "1 while what is published fits the budget at its lowest rates.",
+                &["to"],
+            )?,
             wire_factor: gauge(
                 &r,
                 "blaze_flow_wire_factor",
@@ -140,6 +150,18 @@ impl Page {
                 "blaze_flow_compression_level",
                 "Level of now; 0: payloads go as they are.",
                 &["topic"],
+            )?,
+            compression_pool: gauge(
+                &r,
+                "blaze_flow_compression_pool",
+                "Threads that compress, and what waits for them.",
+                &["state"],
+            )?,
+            compression_pool_seconds: counter(
+                &r,
+                "blaze_flow_compression_pool_seconds",
+                "Time that the threads were taken, all together.",
+                &[],
             )?,
             wire_bytes: counter(
                 &r,
@@ -197,6 +219,7 @@ impl Page {
             .set(1.0);
         self.fill_topics(shared);
         self.fill_link(shared);
+        self.fill_compression(shared);
         self.fill_control(shared);
     }
 
@@ -255,15 +278,15 @@ impl Page {
                 .inc_by(press.seconds);
             // Topics that share a label have no level in common.
             if topic != OTHER {
-                let level = if path.effort.goes_as_it_is() { 0 } else { press.level };
                 self.compression_level
                     .with_label_values(&[topic])
-                    .set(f64::from(level));
+                    .set(f64::from(path.level()));
             }
         }
         let measured = path.in_rate.rate(now).0;
         let granted = path.granted.map(|granted| granted.advertised_hz);
         let advertised = granted.or(path.info.rate_hz).unwrap_or(measured);
+        let mut receivers = Vec::new();
         for bridge in &mut path.bridges {
             let to = bridge.to_label();
             let from = bridge.from.as_str();
@@ -296,13 +319,19 @@ impl Page {
                 (Phase::Ended, _) => continue,
             };
             self.bridges.with_label_values(&[state]).inc();
-            if !matches!(bridge.from, Scope::Inter) {
-                self.rate.with_label_values(&[topic, &to, "advertised"]).set(advertised);
-            }
-            let actual = bridge.out_rate.rate(now).0;
-            self.rate.with_label_values(&[topic, &to, "actual"]).set(actual);
-            if let Some(allocated) = bridge.allocated_hz {
-                self.rate.with_label_values(&[topic, &to, "allocated"]).set(allocated);
+            let rate = |kind: &str| self.rate.with_label_values(&[topic, &to, kind]);
+            rate("actual").add(bridge.out_rate.rate(now).0);
+            // What goes to one flow is one lane, on whatever scope it was published.
+            let counts = match bridge.receiver() {
+                Some((_, receiver)) => matches!(bridge.phase, Phase::Up { .. }) && !receivers.contains(receiver),
+                None => bridge.from != Scope::Inter,
+            };
+            if counts {
+                receivers.extend(bridge.receiver().map(|(_, receiver)| receiver.clone()));
+                rate("advertised").add(advertised);
+                if let Some(allocated) = bridge.allocated_hz {
+                    rate("allocated").add(allocated);
+                }
             }
         }
     }
@@ -360,39 +389,74 @@ impl Page {
                 .with_label_values(&["malformed_sample"])
                 .inc_by(status.malformed as f64);
         }
-        let mut traffic = shared.egress.traffic();
+        self.fill_budgets(now, shared);
+    }
+
+    fn fill_budgets(&self, now: Instant, shared: &Shared) {
         let mut used = 0.0;
-        for destination in &mut traffic.by_destination {
-            let to = format!("inter/{}", destination.flow.layer);
-            for (index, bytes) in destination.wire_bytes.iter().enumerate() {
+        for (layer, mut traffic) in shared.egress.traffic().by_layer {
+            let to = format!("inter/{layer}");
+            for (index, bytes) in traffic.wire_bytes.iter().enumerate() {
                 self.wire_bytes
                     .with_label_values(&[&to, class_label(index)])
                     .inc_by(*bytes as f64);
             }
-            let rate = destination.rate.rate(now).1;
+            let rate = traffic.rate.rate(now).1;
             used += rate;
-            self.budget.with_label_values(&[&to, "used"]).add(rate);
+            self.budget.with_label_values(&[&to, "used"]).set(rate);
         }
         self.budget
             .with_label_values(&["inter", "limit"])
             .set(shared.egress.budget());
         self.budget.with_label_values(&["inter", "used"]).set(used);
         let limiter = shared.limiter.lock();
-        for layer in limiter.bandwidth().links.keys() {
-            if let Some(limit) = limiter.bandwidth().link_limit_bytes_per_s(layer) {
-                self.budget
-                    .with_label_values(&[&format!("inter/{layer}"), "limit"])
-                    .set(limit);
+        let feasible = |to: &str, feasible: bool| {
+            let value = f64::from(u8::from(feasible));
+            self.feasible.with_label_values(&[to]).set(value);
+        };
+        let last = limiter.last();
+        feasible("inter", last.is_none_or(|last| last.process_feasible));
+        if let Some(measured) = limiter.measured_bytes_per_s(None) {
+            self.budget.with_label_values(&["inter", "measured"]).set(measured);
+        }
+        for layer in limiter.layers() {
+            let to = format!("inter/{layer}");
+            let budget = |kind: &str| self.budget.with_label_values(&[to.as_str(), kind]);
+            if let Some(limit) = limiter.bandwidth().link_limit_bytes_per_s(&layer) {
+                budget("limit").set(limit);
             }
+            if let Some(measured) = limiter.measured_bytes_per_s(Some(&layer)) {
+                budget("measured").set(measured);
+            }
+            feasible(&to, last.is_none_or(|last| !last.infeasible_links.contains(&layer)));
         }
-        for (layer, capacity) in &limiter.measured().capacity_bytes_per_s {
-            self.budget
-                .with_label_values(&[&format!("inter/{layer}"), "measured"])
-                .set(*capacity);
+        if let Some(factor) = limiter.wire_factor(None) {
+            self.wire_factor.with_label_values::<&str>(&[]).set(factor);
         }
-        self.wire_factor
+    }
+
+    fn fill_compression(&self, shared: &Shared) {
+        let Some(pool) = shared.plane.codec().map(CodecPool::counters) else {
+            return;
+        };
+        let press = shared.plane.read(|state| state.core.press_counters());
+        for (state, value) in [
+            ("threads", pool.threads),
+            ("busy", pool.working),
+            ("waiting", press.waiting),
+            ("waiting_bytes", press.waiting_bytes),
+        ] {
+            self.compression_pool.with_label_values(&[state]).set(value as f64);
+        }
+        self.compression_pool_seconds
             .with_label_values::<&str>(&[])
-            .set(limiter.budgets().0.wire_factor());
+            .inc_by(pool.busy.as_secs_f64());
+        for (event, count) in [
+            ("compression_refused", press.refused),
+            ("compression_failed", press.failed),
+        ] {
+            self.link.with_label_values(&[event]).inc_by(count as f64);
+        }
     }
 
     fn fill_control(&self, shared: &Shared) {

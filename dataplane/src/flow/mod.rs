@@ -9,6 +9,8 @@
 //! | inter thread | joins and leaves the inter scope, as the control core wants | 1 where there is one |
 //! | pacer thread | link engine → transport, within the budget | 1 |
 //! | transport threads | transport → link engine → message path → brokers | 3 readers and DDS's own |
+//! | compression threads | a payload from the message path → LZ4 → message path | as many as processors |
+//! | codec task | ends these with the process | 1 |
 //! | admin task | `/livez`, `/readyz`, `/metrics`, `/v1/…` | 1 and one per connection |
 
 mod admin;
@@ -42,7 +44,7 @@ use blaze_runtime::supervisor::{Supervisor, TaskHandle, TaskPolicy};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
-use crate::codec::pool::CodecPool;
+use crate::codec::pool::{self, Spawner};
 use crate::control::{ControlConfig, ControlCore};
 use crate::lane::core::{DataConfig, DataCore};
 use crate::limit::limiter::Limiter;
@@ -263,7 +265,7 @@ pub async fn start_with(
     shared.set_bandwidth(now, &live.bandwidth);
     shared.plane.read(|state| state.core.set_compression(live.compression.clone()));
     if shared.inter.is_some() {
-        shared.plane.compress_with(start_pool(live.pool_threads, &supervisor)?);
+        start_pool(&shared.plane, live.pool_threads, &supervisor)?;
     }
     let metrics_of = Arc::clone(&shared);
     let admin = AdminServer::bind(
@@ -339,7 +341,7 @@ impl RunningFlow {
             .plane
             .read(|state| state.core.set_compression(live.compression.clone()));
         if let Some(pool) = self.shared.plane.codec()
-            && let Err(error) = pool.resize(crate::codec::pool::threads(live.pool_threads))
+            && let Err(error) = pool.resize(pool::threads(live.pool_threads))
         {
             tracing::warn!(%error, "the compression pool keeps the threads that it has");
         }
@@ -399,9 +401,7 @@ impl RunningFlow {
             }
         }
         shared.egress.stop();
-        if let Some(pool) = shared.plane.codec() {
-            pool.stop();
-        }
+        shared.plane.stop_compression();
         shared.plane.wake();
         if let Some(pacer) = &self.pacer {
             pacer.finished().await;
@@ -415,13 +415,25 @@ impl RunningFlow {
     }
 }
 
-/// Starts the threads that compress.
-fn start_pool(threads: u16, supervisor: &Supervisor) -> anyhow::Result<CodecPool> {
-    let supervisor = supervisor.clone();
-    let spawner = move |name: String, run: Box<dyn FnOnce() + Send>| {
-        supervisor.spawn_thread(name, TaskPolicy::MayEnd, run).map(|_| ())
+/// Starts the threads that compress. They end when the flow has drained, or with the process if it does not.
+fn start_pool(plane: &Arc<Plane>, threads: u16, supervisor: &Supervisor) -> anyhow::Result<()> {
+    let of_threads = supervisor.clone();
+    let spawner: Spawner = Box::new(move |name, run| {
+        let started = of_threads.spawn_thread(name, TaskPolicy::MayEnd, run);
+        started.map(|_| ())
+    });
+    plane
+        .compress_with(pool::threads(threads), spawner)
+        .context("starting the compression pool")?;
+    let (plane, shutdown) = (Arc::downgrade(plane), supervisor.shutdown_token());
+    let stop = async move {
+        shutdown.cancelled().await;
+        if let Some(plane) = plane.upgrade() {
+            plane.stop_compression();
+        }
     };
-    CodecPool::start(crate::codec::pool::threads(threads), Box::new(spawner)).context("starting the compression pool")
+    supervisor.spawn("codec", TaskPolicy::MayEnd, stop);
+    Ok(())
 }
 
 /// Starts the threads of the inter scope; gives that of the pacer.

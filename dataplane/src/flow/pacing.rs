@@ -1,23 +1,23 @@
 //! The thread that lets datagrams out: the only one that sends on the inter scope.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use blaze_domain::{FlowId, Priority};
+use blaze_domain::{LayerName, Priority};
 use parking_lot::Mutex;
 
 use super::plane::Plane;
 use crate::lane::measure::RateMeter;
-use crate::limit::pacer::Pacer;
+use crate::limit::pacer::{BURST_DATAGRAMS, Pacer};
+use crate::limit::wire_factor::MAX_LAYERS;
 use crate::link::transport::Transport;
 
 /// The pacer wakes at least that often, to notice a new limit or the end.
 const IDLE: Duration = Duration::from_millis(100);
 /// A debt from which on LinkControl is let out all the same; shorter ones delay it by no more than this.
 const LONG_DEBT: Duration = Duration::from_millis(10);
-/// A burst is at most this many datagrams.
-const BURST_DATAGRAMS: usize = 2;
 
 /// What the pacer shares with admin and metrics.
 pub struct Egress {
@@ -28,23 +28,21 @@ pub struct Egress {
 }
 
 /// Wire bytes that have left.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Traffic {
     /// All of them, since the start.
     pub wire_bytes: u64,
     /// Of those, what carried no user message.
     pub control_bytes: u64,
-    /// Per destination and class.
-    pub by_destination: Vec<DestinationTraffic>,
+    /// To single layers, [`MAX_LAYERS`] at most.
+    pub by_layer: BTreeMap<LayerName, LayerTraffic>,
     /// Datagrams that the transport did not take.
     pub not_sent: u64,
 }
 
-/// Wire bytes to one flow.
+/// Wire bytes to the flows of one layer.
 #[derive(Debug, Clone)]
-pub struct DestinationTraffic {
-    /// The destination.
-    pub flow: FlowId,
+pub struct LayerTraffic {
     /// Since the start, per class in the order of [`Priority::ALL`].
     pub wire_bytes: [u64; 3],
     /// Of those, what carried no user message.
@@ -53,9 +51,6 @@ pub struct DestinationTraffic {
     pub rate: RateMeter,
 }
 
-/// Destinations that are counted one by one. At a time there are no more than [`MAX_PEERS`](crate::link::MAX_PEERS).
-const MAX_DESTINATIONS: usize = 1024;
-
 impl Egress {
     /// An egress with a budget in wire bytes per second.
     #[must_use]
@@ -63,12 +58,7 @@ impl Egress {
         Arc::new(Self {
             budget: AtomicU64::new(bytes_per_s.to_bits()),
             stop: AtomicBool::new(false),
-            traffic: Mutex::new(Traffic {
-                wire_bytes: 0,
-                control_bytes: 0,
-                by_destination: Vec::new(),
-                not_sent: 0,
-            }),
+            traffic: Mutex::default(),
         })
     }
 
@@ -124,7 +114,7 @@ impl Egress {
             let mut traffic = self.traffic.lock();
             traffic.add(
                 now,
-                &transmit.to.flow,
+                &transmit.to.flow.layer,
                 transmit.class,
                 wire_bytes as u64,
                 transmit.control,
@@ -137,30 +127,52 @@ impl Egress {
 }
 
 impl Traffic {
-    fn add(&mut self, now: Instant, to: &FlowId, class: Priority, wire_bytes: u64, control: bool) {
+    fn add(&mut self, now: Instant, to: &LayerName, class: Priority, wire_bytes: u64, control: bool) {
+        let control_bytes = if control { wire_bytes } else { 0 };
         self.wire_bytes += wire_bytes;
-        if control {
-            self.control_bytes += wire_bytes;
-        }
-        let place = match self.by_destination.iter().position(|d| d.flow == *to) {
-            Some(place) => place,
-            None if self.by_destination.len() < MAX_DESTINATIONS => {
-                let rate = RateMeter::new(now);
-                self.by_destination.push(DestinationTraffic {
-                    flow: to.clone(),
-                    wire_bytes: [0; 3],
-                    control_bytes: 0,
-                    rate,
-                });
-                self.by_destination.len() - 1
+        self.control_bytes += control_bytes;
+        if !self.by_layer.contains_key(to) {
+            if self.by_layer.len() >= MAX_LAYERS {
+                return;
             }
-            None => return,
-        };
-        let destination = &mut self.by_destination[place];
-        destination.wire_bytes[class as usize] += wire_bytes;
-        if control {
-            destination.control_bytes += wire_bytes;
+            self.by_layer.insert(to.clone(), LayerTraffic::new(now));
         }
-        destination.rate.add(now, wire_bytes);
+        if let Some(layer) = self.by_layer.get_mut(to) {
+            layer.wire_bytes[class as usize] += wire_bytes;
+            layer.control_bytes += control_bytes;
+            layer.rate.add(now, wire_bytes);
+        }
+    }
+}
+
+impl LayerTraffic {
+    fn new(now: Instant) -> Self {
+        Self {
+            wire_bytes: [0; 3],
+            control_bytes: 0,
+            rate: RateMeter::new(now),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn layers_beyond_the_bound_count_together_with_all() {
+        let now = Instant::now();
+        let mut traffic = Traffic::default();
+        for layer in 0..MAX_LAYERS + 10 {
+            let to: LayerName = format!("layer-{layer}").parse().unwrap();
+            traffic.add(now, &to, Priority::State, 100, false);
+            traffic.add(now, &to, Priority::Control, 10, true);
+        }
+        assert_eq!(traffic.by_layer.len(), MAX_LAYERS);
+        let all = (MAX_LAYERS + 10) as u64;
+        assert_eq!((traffic.wire_bytes, traffic.control_bytes), (all * 110, all * 10));
+        let first: LayerName = "layer-0".parse().unwrap();
+        let first = &traffic.by_layer[&first];
+        assert_eq!((first.wire_bytes, first.control_bytes), ([10, 100, 0], 10));
     }
 }

@@ -1,27 +1,32 @@
 //! The message path and the link of one flow behind one lock.
 //!
 //! Source tasks, the transport's reader threads and the pacer take the lock once per batch or datagram and never while
-//! they wait. What the link has to say to the control core is put into a bounded inbox.
+//! they wait. What the link has to say to the control core is put into a bounded inbox. A thread of the compression pool
+//! takes it twice in each of its turns, to see what is to be done and to say what came of it, and not in between.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, OnceLock, Weak};
+use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::Received;
-use blaze_domain::{DropReason, FlowId, MAX_PAYLOAD_BYTES, Priority, Scope};
+use blaze_domain::{DropReason, FlowId, Priority, Scope};
 use blaze_proto::link::link_control::Body;
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::Notify;
 
-use crate::codec::pool::{CodecPool, Completion, Job, Urgency};
-use crate::codec::{Compressed, lz4, processor_time};
+use crate::codec::pool::{CodecPool, Spawner, Urgency};
+use crate::codec::{Done, Work, guarded};
 use crate::lane::core::{DataCore, LaneLink};
 use crate::lane::load::Loads;
-use crate::lane::press::{PressJob, PressWork, Pressed};
 use crate::lane::path::TopicId;
+use crate::lane::press::{PressJob, PressTicket, Turns};
 use crate::link::transport::{Endpoint, TransportEvent};
 use crate::link::{Engine, LaneId, LinkEvent, Submit, Transmit};
+
+#[cfg(test)]
+mod tests;
 
 /// Link events that wait for the control core; Hellos and registry messages beyond it are dropped and repaired by the
 /// next digest.
@@ -81,6 +86,9 @@ impl LaneLink for NoLink {
     fn has_room(&self, _to: &FlowId, _class: Priority, _bytes: usize) -> bool {
         true
     }
+    fn takes_lz4(&self, _to: &FlowId) -> bool {
+        false
+    }
     fn tell(&mut self, _now: Instant, _to: &FlowId, _body: Body) -> bool {
         false
     }
@@ -95,11 +103,27 @@ impl PlaneState {
         }
     }
 
-    /// Takes what became of a job of the pool.
-    pub fn pressed(&mut self, now: Instant, job: PressJob, pressed: Pressed) {
+    /// A thread of the pool has a turn.
+    pub fn begin(&mut self, now: Instant, urgency: Urgency) -> Option<PressJob> {
         match &mut self.engine {
-            Some(engine) => self.core.pressed(now, job, pressed, engine),
-            None => self.core.pressed(now, job, pressed, &mut NoLink),
+            Some(engine) => self.core.begin(now, urgency, engine),
+            None => self.core.begin(now, urgency, &mut NoLink),
+        }
+    }
+
+    /// Takes what came of a turn.
+    pub fn pressed(&mut self, now: Instant, ticket: PressTicket, done: Done) {
+        match &mut self.engine {
+            Some(engine) => self.core.pressed(now, ticket, done, engine),
+            None => self.core.pressed(now, ticket, done, &mut NoLink),
+        }
+    }
+
+    /// There is no pool any more.
+    pub fn stop_compression(&mut self, now: Instant) {
+        match &mut self.engine {
+            Some(engine) => self.core.stop_compression(now, engine),
+            None => self.core.stop_compression(now, &mut NoLink),
         }
     }
 
@@ -169,11 +193,20 @@ impl PlaneState {
     }
 }
 
+/// What a thread does with a payload.
+type Run = fn(Work, &[u8]) -> Done;
+
+/// The threads that compress.
+struct Codec {
+    pool: CodecPool,
+    run: Run,
+}
+
 /// Message path and link of one flow.
 pub struct Plane {
-    /// Itself, for jobs of the pool.
+    /// Itself, for the threads of the pool.
     this: Weak<Self>,
-    codec: OnceLock<CodecPool>,
+    codec: OnceLock<Codec>,
     state: Mutex<PlaneState>,
     /// The pacer waits here while it has nothing to send.
     work: Condvar,
@@ -199,7 +232,14 @@ impl Plane {
 
     /// Does something under the lock, carries out what the link then wants, and wakes the pacer.
     pub fn with<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> R {
-        let (result, told, jobs) = {
+        let (result, turns) = self.locked(action);
+        self.hand_out(turns);
+        result
+    }
+
+    /// The same; the turns at the codec are left to the caller.
+    fn locked<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> (R, Turns) {
+        let (result, told, turns) = {
             let mut state = self.state.lock();
             let result = action(&mut state);
             // Told under the lock: who is up and who is down must reach the control core in the order of its happening.
@@ -208,62 +248,77 @@ impl Plane {
                 told = true;
                 self.tell(event);
             });
-            (result, told, state.core.take_press_jobs())
+            (result, told, state.core.take_turns())
         };
-        self.give_to_pool(jobs);
         self.work.notify_one();
         if told {
             self.news_waits.notify_one();
         }
-        result
+        (result, turns)
     }
 
-    /// Payloads are compressed from now on, by this pool.
-    pub fn compress_with(&self, pool: CodecPool) {
-        if self.codec.set(pool).is_ok() {
+    /// Payloads are compressed from now on, by so many threads.
+    ///
+    /// # Errors
+    /// That of the spawner.
+    pub fn compress_with(&self, threads: usize, spawner: Spawner) -> io::Result<()> {
+        self.compress_by(threads, spawner, Work::run)
+    }
+
+    fn compress_by(&self, threads: usize, spawner: Spawner, run: Run) -> io::Result<()> {
+        let plane = Weak::clone(&self.this);
+        let pool = CodecPool::start(threads, spawner, move |urgency| {
+            if let Some(plane) = plane.upgrade() {
+                let turns = plane.take_turn(|state| state.begin(Instant::now(), urgency));
+                plane.hand_out(turns);
+            }
+        })?;
+        if self.codec.set(Codec { pool, run }).is_ok() {
             self.state.lock().core.enable_compression();
         }
+        Ok(())
     }
 
     /// The pool, if there is one.
     pub fn codec(&self) -> Option<&CodecPool> {
-        self.codec.get()
+        self.codec.get().map(|codec| &codec.pool)
     }
 
-    /// Called without the lock: a job that is not taken comes back at once.
-    fn give_to_pool(&self, jobs: Vec<PressJob>) {
-        for job in jobs {
-            let (ticket, work, payload) = (job.ticket(), job.work, job.payload.clone());
-            let plane = Weak::clone(&self.this);
-            let told = Weak::clone(&self.this);
-            let done = Completion::new(move |pressed: Option<Pressed>| {
-                if let Some(plane) = told.upgrade() {
-                    plane.pressed(job, pressed.unwrap_or(Pressed::NotDone));
-                }
-            });
-            let (urgency, bytes) = match work {
-                PressWork::Compress(_) => (Urgency::Compress, payload.len()),
-                PressWork::Decompress(announced) => {
-                    let result = usize::try_from(announced).unwrap_or(usize::MAX).min(MAX_PAYLOAD_BYTES);
-                    (Urgency::Decompress, payload.len() + result)
-                }
-            };
-            let run = move || {
-                let wanted = plane.upgrade().is_some_and(|plane| plane.read(|state| state.core.begins(ticket)));
-                if wanted {
-                    done.give(press(&payload, work));
-                }
-            };
-            if let Some(pool) = self.codec.get()
-                && let Err((job, _)) = pool.submit(Job::new(urgency, bytes, run))
-            {
-                drop(job);
-            }
+    /// Ends the threads that compress, each after the payload that it is at. What waits for them is dropped; what comes after goes as it is.
+    pub fn stop_compression(&self) {
+        if let Some(codec) = self.codec.get() {
+            codec.pool.stop();
+            self.with(|state| state.stop_compression(Instant::now()));
         }
     }
 
-    fn pressed(&self, job: PressJob, pressed: Pressed) {
-        self.with(|state| state.pressed(Instant::now(), job, pressed));
+    /// One turn: what is to be done is done without the lock. A panic of the codec ends there; one of the message path ends the thread, and
+    /// with it the process. Returns the turns that follow.
+    fn take_turn(&self, begin: impl FnOnce(&mut PlaneState) -> Option<PressJob>) -> Turns {
+        let Some(codec) = self.codec.get() else {
+            return Turns::default();
+        };
+        let (job, mut turns) = self.locked(begin);
+        if let Some(PressJob { ticket, payload, work }) = job {
+            let done = guarded(|| (codec.run)(work, &payload));
+            let ((), more) = self.locked(|state| state.pressed(Instant::now(), ticket, done));
+            turns += more;
+        }
+        turns
+    }
+
+    /// Offers turns to the pool, and takes those that are the caller's. Called without the lock.
+    fn hand_out(&self, mut turns: Turns) {
+        while turns != Turns::default() {
+            if let Some(codec) = self.codec.get() {
+                codec.pool.offer(turns.quick, turns.long);
+            }
+            let mut more = Turns::default();
+            for _ in 0..turns.own {
+                more += self.take_turn(|state| state.core.begin_own());
+            }
+            turns = more;
+        }
     }
 
     /// Looks at the state without changing what the link does.
@@ -320,7 +375,7 @@ impl Plane {
 
     fn transmit(&self, idle: Duration, next: impl Fn(&mut Engine, Instant) -> Option<Transmit>) -> Option<Transmit> {
         let mut told = false;
-        let (transmit, jobs) = {
+        let (transmit, turns) = {
             let mut state = self.state.lock();
             let now = Instant::now();
             let due = state.run_timers(now);
@@ -331,14 +386,14 @@ impl Plane {
             state.pump(now, &mut tell);
             let transmit = state.engine.as_mut().and_then(|engine| next(engine, now));
             state.pump(now, &mut tell);
-            if transmit.is_none() && !told && !idle.is_zero() && !state.core.has_press_jobs() {
+            if transmit.is_none() && !told && !idle.is_zero() && !state.core.has_turns() {
                 let paced = state.engine.as_ref().and_then(Engine::paced_until);
                 let until = [due, paced].into_iter().flatten().fold(now + idle, Instant::min);
                 self.work.wait_until(&mut state, until);
             }
-            (transmit, state.core.take_press_jobs())
+            (transmit, state.core.take_turns())
         };
-        self.give_to_pool(jobs);
+        self.hand_out(turns);
         if told {
             self.news_waits.notify_one();
         }
@@ -403,26 +458,5 @@ impl Plane {
             return;
         }
         news.push_back(News::Link(Box::new(event)));
-    }
-}
-
-/// Does what is to be done with a payload.
-fn press(payload: &bytes::Bytes, work: PressWork) -> Pressed {
-    match work {
-        PressWork::Compress(level) => {
-            let (began, began_on_processor) = (Instant::now(), processor_time());
-            let block = lz4::compress(payload, level);
-            Pressed::Compressed(Compressed {
-                block,
-                level,
-                before: payload.len(),
-                processor: processor_time().saturating_sub(began_on_processor),
-                taken: began.elapsed(),
-            })
-        }
-        PressWork::Decompress(announced) => match lz4::decompress(payload, announced, MAX_PAYLOAD_BYTES) {
-            Ok(payload) => Pressed::Decompressed(payload),
-            Err(_) => Pressed::Refused,
-        },
     }
 }

@@ -116,6 +116,7 @@ fn facts_of(bridge: &mut Bridge) -> BridgeFacts {
         received: lately.taken,
         sent: lately.out,
         dropped: lately.dropped.into_iter().collect(),
+        exceeds_advertised: bridge.exceeds_advertised,
         denied: 0,
     }
 }

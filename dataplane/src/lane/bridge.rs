@@ -6,10 +6,12 @@ use blaze_brokers::PublishOutcome;
 use blaze_domain::{DropReason, Priority, Scope};
 
 use super::admit::Admitted;
+use super::allocation::LaneGates;
 use super::core::{DRAIN, LaneLink};
 use super::load::LoadMeter;
 use super::measure::RateMeter;
 use super::path::{BridgeState, Phase, Sink, TopicId};
+use super::press::plain;
 use super::reading::For;
 use super::stats::BridgeStats;
 use super::succession::{Succession, Waiting};
@@ -32,7 +34,7 @@ impl BridgeState {
             ended: None,
             gate: Gate::new(planned.lane.max_rate_hz, now),
             allocated_hz: None,
-            sent_bytes: 0,
+            exceeds_advertised: false,
             sink,
             pressing: 0,
             submitted: false,
@@ -153,7 +155,13 @@ impl BridgeState {
     }
 
     /// Takes a message that it wants: filters, counts, and writes it to a broker. Returns what is to go to its lane, if it has one.
-    pub(super) fn pass(&mut self, now: Instant, message: &Admitted, large: bool) -> Option<Waiting> {
+    pub(super) fn pass(
+        &mut self,
+        now: Instant,
+        message: &Admitted,
+        large: bool,
+        gates: &mut LaneGates,
+    ) -> Option<Waiting> {
         if let Phase::Draining { until, latest } = &mut self.phase {
             *until = (*until).max(now + DRAIN).min(*latest);
         }
@@ -168,16 +176,15 @@ impl BridgeState {
             self.stats.dropped.add(DropReason::Lifespan, 1);
             return None;
         }
-        match self.gate.admit(now) {
-            // What is kept for late joiners comes at once and is not repeated: the budget is the pacer's then.
-            Err(DropReason::RateLimit) if message.kept => {}
-            Err(reason) => {
-                self.stats.dropped.add(reason, 1);
-                return None;
-            }
-            Ok(()) => {}
+        let admitted = self.admit(now, message, gates);
+        // What the budget skips is asked for, too: a flow that has to skip carries more than one that does not.
+        if matches!(admitted, Ok(()) | Err(DropReason::RateLimit)) {
+            self.load.add(bytes);
         }
-        self.load.add(bytes);
+        if let Err(reason) = admitted {
+            self.stats.dropped.add(reason, 1);
+            return None;
+        }
         match &mut self.sink {
             Sink::Publish { writer, bare, .. } => {
                 let Some(writer) = writer else {
@@ -206,6 +213,21 @@ impl BridgeState {
         }
     }
 
+    /// Whether a message may pass: first what is asked for, then what the budget gives the lane. What is kept for late joiners comes at once and is
+    /// not repeated: each of them gets all of it, and the budget is the pacer's then.
+    fn admit(&mut self, now: Instant, message: &Admitted, gates: &mut LaneGates) -> Result<(), DropReason> {
+        if message.kept {
+            return Ok(());
+        }
+        if !self.gate.admit(now) {
+            return Err(DropReason::MaxRate);
+        }
+        match self.receiver() {
+            Some((_, receiver)) => gates.admit(now, receiver),
+            None => Ok(()),
+        }
+    }
+
     /// To the lane's queue, or behind what is held before it.
     pub(super) fn queue(
         &mut self,
@@ -225,11 +247,19 @@ impl BridgeState {
     }
 
     /// Gives a message to the link.
-    pub(super) fn submit(&mut self, now: Instant, topic: TopicId, message: Waiting, link: &mut dyn LaneLink) {
+    pub(super) fn submit(&mut self, now: Instant, topic: TopicId, mut message: Waiting, link: &mut dyn LaneLink) {
         let keep_newest = self.keep_newest();
         let (Sink::Lane { lane, class }, Target::Inter { receiver, .. }) = (&mut self.sink, &self.target) else {
             return;
         };
+        // It was compressed for a receiver before this one.
+        if message.frame.is_compressed() && !link.takes_lz4(receiver) {
+            let Some(frame) = plain(&message.frame) else {
+                self.stats.dropped.add(DropReason::DecompressError, 1);
+                return;
+            };
+            message.frame = frame;
+        }
         let wanted = if message.large {
             Priority::Bulk
         } else {

@@ -19,6 +19,7 @@ use blaze_proto::link::link_control::Body;
 use lru::LruCache;
 
 use super::admit::{Admitted, Refusal};
+use super::allocation::Reckoned;
 use super::early::Early;
 use super::kept::KeptMessages;
 use super::measure::micros;
@@ -59,6 +60,8 @@ pub trait LaneLink {
     fn answers(&self, to: &FlowId) -> bool;
     /// Whether the queue to a flow takes so many bytes more without coming near its bound.
     fn has_room(&self, to: &FlowId, class: Priority, bytes: usize) -> bool;
+    /// Whether a flow decompresses what comes over the link; one that is not known does not.
+    fn takes_lz4(&self, to: &FlowId) -> bool;
     /// Tells a flow something. `false`: it could not be queued.
     fn tell(&mut self, now: Instant, to: &FlowId, body: Body) -> bool;
 }
@@ -81,6 +84,9 @@ impl LaneLink for Engine {
     }
     fn has_room(&self, to: &FlowId, class: Priority, bytes: usize) -> bool {
         Engine::has_room(self, to, class, bytes)
+    }
+    fn takes_lz4(&self, to: &FlowId) -> bool {
+        Engine::takes_lz4(self, to)
     }
     fn tell(&mut self, now: Instant, to: &FlowId, body: Body) -> bool {
         self.send_control(now, to, body).is_ok()
@@ -131,8 +137,14 @@ pub struct DataCore {
     pub(super) begun: Vec<(TopicId, usize)>,
     /// What could not be attributed to a topic.
     pub unattributed: Drops,
-    /// The rates of lanes have to be worked out anew.
+    /// Topics with lanes, and some that had one.
+    pub(super) leaving: BTreeSet<TopicId>,
+    /// What lanes have sent.
+    pub(super) reckoned: Reckoned,
+    /// The rates of lanes have to be worked out anew: a size has grown …
     pub(super) allocation_due: bool,
+    /// … or anything else has changed.
+    pub(super) lanes_changed: bool,
     /// Windows that gave way to newer writers.
     pub evicted_writers: u64,
 }
@@ -160,7 +172,10 @@ impl DataCore {
             press: Press::default(),
             begun: Vec::new(),
             unattributed: Drops::default(),
+            leaving: BTreeSet::new(),
+            reckoned: Reckoned::default(),
             allocation_due: false,
+            lanes_changed: false,
             evicted_writers: 0,
         }
     }
@@ -227,7 +242,7 @@ impl DataCore {
     /// Changes what counts as large, from the next message on.
     pub fn set_large_bytes(&mut self, bytes: u64) {
         self.config.large_bytes = bytes;
-        self.allocation_due = true;
+        self.lanes_changed = true;
     }
 
     /// Takes a batch that a local scope delivered. `wall_ns` is the clock since 1970 at `now`.
@@ -324,10 +339,15 @@ impl DataCore {
 
     /// The link has sent the last byte of a message for the first time.
     pub fn lane_sent(&mut self, now: Instant, lane: LaneId, bytes: u64, wait: Duration) {
-        if let Some(bridge) = self.lane_bridge(lane) {
-            bridge.out_rate.add(now, bytes);
-            bridge.sent_bytes += bytes;
-            bridge.stats.latency.record(micros(wait));
+        let Some((topic, at)) = self.lanes.get(lane.0 as usize) else { return };
+        let Some(path) = self.topics.get_mut(topic.0 as usize) else { return };
+        // As large as the allocation takes each of them for; one that is larger has just been seen for the first time.
+        let reckoned = path.granted.map_or(bytes, |granted| granted.size_bytes.max(bytes));
+        let Some(bridge) = path.bridges.get_mut(*at) else { return };
+        bridge.out_rate.add(now, bytes);
+        bridge.stats.latency.record(micros(wait));
+        if let Some((layer, _)) = bridge.receiver() {
+            self.reckoned.add(layer, reckoned);
         }
     }
 
@@ -403,13 +423,21 @@ impl DataCore {
         let path = &mut self.topics[topic.0 as usize];
         let large = path.is_large(self.config.large_bytes);
         let mut lanes = ToLanes::new();
+        let mut offered = false;
         for (at, bridge) in path.bridges.iter_mut().enumerate().filter(|(_, bridge)| bridge.from == from) {
             if bridge.takes() && bridge.wants(message) && bridge.is_meant(message.meant) {
-                lanes.extend(bridge.pass(now, message, large).map(|waiting| (at, waiting)));
+                offered |= bridge.lane_id().is_some();
+                let waiting = bridge.pass(now, message, large, &mut path.gates);
+                lanes.extend(waiting.map(|waiting| (at, waiting)));
             }
         }
-        if path.bridges.iter().any(|bridge| bridge.from == from && bridge.lane_id().is_some()) {
-            self.note_size(now, topic, message.frame.payload().len());
+        if offered {
+            let bytes = message.frame.payload().len();
+            // What is kept for late joiners comes at once, which is no rate.
+            if !message.kept {
+                path.note_offered(now, bytes as u64);
+            }
+            self.note_size(now, topic, bytes, link);
         }
         if !lanes.is_empty() {
             self.press_out(now, topic, &message.frame, lanes, link);

@@ -3,6 +3,10 @@
 use std::time::{Duration, Instant};
 
 const SLOTS: usize = 6;
+/// Whole seconds of a mean.
+const WINDOW_S: u64 = SLOTS as u64 - 1;
+/// The same, for whoever reckons with single messages.
+pub const WINDOW: Duration = Duration::from_secs(WINDOW_S);
 
 /// Messages and bytes per second, as the mean of the last five whole seconds.
 #[derive(Debug, Clone)]
@@ -38,7 +42,7 @@ impl RateMeter {
     pub fn rate(&mut self, now: Instant) -> (f64, f64) {
         self.turn(now);
         let current = (self.second % SLOTS as u64) as usize;
-        let whole = (self.second - self.begun).min(SLOTS as u64 - 1);
+        let whole = (self.second - self.begun).min(WINDOW_S);
         if whole == 0 {
             let elapsed = now.saturating_duration_since(self.start).as_secs_f64() - self.second as f64;
             let (messages, bytes) = self.slots[current];
@@ -47,6 +51,12 @@ impl RateMeter {
         let others = self.slots.iter().enumerate().filter(|(index, _)| *index != current);
         let (messages, bytes) = others.fold((0, 0), |sum, (_, slot)| (sum.0 + slot.0, sum.1 + slot.1));
         (messages as f64 / whole as f64, bytes as f64 / whole as f64)
+    }
+
+    /// Messages per second over the last [`WINDOW`]; `None` while it was not counted for so long, as after a silence.
+    pub fn of_window(&mut self, now: Instant) -> Option<f64> {
+        let hz = self.rate(now).0;
+        (self.second - self.begun >= WINDOW_S).then_some(hz)
     }
 
     fn turn(&mut self, now: Instant) {
@@ -94,6 +104,15 @@ impl LatencyHistogram {
         self.counts[Self::bucket(us)] += 1;
         self.count += 1;
         self.sum_us = self.sum_us.saturating_add(us);
+    }
+
+    /// Counts what another one has counted.
+    pub fn merge(&mut self, other: &Self) {
+        for (count, more) in self.counts.iter_mut().zip(other.counts.iter()) {
+            *count += more;
+        }
+        self.count += other.count;
+        self.sum_us = self.sum_us.saturating_add(other.sum_us);
     }
 
     /// How many were counted.
@@ -174,6 +193,39 @@ mod tests {
             "{rate} {bytes}"
         );
         assert!(meter.rate(start + Duration::from_secs(60)).0.abs() < f64::EPSILON);
+    }
+
+    #[test]
+    fn a_window_that_is_not_whole_tells_nothing() {
+        let start = Instant::now();
+        let at = |ms: u64| start + Duration::from_millis(ms);
+        let mut meter = RateMeter::new(start);
+        for n in 0..10u64 {
+            meter.add(at(n * 500), 1);
+            assert_eq!(meter.of_window(at(n * 500)), None);
+        }
+        assert_eq!(meter.of_window(at(5_000)), Some(2.0));
+        // A silence, after which the mean begins anew.
+        meter.add(at(20_000), 1);
+        assert_eq!(meter.of_window(at(24_900)), None);
+        assert_eq!(meter.of_window(at(25_000)), Some(0.2));
+    }
+
+    #[test]
+    fn histograms_add_up() {
+        let (mut all, mut one, mut other) = (
+            LatencyHistogram::default(),
+            LatencyHistogram::default(),
+            LatencyHistogram::default(),
+        );
+        for us in 0..1_000 {
+            all.record(us);
+            let part = if us % 3 == 0 { &mut one } else { &mut other };
+            part.record(us);
+        }
+        one.merge(&other);
+        assert_eq!((one.count(), one.sum_us()), (all.count(), all.sum_us()));
+        assert_eq!(one.quantile_ms(0.5), all.quantile_ms(0.5));
     }
 
     proptest! {

@@ -9,7 +9,7 @@ use blaze_domain::{DropReason, FlowId, LayerName, Priority, Scope, TopicName, Wr
 use blaze_proto::Frame;
 
 use super::admit::Refusal;
-use super::allocation::Granted;
+use super::allocation::{Granted, LaneGates, Published, Told};
 use super::core::FORGET;
 use super::load::LoadMeter;
 use super::measure::RateMeter;
@@ -170,12 +170,12 @@ pub struct BridgeState {
     pub failure: Option<String>,
     /// When it ended, if it did.
     pub ended: Option<Instant>,
-    /// Thins to what requesters ask for and the budget allows.
+    /// Thins to what requesters ask for.
     pub gate: Gate,
-    /// What the budget allows a lane, in Hz, once it is worked out.
+    /// What the budget allows its lane, in Hz, once it is worked out.
     pub allocated_hz: Option<f64>,
-    /// Payload bytes of messages of a lane that were sent, each counted once.
-    pub sent_bytes: u64,
+    /// Its lane is held to the rate that was advertised, because more is published.
+    pub exceeds_advertised: bool,
     /// Where it writes.
     pub sink: Sink,
     /// Messages that are being compressed, or wait behind such.
@@ -216,14 +216,14 @@ impl BridgeState {
         }
     }
 
-    /// Whether it has ended and nothing of it waits for a broker.
+    /// Whether it has ended and nothing of it waits for a broker, or is being compressed.
     #[must_use]
     pub fn is_over(&self) -> bool {
         let waits = match &self.sink {
             Sink::Publish { writer, past, .. } => writer.is_some() || !past.is_empty(),
             Sink::Lane { .. } => false,
         };
-        self.phase == Phase::Ended && !waits
+        self.phase == Phase::Ended && !waits && self.pressing == 0
     }
 
     /// Whether it ended so long ago that another bridge may have its place.
@@ -270,14 +270,22 @@ pub struct TopicPath {
     pub effort: TopicEffort,
     /// What compression did.
     pub press: PressStats,
+    /// Messages that are worth compressing and that some lane has admitted.
+    pub(super) worth_rate: RateMeter,
     /// Largest payload as sent on the inter scope.
     pub sent_size: SizeMeter,
+    /// The level that the last payload that is worth compressing was sent at; 0: as it is.
+    pub(super) sent_level: u8,
     /// What was decided for it, where it leaves on the inter scope.
     pub granted: Option<Granted>,
-    /// Rate of what came from local scopes, in Hz, as it was when it last moved.
-    pub(super) believed_hz: f64,
+    /// What came for its lanes, whether it passed there or not.
+    pub offered: RateMeter,
+    /// What is believed of that.
+    pub(super) published: Published,
     /// What the allocator was told last.
-    pub(super) advertised_told: Option<(f64, bool)>,
+    pub(super) told: Option<Told>,
+    /// What thins its lanes.
+    pub(super) gates: LaneGates,
     /// What came from local scopes.
     pub in_rate: RateMeter,
     /// Dropped before any bridge: echoes, duplicates, what could not be read.
@@ -309,10 +317,14 @@ impl TopicPath {
             compression: Compression::default(),
             effort: TopicEffort::default(),
             press: PressStats::default(),
+            worth_rate: RateMeter::new(now),
             sent_size: SizeMeter::default(),
+            sent_level: 0,
             granted: None,
-            believed_hz: 0.0,
-            advertised_told: None,
+            offered: RateMeter::new(now),
+            published: Published::default(),
+            told: None,
+            gates: LaneGates::default(),
             in_rate: RateMeter::new(now),
             ingress_drops: Drops::default(),
             refused: Default::default(),

@@ -19,7 +19,8 @@ impl DataCore {
     pub fn forget_unused(&mut self, now: Instant) -> usize {
         let before = self.vacant.len();
         for (index, path) in self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant) {
-            if !path.is_idle() {
+            // What is with the codec comes back to its topic.
+            if !path.is_idle() || self.press.holds(topic_id(index)) {
                 path.idle = None;
                 continue;
             }
@@ -125,7 +126,10 @@ impl DataCore {
         }
         self.pass_on(topic);
         self.stir();
-        self.allocation_due = true;
+        if plan.bridges.iter().any(|planned| planned.to.receiver().is_some()) {
+            self.leaving.insert(topic);
+        }
+        self.lanes_changed = true;
     }
 
     /// Gives bridges of a topic that have begun what was kept for them. To be called after [`DataCore::apply`].
@@ -145,12 +149,17 @@ impl DataCore {
             for message in self.kept.of(now, topic, bridge.from) {
                 // The rules may have changed since it came.
                 if bridge.takes() && path.info.takes(&message.frame) && bridge.wants(&message) {
-                    let waiting = bridge.pass(now, &message, large);
+                    let waiting = bridge.pass(now, &message, large, &mut path.gates);
                     passed.extend(waiting.map(|waiting| (message.frame, ToLanes::from_iter([(at, waiting)]))));
                 }
             }
             for (frame, lanes) in passed {
-                self.press_out(now, topic, &frame, lanes, link);
+                // From the codec it would come back behind what is held.
+                if passed_on.is_some() {
+                    self.to_lanes(now, topic, lanes, link);
+                } else {
+                    self.press_out(now, topic, &frame, lanes, link);
+                }
             }
             let path = &mut self.topics[topic.0 as usize];
             if let Some(held) = path.bridges.get_mut(at).and_then(|bridge| bridge.held.as_mut()) {

@@ -1,28 +1,43 @@
 //! Compression on the way of a message: after a lane has admitted it and before it is queued, and back after it came over the link.
 //!
 //! ```text
-//! gate ─► press: a place in the topic's order ─► job ─► pool ─► pressed ─► in order ─► lanes
-//! link ─► press: a place in the topic's order ─► job ─► pool ─► pressed ─► in order ─► bridges to brokers
+//! gate ─► outward: a place in the line of topic and writer ─► begin ─► LZ4 ─► pressed ─► in order ─► lanes
+//! link ─► inward:  a place in the line of topic and writer ─► begin ─► LZ4 ─► pressed ─► in order ─► bridges to brokers
 //! ```
 //!
-//! A message is compressed once, whatever the number of its lanes. What needs no compression waits behind what does, so the order of a
-//! topic is that of admission. Nothing here runs a job: who owns the data plane takes the [`PressJob`]s, and comes back with what became of them.
+//! A message is compressed once, whatever the number of its lanes. What needs no compression waits behind what does of the same writer, so
+//! its order is that of admission. Nothing here runs the codec: whoever owns the data plane offers the [`Turns`] to a pool, and a thread
+//! that has one asks what is to be done then, and comes back with what became of it. Until it asks the message is here, and may give way to a
+//! newer one or become too old.
 
+mod inward;
+mod level;
+mod outward;
+
+use std::ops::AddAssign;
 use std::time::Instant;
 
-use blaze_domain::node_file::{Codec, Compression, TopicRule, TopicValues};
-use blaze_domain::{DropReason, MAX_PAYLOAD_BYTES, TopicName, WriterId};
-use blaze_proto::Frame;
-use blaze_proto::frame::Compression as Compressed;
+use blaze_domain::node_file::{Compression, TopicRule, TopicValues};
+use blaze_domain::{DropReason, TopicName, WriterId};
 use bytes::Bytes;
-use smallvec::SmallVec;
 
 use super::admit::Admitted;
 use super::core::{DataCore, LaneLink};
-use super::path::{Phase, TopicId};
-use super::succession::Waiting;
-use crate::codec::effort::{Effort, shares};
+use super::path::TopicId;
+use crate::codec::effort::shares;
 use crate::codec::order::{Bounds, InOrder, Ticket};
+use crate::codec::pool::{Urgency, threads_for_long};
+use crate::codec::{Done, Work};
+pub(super) use inward::plain;
+pub use level::{PressStats, TopicEffort};
+use outward::Outward;
+pub(super) use outward::ToLanes;
+
+/// Of what came over the link so many bytes wait for the pool (16 MiB) before the thread that brings more does the work itself.
+const OWN_ABOVE: usize = 16 * 1024 * 1024;
+
+/// Topic and writer: what stays in order.
+type Line = (TopicId, WriterId);
 
 /// How payloads are compressed, by topic.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -41,80 +56,54 @@ impl CompressionRules {
     }
 }
 
-/// A message on its way to lanes: which bridges, and what each of them gets.
-pub(super) type ToLanes = SmallVec<[(usize, Waiting); 2]>;
-
-/// What is to be done for a message.
-#[derive(Debug)]
-enum Item {
-    Out(ToLanes),
-    In(Box<Admitted>),
+/// Turns at the codec that were not asked for before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Turns {
+    /// Of the pool, for what is done in a moment.
+    pub quick: usize,
+    /// Of the pool, for large payloads.
+    pub long: usize,
+    /// Of the calling thread, see [`DataCore::begin_own`]: the pool is behind.
+    pub own: usize,
 }
 
-/// Work for the pool.
-#[derive(Debug)]
-pub struct PressJob {
-    ticket: Ticket<TopicId>,
-    item: Item,
-    /// The payload.
-    pub payload: Bytes,
-    /// What is to be done with it.
-    pub work: PressWork,
-}
-
-/// Which job.
-#[derive(Debug, Clone, Copy)]
-pub struct PressTicket {
-    ticket: Ticket<TopicId>,
-    outward: bool,
-}
-
-impl PressJob {
-    /// To ask whether it is still wanted.
-    #[must_use]
-    pub fn ticket(&self) -> PressTicket {
-        PressTicket {
-            ticket: self.ticket,
-            outward: matches!(self.item, Item::Out(_)),
-        }
+impl AddAssign for Turns {
+    fn add_assign(&mut self, more: Self) {
+        self.quick += more.quick;
+        self.long += more.long;
+        self.own += more.own;
     }
 }
 
-/// What is to be done with a payload.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum PressWork {
-    /// Compress it at a level.
-    Compress(u8),
-    /// Decompress it; so large it says that it will be.
-    Decompress(u64),
+/// What is to be done for one message.
+#[derive(Debug, Clone)]
+pub struct PressJob {
+    /// To be given back with the result.
+    pub ticket: PressTicket,
+    /// The payload.
+    pub payload: Bytes,
+    /// What is to be done with it.
+    pub work: Work,
 }
 
-/// What became of a job.
-#[derive(Debug)]
-pub enum Pressed {
-    /// It was compressed, or goes as it is.
-    Compressed(crate::codec::Compressed),
-    /// It was decompressed.
-    Decompressed(Bytes),
-    /// It cannot be.
-    Refused,
-    /// Nobody had the time.
-    NotDone,
+/// Which message that is.
+#[derive(Debug, Clone, Copy)]
+pub struct PressTicket {
+    place: Ticket<TopicId, WriterId>,
+    outward: bool,
 }
 
-/// Bytes before and after, and what it cost.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct PressStats {
-    /// Messages that were compressed, or tried.
-    pub messages: u64,
-    /// Bytes of their payloads before.
-    pub before: u64,
-    /// And after.
-    pub after: u64,
-    /// Seconds of processor time.
-    pub seconds: f64,
-    /// Level of the last one.
-    pub level: u8,
+/// What waits for the codec, and what did not get that far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PressCounters {
+    /// Messages that wait for a turn.
+    pub waiting: usize,
+    /// Bytes of their payloads; of those that came over the link, as they are to become.
+    pub waiting_bytes: usize,
+    /// Messages for which there was no room, since the start.
+    pub refused: u64,
+    /// Payloads with which the codec panicked, since the start.
+    pub failed: u64,
 }
 
 /// The stage in both directions.
@@ -122,19 +111,32 @@ pub(super) struct Press {
     /// Whether there is a pool.
     enabled: bool,
     rules: CompressionRules,
-    out: InOrder<TopicId, WriterId, ToLanes>,
+    out: InOrder<TopicId, WriterId, Outward>,
     into: InOrder<TopicId, WriterId, Box<Admitted>>,
-    jobs: Vec<PressJob>,
+    /// Turns that were asked for and have not begun, by urgency.
+    asked: [usize; Urgency::ALL.len()],
+    /// The last quick turn was for what came over the link.
+    was_inward: bool,
+    refused: u64,
+    failed: u64,
 }
 
 impl Default for Press {
     fn default() -> Self {
+        let bounds = Bounds::default();
         Self {
             enabled: false,
             rules: CompressionRules::default(),
-            out: InOrder::new(Bounds::default()),
-            into: InOrder::new(Bounds::default()),
-            jobs: Vec::new(),
+            out: InOrder::new(bounds),
+            // It was let in by its sender's pacer, and is quickly done.
+            into: InOrder::new(Bounds {
+                waiting_of_one: bounds.bytes_of_one,
+                ..bounds
+            }),
+            asked: [0; Urgency::ALL.len()],
+            was_inward: false,
+            refused: 0,
+            failed: 0,
         }
     }
 }
@@ -146,11 +148,54 @@ impl Press {
 
     /// Whether something of a topic that came over the link is not with its bridges yet.
     pub(super) fn delays(&self, topic: TopicId) -> bool {
-        !self.into.is_clear(&topic)
+        self.into.holds(&topic)
     }
 
     pub(super) fn delays_any(&self) -> bool {
-        self.into.waiting().items > 0
+        self.into.held().items > 0
+    }
+
+    /// Whether it holds anything of a topic.
+    pub(super) fn holds(&self, topic: TopicId) -> bool {
+        self.out.holds(&topic) || self.into.holds(&topic)
+    }
+
+    /// What it holds for one bridge of a topic goes to another one. Returns how many messages that are.
+    pub(super) fn hand_over(&mut self, topic: TopicId, from: usize, to: usize) -> u64 {
+        let mut moved = 0;
+        for lanes in self.out.items_mut(&topic).map(|out| &mut out.lanes) {
+            for (at, _) in lanes.iter_mut().filter(|(at, _)| *at == from) {
+                *at = to;
+                moved += 1;
+            }
+        }
+        moved
+    }
+
+    fn waiting(&self, urgency: Urgency) -> usize {
+        self.out.waits(urgency).items + self.into.waits(urgency).items
+    }
+
+    /// Turns that are still to be asked for. One whose message gave way is left to the message that follows.
+    fn missing(&self) -> [usize; Urgency::ALL.len()] {
+        Urgency::ALL.map(|urgency| self.waiting(urgency).saturating_sub(self.asked[urgency as usize]))
+    }
+
+    fn turn_begins(&mut self, urgency: Urgency) {
+        let asked = &mut self.asked[urgency as usize];
+        *asked = asked.saturating_sub(1);
+    }
+
+    /// What came over the link, to be decompressed.
+    fn begin_inward(&mut self) -> Option<PressJob> {
+        let (place, message) = self.into.begin(Urgency::Quick)?;
+        let job = PressJob {
+            ticket: PressTicket { place, outward: false },
+            payload: message.frame.payload().clone(),
+            work: Work::Decompress(message.frame.uncompressed_bytes()),
+        };
+        self.was_inward = true;
+        Some(job)
     }
 }
 
@@ -160,31 +205,86 @@ impl DataCore {
         self.press.enabled = true;
     }
 
+    /// There is no pool any more. What waits for it is dropped; what it is at comes back.
+    pub fn stop_compression(&mut self, now: Instant, link: &mut dyn LaneLink) {
+        self.press.enabled = false;
+        self.press.asked = Default::default();
+        for urgency in Urgency::ALL {
+            while let Some(place) = self.press.out.begin(urgency).map(|(place, _)| place) {
+                if let Some(out) = self.press.out.give_up(&place) {
+                    self.lose(place.key().0, &out, DropReason::Shutdown);
+                }
+                self.flush_out(now, *place.key(), link);
+            }
+            while let Some(place) = self.press.into.begin(urgency).map(|(place, _)| place) {
+                self.press.into.give_up(&place);
+                self.refuse_pressed(place.key().0, DropReason::Shutdown);
+                self.flush_in(now, *place.key(), link);
+            }
+        }
+        self.stir();
+    }
+
     /// Changes how payloads are compressed, from the next message on.
     pub fn set_compression(&mut self, rules: CompressionRules) {
         for path in &mut self.topics {
-            path.compression = rules.find(&path.name);
+            path.set_compression(rules.find(&path.name));
         }
         self.press.rules = rules;
     }
 
-    /// Work for the pool since the last call.
-    pub fn take_press_jobs(&mut self) -> Vec<PressJob> {
-        std::mem::take(&mut self.press.jobs)
-    }
-
-    /// Whether there is work for the pool.
-    #[must_use]
-    pub fn has_press_jobs(&self) -> bool {
-        !self.press.jobs.is_empty()
-    }
-
-    /// Somebody begins with a job. `false`: it is not wanted any more; it is to be given back as [`Pressed::NotDone`].
-    pub fn begins(&mut self, job: PressTicket) -> bool {
-        match job.outward {
-            true => self.press.out.begin(&job.ticket),
-            false => self.press.into.begin(&job.ticket),
+    /// Turns to be offered since the last call. Of those of the caller each one is to be taken.
+    pub fn take_turns(&mut self) -> Turns {
+        let press = &mut self.press;
+        let [quick, long] = press.missing();
+        press.asked[Urgency::Quick as usize] += quick;
+        press.asked[Urgency::Long as usize] += long;
+        let is_behind = press.into.waits(Urgency::Quick).bytes > OWN_ABOVE;
+        let own = if is_behind { quick } else { 0 };
+        Turns {
+            quick: quick - own,
+            long,
+            own,
         }
+    }
+
+    /// Whether there are turns to be offered.
+    #[must_use]
+    pub fn has_turns(&self) -> bool {
+        self.press.missing().iter().any(|turns| *turns > 0)
+    }
+
+    /// A thread of the pool has a turn. `None`: nothing is left to be done.
+    pub fn begin(&mut self, now: Instant, urgency: Urgency, link: &mut dyn LaneLink) -> Option<PressJob> {
+        self.press.turn_begins(urgency);
+        if urgency == Urgency::Quick
+            && !self.press.was_inward
+            && let Some(job) = self.press.begin_inward()
+        {
+            return Some(job);
+        }
+        self.press.was_inward = false;
+        self.begin_outward(now, urgency, link).or_else(|| match urgency {
+            Urgency::Quick => self.press.begin_inward(),
+            Urgency::Long => None,
+        })
+    }
+
+    /// The calling thread has a turn of its own, for what came over the link. `None`: nothing is left to be done.
+    pub fn begin_own(&mut self) -> Option<PressJob> {
+        self.press.turn_begins(Urgency::Quick);
+        self.press.begin_inward()
+    }
+
+    /// Takes what became of a message.
+    pub fn pressed(&mut self, now: Instant, ticket: PressTicket, done: Done, link: &mut dyn LaneLink) {
+        self.press.failed += u64::from(done == Done::Failed);
+        if ticket.outward {
+            self.pressed_out(now, &ticket.place, done, link);
+        } else {
+            self.pressed_in(now, &ticket.place, done, link);
+        }
+        self.stir();
     }
 
     /// Divides the pool among topics by what they need; to be called about twice a second.
@@ -192,267 +292,33 @@ impl DataCore {
         let mut topics = Vec::new();
         let mut wanted = Vec::new();
         for (at, path) in self.topics.iter_mut().enumerate().filter(|(_, path)| !path.vacant) {
-            let Some((_, _, effort)) = &mut path.effort.0 else { continue };
-            let published = path.in_rate.rate(now).0;
-            let lanes = path.bridges.iter().filter(|bridge| bridge.lane_id().is_some());
-            let admitted = lanes.map(|bridge| bridge.allocated_hz.unwrap_or(published).min(published));
-            topics.push((at, admitted.fold(0.0, f64::max)));
-            wanted.push(effort.wanted());
+            if let Some(effort) = path.effort.get_mut() {
+                topics.push(at);
+                wanted.push(effort.wanted());
+            }
         }
         // First what a topic may use, then what it is to do with it.
-        for ((at, admitted), share) in topics.into_iter().zip(shares(threads as f64, &wanted)) {
-            if let Some((_, _, effort)) = &mut self.topics[at].effort.0 {
+        let threads = threads_for_long(threads) as f64;
+        for (at, share) in topics.into_iter().zip(shares(threads, &wanted)) {
+            let path = &mut self.topics[at];
+            let rate_hz = path.worth_rate.rate(now).0;
+            if let Some(effort) = path.effort.get_mut() {
                 effort.set_threads(share);
-                effort.demand(now, admitted);
+                effort.demand(now, rate_hz);
             }
         }
     }
 
-    /// Takes a message that lanes have admitted.
-    pub(super) fn press_out(&mut self, now: Instant, topic: TopicId, frame: &Frame, lanes: ToLanes, link: &mut dyn LaneLink) {
-        let path = &mut self.topics[topic.0 as usize];
-        let payload = frame.payload();
-        let compression = path.compression;
-        let is_worth = self.press.enabled
-            && compression.codec == Codec::Lz4
-            && payload.len() >= compression.min_bytes as usize
-            && !payload.is_empty();
-        let level = if is_worth {
-            path.effort.level(now, compression.level, compression.adaptive)
-        } else {
-            None
-        };
-        if level.is_none() && self.press.out.is_clear(&topic) {
-            self.to_lanes(now, topic, lanes, link);
-            return;
-        }
-        for (at, _) in &lanes {
-            path.bridges[*at].pressing += 1;
-        }
-        let Some(level) = level else {
-            if let Err((lanes, _)) = self.press.out.push_ready(topic, lanes, payload.len()) {
-                self.not_pressed(topic, &lanes, DropReason::QueueFull);
-            }
-            return;
-        };
-        let keep = lanes.iter().map(|(at, _)| path.bridges[*at].keep_newest()).max().unwrap_or(0);
-        if keep > 0 {
-            // Those that give way are counted when their jobs come back.
-            self.press.out.keep_newest(&topic, &frame.writer(), keep.saturating_sub(1));
-        }
-        match self.press.out.push_pending(topic, frame.writer(), payload.len()) {
-            Ok(ticket) => self.press.jobs.push(PressJob {
-                ticket,
-                item: Item::Out(lanes),
-                payload: payload.clone(),
-                work: PressWork::Compress(level),
-            }),
-            Err(_) => self.not_pressed(topic, &lanes, DropReason::QueueFull),
-        }
-        self.flush_out(now, topic, link);
-    }
-
-    /// Takes a message that came over the link and was not seen before.
-    pub(super) fn press_in(&mut self, now: Instant, topic: TopicId, message: Admitted, link: &mut dyn LaneLink) {
-        let (announced, payload) = (message.frame.uncompressed_bytes(), message.frame.payload().clone());
-        match message.frame.compression() {
-            Compressed::None if self.press.into.is_clear(&topic) => self.deliver_pressed(now, topic, &message, link),
-            Compressed::None => {
-                if self.press.into.push_ready(topic, Box::new(message), payload.len()).is_err() {
-                    self.refuse_pressed(topic, DropReason::QueueFull);
-                }
-            }
-            Compressed::Unknown(_) => self.refuse_pressed(topic, DropReason::DecompressError),
-            Compressed::Lz4Block if !self.press.enabled => {
-                match crate::codec::lz4::decompress(&payload, announced, MAX_PAYLOAD_BYTES) {
-                    Ok(payload) => self.decompressed(now, topic, message, payload, link),
-                    Err(_) => self.refuse_pressed(topic, DropReason::DecompressError),
-                }
-            }
-            Compressed::Lz4Block => {
-                let bytes = usize::try_from(announced).unwrap_or(usize::MAX).min(MAX_PAYLOAD_BYTES);
-                match self.press.into.push_pending(topic, message.frame.writer(), payload.len() + bytes) {
-                    Ok(ticket) => self.press.jobs.push(PressJob {
-                        ticket,
-                        item: Item::In(Box::new(message)),
-                        payload,
-                        work: PressWork::Decompress(announced),
-                    }),
-                    Err(_) => self.refuse_pressed(topic, DropReason::QueueFull),
-                }
-            }
-        }
-    }
-
-    /// Notes the size of a message that a lane could send: of one that is compressed that is known when it has been.
-    pub(super) fn note_size(&mut self, now: Instant, topic: TopicId, bytes: usize) {
-        let path = &mut self.topics[topic.0 as usize];
-        let is_pressed = self.press.enabled
-            && path.compression.codec == Codec::Lz4
-            && bytes >= path.compression.min_bytes as usize
-            && !path.effort.goes_as_it_is();
-        if !is_pressed {
-            self.allocation_due |= path.sent_size.note(now, bytes as u64);
-        }
-    }
-
-    fn decompressed(&mut self, now: Instant, topic: TopicId, message: Admitted, payload: Bytes, link: &mut dyn LaneLink) {
-        match message.frame.decompressed(payload) {
-            Ok(frame) => self.deliver_pressed(now, topic, &Admitted { frame, ..message }, link),
-            Err(_) => self.refuse_pressed(topic, DropReason::DecompressError),
-        }
-    }
-
-    /// Takes what became of a job.
-    pub fn pressed(&mut self, now: Instant, job: PressJob, pressed: Pressed, link: &mut dyn LaneLink) {
-        let PressJob { ticket, item, .. } = job;
-        let topic = *ticket.key();
-        match item {
-            Item::Out(lanes) => self.pressed_out(now, &ticket, lanes, pressed),
-            Item::In(message) => self.pressed_in(&ticket, message, pressed),
-        }
-        self.flush_out(now, topic, link);
-        self.flush_in(now, topic, link);
-        self.stir();
-    }
-
-    fn pressed_out(&mut self, now: Instant, ticket: &Ticket<TopicId>, mut lanes: ToLanes, pressed: Pressed) {
-        let topic = *ticket.key();
-        if let Pressed::Compressed(done) = pressed {
-            let path = &mut self.topics[topic.0 as usize];
-            path.effort.compressed(now, &done);
-            path.press.note(&done);
-            let bytes = done.after();
-            self.allocation_due |= path.sent_size.note(now, bytes as u64);
-            if let Some(block) = done.block {
-                for (_, waiting) in &mut lanes {
-                    // Only a header without room for the new fields cannot take it: then it goes as it is.
-                    if let Ok(frame) = waiting.frame.compressed(block.clone(), done.before as u64) {
-                        waiting.frame = frame;
-                    }
-                }
-            }
-            if let Err(lanes) = self.press.out.finish(ticket, lanes, bytes) {
-                self.not_pressed(topic, &lanes, DropReason::QueueFull);
-            }
-        } else {
-            self.press.out.give_up(ticket);
-            self.not_pressed(topic, &lanes, DropReason::QueueFull);
-        }
-    }
-
-    fn pressed_in(&mut self, ticket: &Ticket<TopicId>, message: Box<Admitted>, pressed: Pressed) {
-        let topic = *ticket.key();
-        let frame = match pressed {
-            Pressed::Decompressed(payload) => message.frame.decompressed(payload).map_err(|_| DropReason::DecompressError),
-            Pressed::NotDone => Err(DropReason::QueueFull),
-            Pressed::Compressed(_) | Pressed::Refused => Err(DropReason::DecompressError),
-        };
-        match frame {
-            Ok(frame) => {
-                let bytes = frame.payload().len();
-                let message = Box::new(Admitted { frame, ..*message });
-                if self.press.into.finish(ticket, message, bytes).is_err() {
-                    self.refuse_pressed(topic, DropReason::QueueFull);
-                }
-            }
-            Err(reason) => {
-                self.press.into.give_up(ticket);
-                self.refuse_pressed(topic, reason);
-            }
-        }
-    }
-
-    /// Hands on what is next in the order of a topic.
-    fn flush_out(&mut self, now: Instant, topic: TopicId, link: &mut dyn LaneLink) {
-        while let Some(lanes) = self.press.out.pop_ready(&topic) {
-            for (at, _) in &lanes {
-                let bridge = &mut self.topics[topic.0 as usize].bridges[*at];
-                bridge.pressing = bridge.pressing.saturating_sub(1);
-            }
-            self.to_lanes(now, topic, lanes, link);
-        }
-    }
-
-    fn flush_in(&mut self, now: Instant, topic: TopicId, link: &mut dyn LaneLink) {
-        while let Some(message) = self.press.into.pop_ready(&topic) {
-            self.deliver_pressed(now, topic, &message, link);
-        }
-    }
-
-    /// To the queues of the lanes. One that has ended meanwhile has nobody to send to.
-    fn to_lanes(&mut self, now: Instant, topic: TopicId, lanes: ToLanes, link: &mut dyn LaneLink) {
-        for (at, waiting) in lanes {
-            let bridge = &mut self.topics[topic.0 as usize].bridges[at];
-            if matches!(bridge.phase, Phase::Up { .. } | Phase::Draining { .. }) {
-                bridge.queue(now, topic, waiting, &mut self.succession, link);
-            } else {
-                bridge.stats.dropped.add(DropReason::NoDestination, 1);
-            }
-        }
-    }
-
-    fn deliver_pressed(&mut self, now: Instant, topic: TopicId, message: &Admitted, link: &mut dyn LaneLink) {
-        // It is older by what the pool took.
-        let waited = super::measure::micros(now.saturating_duration_since(message.came));
-        if waited == 0 {
-            self.fan_out(now, topic, blaze_domain::Scope::Inter, message, link);
-        } else {
-            self.fan_out(now, topic, blaze_domain::Scope::Inter, &message.older(waited), link);
-        }
-    }
-
-    fn not_pressed(&mut self, topic: TopicId, lanes: &ToLanes, reason: DropReason) {
-        for (at, _) in lanes {
-            let bridge = &mut self.topics[topic.0 as usize].bridges[*at];
-            bridge.pressing = bridge.pressing.saturating_sub(1);
-            bridge.stats.dropped.add(reason, 1);
-        }
-    }
-
-    fn refuse_pressed(&mut self, topic: TopicId, reason: DropReason) {
-        self.topics[topic.0 as usize].ingress_drops.add(reason, 1);
-    }
-}
-
-impl PressStats {
-    fn note(&mut self, done: &crate::codec::Compressed) {
-        self.messages += 1;
-        self.before += done.before as u64;
-        self.after += done.after() as u64;
-        self.seconds += done.processor.as_secs_f64();
-        self.level = done.level;
-    }
-}
-
-/// The level of one topic over time.
-#[derive(Debug, Default)]
-pub struct TopicEffort(Option<(u8, bool, Effort)>);
-
-impl TopicEffort {
-    /// The level for the next message; `None`: it goes as it is.
-    fn level(&mut self, now: Instant, configured: u8, adaptive: bool) -> Option<u8> {
-        if !adaptive {
-            self.0 = None;
-            return Some(configured);
-        }
-        let fits = self.0.as_ref().is_some_and(|(level, ..)| *level == configured);
-        if !fits {
-            self.0 = Some((configured, adaptive, Effort::new(configured, now)));
-        }
-        let (_, _, effort) = self.0.as_mut()?;
-        effort.next(now)
-    }
-
-    /// Whether payloads are not compressed for now.
+    /// What waits for the codec, and what did not get that far.
     #[must_use]
-    pub fn goes_as_it_is(&self) -> bool {
-        self.0.as_ref().is_some_and(|(_, _, effort)| effort.goes_as_it_is())
-    }
-
-    fn compressed(&mut self, now: Instant, done: &crate::codec::Compressed) {
-        if let Some((_, _, effort)) = &mut self.0 {
-            effort.compressed(now, done.level, done.taken.as_secs_f64(), done.before, done.after());
+    pub fn press_counters(&self) -> PressCounters {
+        let press = &self.press;
+        let waits = Urgency::ALL.map(|urgency| press.out.waits(urgency).bytes + press.into.waits(urgency).bytes);
+        PressCounters {
+            waiting: Urgency::ALL.iter().map(|urgency| press.waiting(*urgency)).sum(),
+            waiting_bytes: waits.iter().sum(),
+            refused: press.refused,
+            failed: press.failed,
         }
     }
 }

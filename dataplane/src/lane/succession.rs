@@ -65,6 +65,13 @@ pub(super) struct Waiting {
 }
 
 impl Waiting {
+    /// Whether it is of no use any more.
+    pub(super) fn is_too_old(&self, now: Instant) -> bool {
+        let here = now.saturating_duration_since(self.arrived);
+        let age = Duration::from_micros(self.frame.age_us()).saturating_add(here);
+        self.lifespan.is_some_and(|lifespan| age >= lifespan)
+    }
+
     fn cost(&self) -> usize {
         self.frame.wire_len() + OVERHEAD
     }
@@ -120,7 +127,9 @@ pub(super) struct Succession {
 impl Succession {
     /// What the receiver of a bridge that drains has got is to be written before another one goes on.
     pub(super) fn await_written(&mut self, now: Instant, topic: TopicId, bridge: &mut BridgeState) {
-        if self.leaving || !bridge.submitted || bridge.unwritten.is_some() {
+        // What is with the codec will be given to its lane.
+        let was_used = bridge.submitted || bridge.pressing > 0;
+        if self.leaving || !was_used || bridge.unwritten.is_some() {
             return;
         }
         self.tokens = self.tokens.wrapping_add(1);
@@ -376,6 +385,14 @@ impl DataCore {
                 let mut held = bridges[at].held.take().unwrap_or_default();
                 held.append(bridges[heir].held.take());
                 bridges[heir].held = Some(held);
+                // What of its messages is with the codec comes behind these.
+                let moved = self.press.hand_over(topic, at, heir);
+                bridges[at].pressing = bridges[at].pressing.saturating_sub(moved);
+                bridges[heir].pressing += moved;
+                if !bridges[at].submitted {
+                    // Its receiver got nothing, and gets nothing any more.
+                    bridges[at].unwritten = None;
+                }
                 self.draining.insert(topic);
             }
         }

@@ -7,6 +7,8 @@
 //!           then in steps                                    └─ it stays: it is the path's; the rate is as before
 //! ```
 //!
+//! A slow start begins higher where what is small needs more than 1/32 of the limit.
+//!
 //! Nothing is concluded from a delivered rate alone: it may be low because little was offered. What tells is a queue
 //! that does not go away (`path.rs`): as long as it lasts, what comes out of it is what the bottleneck carries, as the
 //! delivery rate of BBR (draft-ietf-ccwg-bbr). Whether the queue is ours is tried out (`trial.rs`).
@@ -29,6 +31,8 @@ pub const FLOOR_SHARE: f64 = 0.01;
 /// Share of the limit that slow start begins with: five doublings below, which take three seconds at a round trip of
 /// 50 ms. A path that now carries a hundredth of the limit gets three times that, not a hundred times.
 pub const START_SHARE: f64 = 1.0 / 32.0;
+/// … but with so many times what is small needs at least: it is not what fills a link, and should not wait until the link is known.
+pub const START_MARGIN: f64 = 1.25;
 /// Loss above the ordinary that counts as the sign of a full link, as in draft-ietf-rmcat-gcc.
 pub const LOSS: f64 = 0.1;
 
@@ -103,6 +107,8 @@ pub struct Capacity {
     now: Instant,
     limit: f64,
     rate: f64,
+    /// What is small needs so much, in bytes per second.
+    needed: f64,
     estimate: Option<f64>,
     phase: Phase,
     delay: Delay,
@@ -128,6 +134,7 @@ impl Capacity {
             now,
             limit,
             rate: limit,
+            needed: 0.0,
             estimate: None,
             phase: Phase::Rising,
             delay: Delay::default(),
@@ -156,6 +163,25 @@ impl Capacity {
         }
     }
 
+    /// So much is needed for what is small, LinkControl too, in bytes per second: no slow start is below that.
+    pub fn set_needed(&mut self, bytes_per_s: f64, now: Instant) {
+        self.advance(now);
+        self.needed = if bytes_per_s.is_finite() {
+            bytes_per_s.max(0.0)
+        } else {
+            0.0
+        };
+        // It is known after the peer is back what goes there.
+        if self.state() == State::SlowStart && self.rate < self.start().min(self.limit) {
+            self.set_rate(self.start());
+        }
+    }
+
+    /// What slow start begins with.
+    fn start(&self) -> f64 {
+        (self.limit * START_SHARE).max(self.needed * START_MARGIN)
+    }
+
     /// Takes what has left, of all classes and LinkControl too: one call per datagram.
     pub fn sent(&mut self, now: Instant, wire_bytes: usize) {
         self.advance(now);
@@ -173,7 +199,7 @@ impl Capacity {
         self.loss = Loss::new(self.now);
         self.hold = HOLD;
         self.pause = Duration::ZERO;
-        self.set_rate((self.limit * START_SHARE).min(self.rate));
+        self.set_rate(self.start().min(self.rate));
     }
 
     /// Takes a Feedback of any class.

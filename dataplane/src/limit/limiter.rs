@@ -2,40 +2,55 @@
 //!
 //! ```text
 //! node file ─────────► limits ─┐
-//! wire bytes, payload ─► ω ────┼─► budgets of s·α ─► rates of lanes ─► gates
+//! wire bytes, Σ s ───► ω ──────┼─► budgets of s·α ─► rates of lanes ─► gates
 //! Feedback ──► capacity ───────┘        ▲ topics, sizes, advertised rates
 //! ```
 //!
 //! It is anew when a topic or lane comes or goes, a size grows, a measured rate or the wire factor moves, a capacity changes, or the node
-//! file does. All of these together cost one run at most every [`BETWEEN`].
+//! file does. All of these together cost one run at most every 20 ms; sizes that grow alone one every 100 ms.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-use blaze_domain::LayerName;
 use blaze_domain::node_file::{BandwidthSection, WireOverhead};
+use blaze_domain::{FlowId, LayerName};
 
-use super::rates::{Budgets, Demand, Rates, rates, terms};
-use super::wire_factor::{Totals, WireFactor};
+use super::rates::{Budgets, Demand, FlowBudget, Rates, rates, standard_load, terms};
+use super::wire_factor::{FIRST, Totals, WireFactor, budget};
 
 /// Between two runs.
 const BETWEEN: Duration = Duration::from_millis(20);
+/// Between two runs where nothing but sizes has grown: those of a topic that has just begun grow with every few messages.
+const BETWEEN_SIZES: Duration = Duration::from_millis(100);
 /// Between two looks at what is measured.
 const LOOK: Duration = Duration::from_millis(500);
 /// A budget is believed anew when it has moved by this share.
 const MOVED: f64 = 0.01;
+/// Between two lines of the log about what does not fit.
+const TOLD_EVERY: Duration = Duration::from_secs(10);
+
+/// What the link to one flow carries, in wire bytes per second.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum LinkRate {
+    /// Nothing is known to be less than its limit.
+    Free,
+    /// It is being found out, and so much may be sent now: that thins large topics alone.
+    Passing(f64),
+    /// So much, as was seen.
+    Carries(f64),
+}
 
 /// What the budgets come from, at one moment.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Measured {
-    /// Wire bytes per second that the links to a layer can carry, where that is known to be less than their limit.
-    pub capacity_bytes_per_s: BTreeMap<LayerName, f64>,
+    /// The links to all flows that there are.
+    pub links: BTreeMap<FlowId, LinkRate>,
 }
 
 /// A limit and what it leaves for messages.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Budget {
-    /// Wire bytes per second that are used: the smaller of configured and measured.
+    /// The limit, in wire bytes per second.
     pub wire_bytes_per_s: f64,
     /// Bytes per second of `s · α` that it leaves.
     pub message_bytes_per_s: f64,
@@ -49,6 +64,17 @@ impl Budget {
     }
 }
 
+/// All budgets at one moment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AllBudgets {
+    /// Of the process.
+    pub process: Budget,
+    /// Of the links to layers for which the node file gives a limit.
+    pub links: BTreeMap<LayerName, Budget>,
+    /// Of the links to flows that can carry less than their limit; `true`: for the moment, see [`LinkRate::Passing`].
+    pub flows: BTreeMap<FlowId, (Budget, bool)>,
+}
+
 /// The state of one flow's allocation.
 #[derive(Debug)]
 pub struct Limiter {
@@ -56,14 +82,19 @@ pub struct Limiter {
     measured: Measured,
     all: WireFactor,
     links: BTreeMap<LayerName, WireFactor>,
+    /// Flows that lanes go to, by layer, and what standard topics take of the links to them; as of the last run.
+    receivers: BTreeMap<LayerName, BTreeSet<FlowId>>,
+    standard: BTreeMap<FlowId, f64>,
     /// Budgets that the last run was made with.
-    used: Option<(Budget, BTreeMap<LayerName, Budget>)>,
+    used: Option<AllBudgets>,
     due: bool,
+    grown: bool,
     ran: Option<Instant>,
     looked: Option<Instant>,
     last: Option<Rates>,
     runs: u64,
-    reported: Option<bool>,
+    /// When it was last told whether everything fits, and what.
+    told: Option<(Instant, bool)>,
 }
 
 impl Limiter {
@@ -75,13 +106,16 @@ impl Limiter {
             measured: Measured::default(),
             all: WireFactor::default(),
             links: BTreeMap::new(),
+            receivers: BTreeMap::new(),
+            standard: BTreeMap::new(),
             used: None,
             due: true,
+            grown: false,
             ran: None,
             looked: None,
             last: None,
             runs: 0,
-            reported: None,
+            told: None,
         }
     }
 
@@ -102,6 +136,11 @@ impl Limiter {
         self.due = true;
     }
 
+    /// A size has grown.
+    pub fn size_grown(&mut self) {
+        self.grown = true;
+    }
+
     /// Whether it is time to look at what is measured; then [`Limiter::look`] is to be called.
     pub fn is_time_to_look(&mut self, now: Instant) -> bool {
         let due = self.looked.is_none_or(|at| now.saturating_duration_since(at) >= LOOK);
@@ -111,7 +150,7 @@ impl Limiter {
         due
     }
 
-    /// Takes what was measured: totals of all links together and of each one, and what the links can carry.
+    /// Takes what was measured: totals of all links together and of those to each layer, and what the links can carry.
     pub fn look(&mut self, now: Instant, all: Totals, links: &BTreeMap<LayerName, Totals>, measured: Measured) {
         self.all.sample(now, all);
         self.links.retain(|layer, _| links.contains_key(layer));
@@ -119,79 +158,116 @@ impl Limiter {
             self.links.entry(layer.clone()).or_default().sample(now, *totals);
         }
         self.measured = measured;
-        let moved = |(before, after): (&Budget, &Budget)| {
-            let share = (after.message_bytes_per_s - before.message_bytes_per_s).abs();
-            share > MOVED * before.message_bytes_per_s
-        };
-        let (process, of_links) = self.budgets();
-        self.due |= match &self.used {
-            None => true,
-            Some((before, links_before)) => {
-                moved((before, &process))
-                    || of_links.len() != links_before.len()
-                    || of_links
-                        .iter()
-                        .any(|(layer, after)| links_before.get(layer).is_none_or(|before| moved((before, after))))
-            }
-        };
+        let now_there = self.budgets();
+        self.due |= self.used.as_ref().is_none_or(|before| has_moved(before, &now_there));
+        if let Some(rates) = &self.last {
+            tell(&mut self.told, self.bandwidth.limit_mbps, rates, now);
+        }
     }
 
-    /// Whether rates have to be worked out now. A change that comes right after a run waits for [`BETWEEN`].
+    /// Whether rates have to be worked out now. A change that comes right after a run waits a little.
     #[must_use]
     pub fn is_due(&self, now: Instant) -> bool {
-        self.due && self.ran.is_none_or(|at| now.saturating_duration_since(at) >= BETWEEN)
+        let waited = |pause| self.ran.is_none_or(|at| now.saturating_duration_since(at) >= pause);
+        (self.due && waited(BETWEEN)) || (self.grown && waited(BETWEEN_SIZES))
     }
 
     /// The budget of the process, and those of links that have one of their own or can carry less.
     #[must_use]
-    pub fn budgets(&self) -> (Budget, BTreeMap<LayerName, Budget>) {
-        let measures = self.bandwidth.wire_overhead == WireOverhead::Measured;
-        let budget = |limit: f64, factor: Option<&WireFactor>| Budget {
+    pub fn budgets(&self) -> AllBudgets {
+        let of_layer = |layer: &LayerName| {
+            let limit = self.bandwidth.link_limit_bytes_per_s(layer)?;
+            Some((layer.clone(), self.budget(limit, Some(layer), 1.0)))
+        };
+        let of_flow = |(flow, rate): (&FlowId, &LinkRate)| {
+            let (bytes_per_s, passing) = match *rate {
+                LinkRate::Free => return None,
+                LinkRate::Passing(bytes_per_s) => (bytes_per_s, true),
+                LinkRate::Carries(bytes_per_s) => (bytes_per_s, false),
+            };
+            let budget = self.budget(bytes_per_s, Some(&flow.layer), self.control_share(&flow.layer));
+            Some((flow.clone(), (budget, passing)))
+        };
+        AllBudgets {
+            process: self.budget(self.bandwidth.limit_bytes_per_s(), None, 1.0),
+            links: self.bandwidth.links.keys().filter_map(of_layer).collect(),
+            flows: self.measured.links.iter().filter_map(of_flow).collect(),
+        }
+    }
+
+    /// What a limit of all links (`None`) or of those to a layer leaves. `share` of the control messages there go that way.
+    fn budget(&self, limit: f64, layer: Option<&LayerName>, share: f64) -> Budget {
+        let link = layer.map_or(Some(&self.all), |layer| self.links.get(layer));
+        let control = link.map_or(0.0, WireFactor::control_bytes_per_s) * share;
+        Budget {
             wire_bytes_per_s: limit,
-            message_bytes_per_s: match factor {
-                Some(factor) if measures => factor.budget(limit, self.bandwidth.overhead),
-                None if measures => self.all.budget(limit, self.bandwidth.overhead),
-                _ => limit,
+            message_bytes_per_s: match self.bandwidth.wire_overhead {
+                WireOverhead::Measured => budget(limit, control, self.of_messages(layer)),
+                WireOverhead::Off => limit,
             },
-        };
-        let process = budget(self.bandwidth.limit_bytes_per_s(), Some(&self.all));
-        let layers = self.bandwidth.links.keys().chain(self.measured.capacity_bytes_per_s.keys());
-        let of_link = |layer: &LayerName| {
-            let said = self.bandwidth.link_limit_bytes_per_s(layer).unwrap_or(f64::INFINITY);
-            let can = self.measured.capacity_bytes_per_s.get(layer).copied().unwrap_or(f64::INFINITY);
-            budget(said.min(can), self.links.get(layer))
-        };
-        (process, layers.map(|layer| (layer.clone(), of_link(layer))).collect())
+        }
+    }
+
+    /// What messages to a layer cost; where that is not known, what all of them do.
+    fn of_messages(&self, layer: Option<&LayerName>) -> f64 {
+        let overhead = self.bandwidth.overhead;
+        let own = layer.and_then(|layer| self.links.get(layer)?.of_messages(overhead));
+        own.or_else(|| self.all.of_messages(overhead)).unwrap_or(FIRST)
+    }
+
+    /// How much of the control messages to a layer goes to one flow of it.
+    fn control_share(&self, layer: &LayerName) -> f64 {
+        let flows = self.measured.links.keys().filter(|flow| flow.layer == *layer).count();
+        1.0 / flows.max(1) as f64
     }
 
     /// Works out the rates.
     pub fn run(&mut self, now: Instant, demands: &[Demand<'_>]) -> &Rates {
-        let (process, links) = self.budgets();
-        let budgets = Budgets {
-            process: process.message_bytes_per_s,
-            links: links
-                .iter()
-                .map(|(layer, budget)| (layer.clone(), budget.message_bytes_per_s))
-                .collect(),
+        let budgets = self.budgets();
+        let terms = terms(&self.bandwidth);
+        let of_flow = |(flow, (budget, passing)): (&FlowId, &(Budget, bool))| {
+            let budget = FlowBudget {
+                bytes_per_s: budget.message_bytes_per_s,
+                passing: *passing,
+            };
+            (flow.clone(), budget)
         };
-        let rates = rates(&budgets, &terms(&self.bandwidth), demands);
-        if self.reported.replace(rates.feasible) != Some(rates.feasible) {
-            if !rates.feasible {
-                let links: Vec<&str> = rates.infeasible_links.iter().map(LayerName::as_str).collect();
-                tracing::warn!(
-                    limit_mbps = self.bandwidth.limit_mbps,
-                    ?links,
-                    "what is published does not fit the budget even at its lowest rates; see /v1/allocation"
-                );
-            } else if self.runs > 0 {
-                tracing::info!("what is published fits the budget again");
-            }
-        }
-        self.used = Some((process, links));
-        self.due = false;
+        let of_layer = |(layer, budget): (&LayerName, &Budget)| (layer.clone(), budget.message_bytes_per_s);
+        let messages = Budgets {
+            process: budgets.process.message_bytes_per_s,
+            links: budgets.links.iter().map(of_layer).collect(),
+            flows: budgets.flows.iter().map(of_flow).collect(),
+        };
+        let rates = rates(&messages, &terms, demands);
+        let on_the_wire = |(flow, bytes_per_s): (FlowId, f64)| {
+            let control = self.links.get(&flow.layer).map_or(0.0, WireFactor::control_bytes_per_s);
+            let wire = bytes_per_s * self.of_messages(Some(&flow.layer)) + control * self.control_share(&flow.layer);
+            (flow, wire)
+        };
+        let standard = standard_load(&rates, &terms, demands)
+            .into_iter()
+            .map(on_the_wire)
+            .collect();
+        self.standard = standard;
+        self.note_receivers(demands);
+        tell(&mut self.told, self.bandwidth.limit_mbps, &rates, now);
+        self.used = Some(budgets);
+        (self.due, self.grown) = (false, false);
         self.ran = Some(now);
         self.runs += 1;
         self.last.insert(rates)
+    }
+
+    fn note_receivers(&mut self, demands: &[Demand<'_>]) {
+        self.receivers.clear();
+        for lane in demands.iter().flat_map(|demand| &demand.lanes) {
+            if let Some(receiver) = lane.receiver {
+                let of_layer = self.receivers.entry(lane.layer.clone()).or_default();
+                if !of_layer.contains(receiver) {
+                    of_layer.insert(receiver.clone());
+                }
+            }
+        }
     }
 
     /// What was worked out last; `None` before the first run.
@@ -200,10 +276,53 @@ impl Limiter {
         self.last.as_ref()
     }
 
-    /// What is measured of the links.
+    /// Layers that lanes go to, or whose links have a limit of their own.
     #[must_use]
-    pub fn measured(&self) -> &Measured {
-        &self.measured
+    pub fn layers(&self) -> BTreeSet<LayerName> {
+        self.receivers
+            .keys()
+            .chain(self.bandwidth.links.keys())
+            .cloned()
+            .collect()
+    }
+
+    /// ω of all links (`None`) or of those to a layer; `None` while too little was sent there to tell, and 1 where it is left out.
+    #[must_use]
+    pub fn wire_factor(&self, layer: Option<&LayerName>) -> Option<f64> {
+        let process = self.bandwidth.limit_bytes_per_s();
+        let limit = layer
+            .and_then(|layer| self.bandwidth.link_limit_bytes_per_s(layer))
+            .unwrap_or(process);
+        let factor = layer.map_or(Some(&self.all), |layer| self.links.get(layer));
+        if self.bandwidth.wire_overhead == WireOverhead::Measured {
+            factor?.of_messages(self.bandwidth.overhead)?;
+        }
+        Some(self.budget(limit, layer, 1.0).wire_factor())
+    }
+
+    /// Wire bytes per second that the links to all flows (`None`) or to those of a layer carry that lanes go to; `None` while one of them was not
+    /// seen to carry less than its limit.
+    #[must_use]
+    pub fn measured_bytes_per_s(&self, layer: Option<&LayerName>) -> Option<f64> {
+        let mut sum: Option<f64> = None;
+        for (of, flows) in &self.receivers {
+            if layer.is_some_and(|layer| layer != of) {
+                continue;
+            }
+            for flow in flows {
+                match self.measured.links.get(flow) {
+                    Some(LinkRate::Carries(bytes_per_s)) => *sum.get_or_insert(0.0) += *bytes_per_s,
+                    Some(LinkRate::Free | LinkRate::Passing(_)) | None => return None,
+                }
+            }
+        }
+        sum
+    }
+
+    /// Wire bytes per second that the standard topics to each flow need, control messages included.
+    #[must_use]
+    pub fn standard_wire_bytes_per_s(&self) -> &BTreeMap<FlowId, f64> {
+        &self.standard
     }
 
     /// How often rates were worked out.
@@ -213,9 +332,48 @@ impl Limiter {
     }
 }
 
+/// Says in the log whether everything fits, when that has changed, and not more often than every few seconds.
+fn tell(told: &mut Option<(Instant, bool)>, limit_mbps: f64, rates: &Rates, now: Instant) {
+    let (before, at) = told.map_or((true, None), |(at, feasible)| (feasible, Some(at)));
+    if rates.feasible == before || at.is_some_and(|at| now.saturating_duration_since(at) < TOLD_EVERY) {
+        return;
+    }
+    *told = Some((now, rates.feasible));
+    if rates.feasible {
+        tracing::info!("what is published fits the budget again");
+    } else {
+        let links: Vec<&str> = rates.infeasible_links.iter().map(LayerName::as_str).collect();
+        tracing::warn!(
+            limit_mbps,
+            ?links,
+            "what is published does not fit the budget even at its lowest rates; see /v1/allocation"
+        );
+    }
+}
+
+/// Whether a budget has come, gone or moved.
+fn has_moved(before: &AllBudgets, after: &AllBudgets) -> bool {
+    let moved = |before: &Budget, after: &Budget| {
+        let by = (after.message_bytes_per_s - before.message_bytes_per_s).abs();
+        by > MOVED * before.message_bytes_per_s
+    };
+    let of_links = before.links.len() != after.links.len()
+        || after
+            .links
+            .iter()
+            .any(|(layer, after)| before.links.get(layer).is_none_or(|before| moved(before, after)));
+    let of_flows = before.flows.len() != after.flows.len()
+        || after.flows.iter().any(|(flow, (after, passing))| {
+            let before = before.flows.get(flow);
+            before.is_none_or(|(before, was_passing)| was_passing != passing || moved(before, after))
+        });
+    moved(&before.process, &after.process) || of_links || of_flows
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::limit::pacer::allocated;
     use crate::limit::rates::LaneDemand;
 
     const SECOND: Duration = Duration::from_secs(1);
@@ -224,17 +382,27 @@ mod tests {
         "cloud".parse().unwrap()
     }
 
-    fn camera(layer: &LayerName) -> Demand<'_> {
+    fn flow(name: &str) -> FlowId {
+        name.parse().unwrap()
+    }
+
+    fn topic<'a>(topic: &'a str, size_bytes: u64, receivers: &'a [FlowId]) -> Demand<'a> {
+        let lane = |receiver: &'a FlowId| LaneDemand {
+            layer: &receiver.layer,
+            receiver: Some(receiver),
+            max_rate_hz: None,
+        };
         Demand {
-            topic: "camera",
-            size_bytes: 100_000,
+            topic,
+            size_bytes,
             advertised_hz: 100.0,
             class: None,
-            lanes: vec![LaneDemand {
-                layer,
-                max_rate_hz: None,
-            }],
+            lanes: receivers.iter().map(lane).collect(),
         }
+    }
+
+    fn camera(receivers: &[FlowId]) -> Demand<'_> {
+        topic("camera", 100_000, receivers)
     }
 
     fn limiter(limit_mbps: f64, wire_overhead: WireOverhead) -> Limiter {
@@ -247,12 +415,23 @@ mod tests {
         })
     }
 
+    fn measured(links: &[(&str, LinkRate)]) -> Measured {
+        Measured {
+            links: links.iter().map(|(name, rate)| (flow(name), *rate)).collect(),
+        }
+    }
+
+    fn look(limiter: &mut Limiter, now: Instant, measured: Measured) {
+        limiter.look(now, Totals::default(), &BTreeMap::new(), measured);
+    }
+
     #[test]
     fn without_the_wire_factor_the_whole_limit_is_given_out() {
-        let cloud = cloud();
+        let cloud = [flow("cloud/a")];
         let mut limiter = limiter(8.0, WireOverhead::Off);
         let hz = limiter.run(Instant::now(), &[camera(&cloud)]).topics[0].lanes_hz[0];
         assert!((hz - 1_048_576.0 / 100_000.0).abs() < 1e-9);
+        assert_eq!(limiter.wire_factor(None), Some(1.0));
     }
 
     #[test]
@@ -270,10 +449,24 @@ mod tests {
     }
 
     #[test]
+    fn sizes_that_grow_wait_longer_than_what_else_changes() {
+        let start = Instant::now();
+        let mut limiter = limiter(8.0, WireOverhead::Off);
+        limiter.run(start, &[]);
+        limiter.size_grown();
+        assert!(!limiter.is_due(start + BETWEEN) && limiter.is_due(start + BETWEEN_SIZES));
+        limiter.touch();
+        assert!(limiter.is_due(start + BETWEEN));
+        limiter.run(start + BETWEEN, &[]);
+        assert!(!limiter.is_due(start + SECOND), "both are settled by one run");
+    }
+
+    #[test]
     fn the_factor_is_followed_when_it_has_moved_and_not_before() {
         let start = Instant::now();
-        let cloud = cloud();
+        let (cloud, receivers) = (cloud(), [flow("cloud/a")]);
         let mut limiter = limiter(80.0, WireOverhead::Measured);
+        assert_eq!(limiter.wire_factor(None), None, "nothing was measured");
         let mut runs = Vec::new();
         for second in 0..120u32 {
             let now = start + SECOND * second;
@@ -283,37 +476,147 @@ mod tests {
             let totals = Totals {
                 user_wire: seconds * 1_100_000 + extra,
                 control_wire: seconds * 1_000,
-                payload: seconds * 1_000_000,
+                reckoned: seconds * 1_000_000,
             };
-            limiter.look(now, totals, &BTreeMap::from([(cloud.clone(), totals)]), Measured::default());
+            limiter.look(
+                now,
+                totals,
+                &BTreeMap::from([(cloud.clone(), totals)]),
+                Measured::default(),
+            );
             if limiter.is_due(now) {
-                limiter.run(now, &[camera(&cloud)]);
+                limiter.run(now, &[camera(&receivers)]);
                 runs.push(second);
             }
         }
         let quiet = runs.iter().filter(|second| (30..60).contains(*second)).count();
         assert_eq!(quiet, 0, "{runs:?}");
-        assert!(runs.iter().any(|second| (61..70).contains(second)) && runs.len() < 60, "{runs:?}");
-        let (process, _) = limiter.budgets();
-        let factor = process.wire_factor();
-        assert!((factor - 1.32 / (1.0 - crate::limit::pacer::RESERVE)).abs() < 0.01, "{factor}");
+        assert!(
+            runs.iter().any(|second| (61..70).contains(second)) && runs.len() < 60,
+            "{runs:?}"
+        );
+        for factor in [
+            limiter.wire_factor(None).unwrap(),
+            limiter.wire_factor(Some(&cloud)).unwrap(),
+        ] {
+            assert!((factor - 1.32 / allocated(1.0)).abs() < 0.01, "{factor}");
+        }
+        let fog: LayerName = "fog".parse().unwrap();
+        assert_eq!(limiter.wire_factor(Some(&fog)), None);
     }
 
     #[test]
     fn a_link_that_carries_less_than_its_limit_bounds_its_lanes() {
-        let cloud = cloud();
+        let (cloud, receivers) = (cloud(), [flow("cloud/a")]);
         let mut limiter = limiter(80.0, WireOverhead::Off);
         limiter.set_bandwidth(BandwidthSection {
             links: BTreeMap::from([(cloud.clone(), blaze_domain::node_file::LinkLimit { limit_mbps: 40.0 })]),
             ..limiter.bandwidth().clone()
         });
-        let hz = |limiter: &mut Limiter| limiter.run(Instant::now(), &[camera(&cloud)]).topics[0].lanes_hz[0];
+        let hz = |limiter: &mut Limiter| limiter.run(Instant::now(), &[camera(&receivers)]).topics[0].lanes_hz[0];
         assert!((hz(&mut limiter) - 5.0 * 1_048_576.0 / 100_000.0).abs() < 1e-9);
-        let measured = Measured {
-            capacity_bytes_per_s: BTreeMap::from([(cloud.clone(), 1_000_000.0)]),
-        };
-        limiter.look(Instant::now(), Totals::default(), &BTreeMap::new(), measured);
+        look(
+            &mut limiter,
+            Instant::now(),
+            measured(&[("cloud/a", LinkRate::Carries(1e6))]),
+        );
         assert!(limiter.due);
         assert!((hz(&mut limiter) - 10.0).abs() < 1e-9);
+        assert_eq!(limiter.measured_bytes_per_s(Some(&cloud)), Some(1e6));
+    }
+
+    /// A replica that gets nothing says nothing of the link to the one that gets all.
+    #[test]
+    fn an_idle_replica_does_not_hide_a_slow_link() {
+        let receivers = [flow("cloud/a")];
+        let mut limiter = limiter(80.0, WireOverhead::Off);
+        let links = [
+            ("cloud/a", LinkRate::Carries(1e6)),
+            ("cloud/b", LinkRate::Free),
+            ("fog/c", LinkRate::Free),
+        ];
+        look(&mut limiter, Instant::now(), measured(&links));
+        let hz = limiter.run(Instant::now(), &[camera(&receivers)]).topics[0].lanes_hz[0];
+        assert!((hz - 10.0).abs() < 1e-9, "{hz}");
+        assert_eq!(
+            limiter.measured_bytes_per_s(None),
+            Some(1e6),
+            "lanes go to one flow alone"
+        );
+    }
+
+    #[test]
+    fn what_is_measured_is_shown_where_all_links_are_limited() {
+        let receivers = [flow("cloud/a"), flow("cloud/b"), flow("fog/c")];
+        let mut limiter = limiter(80.0, WireOverhead::Off);
+        limiter.run(Instant::now(), &[camera(&receivers)]);
+        let mut shown = |c: LinkRate| {
+            let links = [
+                ("cloud/a", LinkRate::Carries(1e6)),
+                ("cloud/b", LinkRate::Carries(2e6)),
+                ("fog/c", c),
+            ];
+            look(&mut limiter, Instant::now(), measured(&links));
+            let layer = |name: &str| limiter.measured_bytes_per_s(Some(&name.parse().unwrap()));
+            (
+                limiter.measured_bytes_per_s(None),
+                layer("cloud"),
+                layer("fog"),
+                layer("edge"),
+            )
+        };
+        assert_eq!(shown(LinkRate::Free), (None, Some(3e6), None, None));
+        // A slow start has a rate, and has measured nothing.
+        assert_eq!(shown(LinkRate::Passing(1e5)), (None, Some(3e6), None, None));
+        assert_eq!(shown(LinkRate::Carries(1e5)), (Some(3.1e6), Some(3e6), Some(1e5), None));
+    }
+
+    #[test]
+    fn a_link_that_rises_thins_what_is_large_and_is_no_fault() {
+        let receivers = [flow("cloud/a")];
+        let mut limiter = limiter(80.0, WireOverhead::Off);
+        look(
+            &mut limiter,
+            Instant::now(),
+            measured(&[("cloud/a", LinkRate::Passing(150_000.0))]),
+        );
+        let demands = [camera(&receivers), topic("odom", 1_000, &receivers)];
+        let rates = limiter.run(Instant::now(), &demands);
+        assert_eq!(rates.topics[1].lanes_hz, [100.0]);
+        assert_eq!(rates.topics[0].lanes_hz, [2.0], "r_min");
+        assert!(rates.feasible);
+        let standard = limiter.standard_wire_bytes_per_s()[&receivers[0]];
+        assert!((standard - 100.0 * 1_000.0 * FIRST).abs() < 1e-6, "{standard}");
+        // The same rate as that of the link does not suffice, and is told.
+        look(
+            &mut limiter,
+            Instant::now(),
+            measured(&[("cloud/a", LinkRate::Carries(150_000.0))]),
+        );
+        assert!(limiter.due && !limiter.run(Instant::now(), &demands).feasible);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_told_once_in_a_while() {
+        let start = Instant::now();
+        let receivers = [flow("cloud/a")];
+        let mut limiter = limiter(80.0, WireOverhead::Off);
+        let (fits, does_not) = (
+            topic("odom", 1_000, &receivers),
+            topic("points", 60_000_000, &receivers),
+        );
+        let mut told = BTreeSet::new();
+        for tenth in 0..300u32 {
+            let demand = if tenth % 2 == 0 { &does_not } else { &fits };
+            limiter.run(start + SECOND * tenth / 10, std::slice::from_ref(demand));
+            told.extend(limiter.told.map(|(at, _)| at));
+        }
+        assert_eq!(told.len(), 3, "{told:?}");
+        // What could not be told then is told when its time has come.
+        look(&mut limiter, start + SECOND * 60, Measured::default());
+        assert_eq!(
+            limiter.told.map(|(_, feasible)| feasible),
+            limiter.last().map(|rates| rates.feasible)
+        );
     }
 }

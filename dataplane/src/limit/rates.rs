@@ -1,19 +1,22 @@
-//! What each lane of one flow runs at: the budget of the process, and the budgets of single links besides (F9).
+//! What each lane of one flow runs at: the budget of the process, and the budgets of single links besides (F9). A link has a budget where
+//! the node file limits what goes to its layer, and where it was seen to carry less.
 //!
 //! The same function serves the running flow and `blaze plan`, so that what was planned is what happens.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-use blaze_domain::LayerName;
 use blaze_domain::node_file::{BandwidthSection, SharePolicy};
+use blaze_domain::{FlowId, LayerName};
 
-use super::allocate::{Allocation, Class, Lane, Sharing, Terms, Topic, allocate};
+use super::allocate::{Class, Grant, Lane, Sharing, Terms, Topic, allocate};
 
 /// One copy of a topic: to one destination layer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LaneDemand<'a> {
     /// Where it goes.
     pub layer: &'a LayerName,
+    /// The flow that takes it in there, where that is known.
+    pub receiver: Option<&'a FlowId>,
     /// Highest rate that anybody there asks for, in Hz; `None`: whatever is published.
     pub max_rate_hz: Option<f64>,
 }
@@ -38,8 +41,20 @@ pub struct Demand<'a> {
 pub struct Budgets {
     /// Of the process: all lanes together.
     pub process: f64,
-    /// Of single destinations.
+    /// Of what goes to single layers.
     pub links: BTreeMap<LayerName, f64>,
+    /// Of what goes to single flows.
+    pub flows: BTreeMap<FlowId, FlowBudget>,
+}
+
+/// What the link to one flow can carry.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FlowBudget {
+    /// In bytes per second of `s · α`.
+    pub bytes_per_s: f64,
+    /// It is not what the link carries, but a step on the way there: large topics are thinned to it and standard ones are not, and nobody is
+    /// told that it is too small.
+    pub passing: bool,
 }
 
 /// What one topic gets.
@@ -60,8 +75,10 @@ pub struct Rates {
     pub topics: Vec<TopicRates>,
     /// Whether the budget of the process and those of all links are kept.
     pub feasible: bool,
-    /// Links whose own budget is not kept.
-    pub infeasible_links: Vec<LayerName>,
+    /// Whether that of the process is.
+    pub process_feasible: bool,
+    /// Layers to which a link's own budget is not kept.
+    pub infeasible_links: BTreeSet<LayerName>,
     /// What all lanes to a destination cost together, in bytes per second of `s · α`.
     pub load_bytes_per_s: BTreeMap<LayerName, f64>,
 }
@@ -81,62 +98,116 @@ pub fn terms(bandwidth: &BandwidthSection) -> Terms {
     }
 }
 
-/// Works out what each lane runs at: the smaller of what the budget of the process and that of its link give it.
+/// Works out what each lane runs at: the smallest of what the budget of the process and those of its link give it.
 #[must_use]
 pub fn rates(budgets: &Budgets, terms: &Terms, demands: &[Demand<'_>]) -> Rates {
-    let of_process = within(budgets.process, terms, demands, |_| true);
-    let mut topics: Vec<TopicRates> = demands
-        .iter()
-        .zip(&of_process.grants)
-        .map(|(demand, grant)| TopicRates {
+    let (of_process, process_feasible) = within(budgets.process, terms, demands, |_| true);
+    let mut topics: Vec<TopicRates> = of_process
+        .into_iter()
+        .map(|(at, grant)| TopicRates {
             class: grant.class,
             rate_hz: grant.rate_hz,
-            lanes_hz: demand.lanes.iter().map(|lane| grant.lane_hz(&as_lane(lane))).collect(),
+            lanes_hz: demands[at]
+                .lanes
+                .iter()
+                .map(|lane| grant.lane_hz(&as_lane(lane)))
+                .collect(),
         })
         .collect();
-    let mut infeasible_links = Vec::new();
-    for (layer, budget) in &budgets.links {
-        let of_link = within(*budget, terms, demands, |lane| lane.layer == layer);
-        if !of_link.feasible {
-            infeasible_links.push(layer.clone());
-        }
-        for ((demand, topic), grant) in demands.iter().zip(&mut topics).zip(&of_link.grants) {
-            for (lane, hz) in demand.lanes.iter().zip(&mut topic.lanes_hz) {
-                if lane.layer == layer {
+    let mut bound = |budget: f64, spares_standard: bool, is_in: &dyn Fn(&LaneDemand<'_>) -> bool| -> bool {
+        let (of_link, feasible) = within(budget, terms, demands, is_in);
+        for (at, grant) in of_link {
+            if spares_standard && grant.class == Class::Standard {
+                continue;
+            }
+            for (lane, hz) in demands[at].lanes.iter().zip(&mut topics[at].lanes_hz) {
+                if is_in(lane) {
                     *hz = hz.min(grant.lane_hz(&as_lane(lane)));
                 }
             }
         }
+        feasible
+    };
+    let mut infeasible_links = BTreeSet::new();
+    for (layer, budget) in &budgets.links {
+        if !bound(*budget, false, &|lane: &LaneDemand<'_>| lane.layer == layer) {
+            infeasible_links.insert(layer.clone());
+        }
+    }
+    for (flow, budget) in &budgets.flows {
+        let goes_there = |lane: &LaneDemand<'_>| lane.receiver == Some(flow);
+        let feasible = bound(budget.bytes_per_s, budget.passing, &goes_there);
+        if !feasible && !budget.passing {
+            infeasible_links.insert(flow.layer.clone());
+        }
     }
     let mut load_bytes_per_s: BTreeMap<LayerName, f64> = BTreeMap::new();
     for (demand, topic) in demands.iter().zip(&topics) {
-        let message_bytes = demand.size_bytes as f64 * terms.overhead.max(1.0);
         for (lane, hz) in demand.lanes.iter().zip(&topic.lanes_hz) {
-            *load_bytes_per_s.entry(lane.layer.clone()).or_default() += hz * message_bytes;
+            *load_bytes_per_s.entry(lane.layer.clone()).or_default() += hz * demand.message_bytes(terms);
         }
     }
     Rates {
         topics,
-        feasible: of_process.feasible && infeasible_links.is_empty(),
+        feasible: process_feasible && infeasible_links.is_empty(),
+        process_feasible,
         infeasible_links,
         load_bytes_per_s,
     }
 }
 
-/// The allocation of one budget among the lanes that are in it.
-fn within(budget: f64, terms: &Terms, demands: &[Demand<'_>], is_in: impl Fn(&LaneDemand<'_>) -> bool) -> Allocation {
-    let topic = |demand: &Demand<'_>| demand.lanes.iter().filter(|lane| is_in(lane)).map(as_lane).collect();
-    let topics: Vec<Topic<'_>> = demands
+/// What the standard topics take of the link to each flow at the rates that the budget of the process gives them, whatever the link carries;
+/// in bytes per second of `s · α`.
+#[must_use]
+pub fn standard_load(rates: &Rates, terms: &Terms, demands: &[Demand<'_>]) -> BTreeMap<FlowId, f64> {
+    let mut load: BTreeMap<FlowId, f64> = BTreeMap::new();
+    let standard = demands
         .iter()
-        .map(|demand| Topic {
+        .zip(&rates.topics)
+        .filter(|(_, topic)| topic.class == Class::Standard);
+    for (demand, topic) in standard {
+        for lane in &demand.lanes {
+            let Some(receiver) = lane.receiver else { continue };
+            let hz = lane.max_rate_hz.map_or(topic.rate_hz, |most| topic.rate_hz.min(most));
+            *load.entry(receiver.clone()).or_default() += hz * demand.message_bytes(terms);
+        }
+    }
+    load
+}
+
+impl Demand<'_> {
+    /// `s · α`.
+    fn message_bytes(&self, terms: &Terms) -> f64 {
+        self.size_bytes as f64 * terms.overhead.max(1.0)
+    }
+}
+
+/// The allocation of one budget among the lanes that are in it: what each topic is granted that has any, by its place, and whether the
+/// budget is kept.
+fn within(
+    budget: f64,
+    terms: &Terms,
+    demands: &[Demand<'_>],
+    is_in: impl Fn(&LaneDemand<'_>) -> bool,
+) -> (Vec<(usize, Grant)>, bool) {
+    let (mut places, mut topics) = (Vec::new(), Vec::new());
+    for (at, demand) in demands.iter().enumerate() {
+        let lanes: Vec<Lane> = demand.lanes.iter().filter(|lane| is_in(lane)).map(as_lane).collect();
+        // One that goes nowhere costs nothing, and is granted what it says.
+        if lanes.is_empty() && !demand.lanes.is_empty() {
+            continue;
+        }
+        places.push(at);
+        topics.push(Topic {
             name: demand.topic,
             size_bytes: demand.size_bytes,
             advertised_hz: demand.advertised_hz,
             class: demand.class,
-            lanes: topic(demand),
-        })
-        .collect();
-    allocate(budget, terms, &topics)
+            lanes,
+        });
+    }
+    let allocation = allocate(budget, terms, &topics);
+    (places.into_iter().zip(allocation.grants).collect(), allocation.feasible)
 }
 
 fn as_lane(lane: &LaneDemand<'_>) -> Lane {
@@ -156,7 +227,26 @@ mod tests {
     fn lane(layer: &LayerName) -> LaneDemand<'_> {
         LaneDemand {
             layer,
+            receiver: None,
             max_rate_hz: None,
+        }
+    }
+
+    fn to(receiver: &FlowId) -> LaneDemand<'_> {
+        LaneDemand {
+            layer: &receiver.layer,
+            receiver: Some(receiver),
+            max_rate_hz: None,
+        }
+    }
+
+    fn demand<'a>(topic: &'a str, size_bytes: u64, advertised_hz: f64, lanes: Vec<LaneDemand<'a>>) -> Demand<'a> {
+        Demand {
+            topic,
+            size_bytes,
+            advertised_hz,
+            class: None,
+            lanes,
         }
     }
 
@@ -164,17 +254,15 @@ mod tests {
     #[test]
     fn a_lane_runs_at_the_smaller_of_both_rates() {
         let (fog, cloud) = (layer("fog"), layer("cloud"));
-        let demand = |topic, size_bytes, advertised_hz| Demand {
-            topic,
-            size_bytes,
-            advertised_hz,
-            class: None,
-            lanes: vec![lane(&fog), lane(&cloud)],
-        };
-        let demands = [demand("camera", 1_000_000, 30.0), demand("imu", 1_000, 50.0)];
+        let both = || vec![lane(&fog), lane(&cloud)];
+        let demands = [
+            demand("camera", 1_000_000, 30.0, both()),
+            demand("imu", 1_000, 50.0, both()),
+        ];
         let budgets = Budgets {
             process: 100e6,
             links: BTreeMap::from([(cloud.clone(), 5_151_000.0)]),
+            ..Budgets::default()
         };
         let got = rates(&budgets, &Terms::default(), &demands);
         // The camera to the fog is whole; to the cloud 5,151,000 B/s less the IMU's 50 · 1,020 leave five images of 1,020,000 B, and
@@ -189,19 +277,77 @@ mod tests {
     #[test]
     fn a_link_that_cannot_hold_its_floors_is_named() {
         let cloud = layer("cloud");
-        let demands = [Demand {
-            topic: "camera",
-            size_bytes: 1_000_000,
-            advertised_hz: 30.0,
-            class: None,
-            lanes: vec![lane(&cloud)],
-        }];
+        let demands = [demand("camera", 1_000_000, 30.0, vec![lane(&cloud)])];
         let budgets = Budgets {
             process: 100e6,
             links: BTreeMap::from([(cloud.clone(), 1e6)]),
+            ..Budgets::default()
         };
         let got = rates(&budgets, &Terms::default(), &demands);
-        assert_eq!((got.feasible, got.infeasible_links), (false, vec![cloud]));
+        assert_eq!((got.feasible, got.infeasible_links), (false, BTreeSet::from([cloud])));
+        assert!(got.process_feasible);
         assert_eq!(got.topics[0].lanes_hz, [2.0], "never below r_min");
+    }
+
+    /// Two robots of one layer; the radio of one of them is bad.
+    #[test]
+    fn a_slow_link_to_one_flow_thins_what_goes_there_alone() {
+        let (one, other): (FlowId, FlowId) = ("edge/robot-1".parse().unwrap(), "edge/robot-2".parse().unwrap());
+        let both = || vec![to(&one), to(&other)];
+        let demands = [
+            demand("map", 1_000_000, 10.0, both()),
+            demand("stop", 1_000, 10.0, both()),
+            demand("unasked", 1_000_000, 10.0, Vec::new()),
+        ];
+        let slow = |bytes_per_s, passing| {
+            let budgets = Budgets {
+                process: 100e6,
+                flows: BTreeMap::from([(other.clone(), FlowBudget { bytes_per_s, passing })]),
+                ..Budgets::default()
+            };
+            rates(&budgets, &Terms::default(), &demands)
+        };
+        let got = slow(5_110_200.0, false);
+        assert_eq!(got.topics[0].lanes_hz[0], 10.0);
+        // β · 5,110,200 B/s are 4.76 maps of 1,020,000 B.
+        assert!((got.topics[0].lanes_hz[1] - 0.95 * 5_110_200.0 / 1_020_000.0).abs() < 1e-9);
+        assert_eq!(got.topics[1].lanes_hz, [10.0, 10.0]);
+        assert_eq!((got.topics[2].rate_hz, got.topics[2].lanes_hz.len()), (10.0, 0));
+        assert!(got.feasible);
+        // Two maps a second do not fit: that is told, unless the link is about to carry more.
+        assert_eq!(slow(1e6, false).infeasible_links, BTreeSet::from([layer("edge")]));
+        let got = slow(1e6, true);
+        assert!(got.feasible && (got.topics[0].lanes_hz[1] - 2.0).abs() < 1e-9);
+        // What is small is thinned by what a link carries, not by what it is asked to carry for a moment.
+        assert!(slow(5_000.0, false).topics[1].lanes_hz[1] < 5.0);
+        assert_eq!(slow(5_000.0, true).topics[1].lanes_hz, [10.0, 10.0]);
+    }
+
+    #[test]
+    fn what_standard_topics_take_of_a_link_does_not_depend_on_it() {
+        let robot: FlowId = "edge/robot-1".parse().unwrap();
+        let slower = LaneDemand {
+            max_rate_hz: Some(5.0),
+            ..to(&robot)
+        };
+        let demands = [
+            demand("map", 1_000_000, 10.0, vec![to(&robot)]),
+            demand("stop", 1_000, 10.0, vec![to(&robot)]),
+            demand("odom", 2_000, 50.0, vec![slower]),
+        ];
+        let budgets = Budgets {
+            process: 100e6,
+            flows: BTreeMap::from([(
+                robot.clone(),
+                FlowBudget {
+                    bytes_per_s: 100.0,
+                    passing: true,
+                },
+            )]),
+            ..Budgets::default()
+        };
+        let terms = Terms::default();
+        let got = standard_load(&rates(&budgets, &terms, &demands), &terms, &demands);
+        assert!((got[&robot] - (10.0 * 1_020.0 + 5.0 * 2_040.0)).abs() < 1e-6, "{got:?}");
     }
 }

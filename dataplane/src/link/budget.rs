@@ -9,25 +9,38 @@ use std::time::{Duration, Instant};
 use blaze_domain::LayerName;
 
 use crate::limit::capacity::{Capacity, Seen, State};
-use crate::limit::pacer::Pacer;
+use crate::limit::pacer::{BURST_DATAGRAMS, Pacer};
 
-/// A burst is at most this many datagrams.
-const BURST_DATAGRAMS: usize = 2;
-
-/// What a datagram becomes on the wire.
+/// What a datagram becomes on the wire. Sizes are in bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PacketSize {
-    /// Bytes of a datagram that one IP packet carries.
-    pub content_bytes: usize,
-    /// Bytes of headers in each packet.
-    pub header_bytes: usize,
+    /// Put before a datagram.
+    pub prefix: usize,
+    /// Both together are filled up to a multiple of this.
+    pub align: usize,
+    /// With its prefix a datagram up to this size goes as one packet …
+    pub whole: usize,
+    /// … with headers of this size.
+    pub whole_header: usize,
+    /// Of a larger one so much goes in one packet at most, …
+    pub last_part: usize,
+    /// … so much in each packet before that, …
+    pub part: usize,
+    /// … each with headers of this size.
+    pub part_header: usize,
 }
 
 impl PacketSize {
     /// Bytes of all IP packets of a datagram.
     #[must_use]
     pub fn wire_bytes(self, datagram_bytes: usize) -> usize {
-        datagram_bytes + self.header_bytes * datagram_bytes.div_ceil(self.content_bytes.max(1)).max(1)
+        let content = self.prefix + datagram_bytes;
+        let filled = content.next_multiple_of(self.align.max(1));
+        if content <= self.whole {
+            return self.whole_header + filled;
+        }
+        let packets = 1 + content.saturating_sub(self.last_part).div_ceil(self.part.max(1));
+        packets * self.part_header + filled
     }
 }
 
@@ -69,19 +82,20 @@ pub(crate) struct Budgets {
 }
 
 impl Budgets {
-    pub(crate) fn set(&mut self, budgets: LinkBudgets, burst_bytes: usize, now: Instant) {
+    pub(crate) fn set(&mut self, now: Instant, budgets: LinkBudgets, max_datagram: usize) {
+        let burst = burst_bytes(budgets.packets, max_datagram);
         self.layers.retain(|layer, _| budgets.layers.contains_key(layer));
         for (layer, limit) in &budgets.layers {
-            self.layers
-                .entry(layer.clone())
-                .or_insert_with(|| Pacer::new(*limit, burst_bytes, now))
-                .set_limit(*limit, now);
+            let pacer = self.layers.entry(layer.clone());
+            let pacer = pacer.or_insert_with(|| Pacer::new(*limit, burst, now));
+            pacer.set_limit(*limit, now);
+            pacer.set_burst(burst);
         }
         self.set = Some(budgets);
     }
 
-    pub(crate) fn wire_bytes(&self, datagram_bytes: usize) -> Option<usize> {
-        self.set.as_ref().map(|set| set.packets.wire_bytes(datagram_bytes))
+    pub(crate) fn packets(&self) -> Option<PacketSize> {
+        self.set.as_ref().map(|set| set.packets)
     }
 
     fn limit(&self, layer: &LayerName) -> Option<f64> {
@@ -92,7 +106,10 @@ impl Budgets {
 
     /// Whether a peer of the layer may be sent to; else it is noted when.
     pub(crate) fn may_send(&mut self, now: Instant, layer: &LayerName, path: &mut PathBudget) -> bool {
-        let of_layer = self.layers.get_mut(layer).map_or(Duration::ZERO, |pacer| pacer.wait(now));
+        let of_layer = self
+            .layers
+            .get_mut(layer)
+            .map_or(Duration::ZERO, |pacer| pacer.wait(now));
         let wait = of_layer.max(path.wait(now));
         if wait.is_zero() {
             return true;
@@ -104,9 +121,8 @@ impl Budgets {
 
     /// Counts a datagram that leaves.
     pub(crate) fn spend(&mut self, now: Instant, layer: &LayerName, path: &mut PathBudget, datagram_bytes: usize) {
-        let Some(wire_bytes) = self.wire_bytes(datagram_bytes) else {
-            return;
-        };
+        let Some(packets) = self.packets() else { return };
+        let wire_bytes = packets.wire_bytes(datagram_bytes);
         if let Some(pacer) = self.layers.get_mut(layer) {
             pacer.spend(wire_bytes, now);
         }
@@ -114,23 +130,25 @@ impl Budgets {
     }
 
     /// Makes a peer's budget as it is set now.
-    pub(crate) fn fit(&self, now: Instant, layer: &LayerName, burst_bytes: usize, path: &mut PathBudget) {
-        let adaptive = self.set.as_ref().is_some_and(|set| set.adaptive);
-        match self.limit(layer).filter(|_| adaptive) {
-            Some(limit) => path.adapt(now, limit, burst_bytes),
+    pub(crate) fn fit(&self, now: Instant, layer: &LayerName, max_datagram: usize, path: &mut PathBudget) {
+        let adaptive = self.set.as_ref().filter(|set| set.adaptive);
+        match adaptive.zip(self.limit(layer)) {
+            Some((set, limit)) => path.adapt(now, limit, burst_bytes(set.packets, max_datagram)),
             None => path.follow = None,
         }
     }
+}
 
-    pub(crate) fn burst_bytes(&self, max_datagram: usize) -> usize {
-        BURST_DATAGRAMS * self.wire_bytes(max_datagram).unwrap_or(max_datagram)
-    }
+fn burst_bytes(packets: PacketSize, max_datagram: usize) -> usize {
+    BURST_DATAGRAMS * packets.wire_bytes(max_datagram)
 }
 
 /// What may go to one peer.
 #[derive(Debug, Default)]
 pub(crate) struct PathBudget {
     follow: Option<Follow>,
+    /// What is small needs so much, in wire bytes per second.
+    needed: f64,
 }
 
 #[derive(Debug)]
@@ -142,15 +160,29 @@ struct Follow {
 impl PathBudget {
     fn adapt(&mut self, now: Instant, limit: f64, burst_bytes: usize) {
         match &mut self.follow {
-            Some(follow) => follow.capacity.set_limit(limit, now),
+            Some(follow) => {
+                follow.capacity.set_limit(limit, now);
+                follow.pacer.set_burst(burst_bytes);
+            }
             None => {
+                let mut capacity = Capacity::new(limit, now);
+                capacity.set_needed(self.needed, now);
                 self.follow = Some(Follow {
-                    capacity: Capacity::new(limit, now),
+                    capacity,
                     pacer: Pacer::new(limit, burst_bytes, now),
                 });
             }
         }
         self.pace(now);
+    }
+
+    /// So much is needed for what is small, in wire bytes per second.
+    pub(crate) fn set_needed(&mut self, now: Instant, wire_bytes_per_s: f64) {
+        self.needed = wire_bytes_per_s;
+        if let Some(follow) = &mut self.follow {
+            follow.capacity.set_needed(wire_bytes_per_s, now);
+            self.pace(now);
+        }
     }
 
     fn pace(&mut self, now: Instant) {
@@ -204,16 +236,38 @@ impl PathBudget {
 mod tests {
     use super::*;
 
+    /// Those of DDS over Ethernet.
     const PACKETS: PacketSize = PacketSize {
-        content_bytes: 1_296,
-        header_bytes: 80,
+        prefix: 8,
+        align: 4,
+        whole: 1_404,
+        whole_header: 72,
+        last_part: 1_396,
+        part: 1_280,
+        part_header: 84,
     };
 
     #[test]
     fn a_datagram_has_the_headers_of_all_its_packets() {
         assert_eq!(PACKETS.wire_bytes(1_296), 1_376);
-        assert_eq!(PACKETS.wire_bytes(1_297), 1_297 + 160);
+        assert_eq!(PACKETS.wire_bytes(1_293), 1_376, "filled up");
+        assert_eq!(PACKETS.wire_bytes(1_400), 2 * 84 + 1_408);
+        assert_eq!(PACKETS.wire_bytes(6_000), 5 * 84 + 6_008);
         assert_eq!(PACKETS.wire_bytes(0), 80);
+    }
+
+    fn budgets(
+        limit_bytes_per_s: f64,
+        layers: &[(&LayerName, f64)],
+        adaptive: bool,
+        packets: PacketSize,
+    ) -> LinkBudgets {
+        LinkBudgets {
+            limit_bytes_per_s,
+            layers: layers.iter().map(|(layer, limit)| ((*layer).clone(), *limit)).collect(),
+            adaptive,
+            packets,
+        }
     }
 
     /// Bytes that two peers of two layers send in ten seconds, as fast as they may.
@@ -221,29 +275,79 @@ mod tests {
     fn a_slow_link_holds_back_its_own_peers_alone() {
         let start = Instant::now();
         let (fog, cloud): (LayerName, LayerName) = ("fog".parse().unwrap(), "cloud".parse().unwrap());
-        let mut budgets = Budgets::default();
-        let set = LinkBudgets {
-            limit_bytes_per_s: 1_000_000.0,
-            layers: BTreeMap::from([(cloud.clone(), 100_000.0)]),
-            adaptive: false,
-            packets: PACKETS,
-        };
-        budgets.set(set, 2 * 1_376, start);
+        let mut link = Budgets::default();
+        link.set(start, budgets(1e6, &[(&cloud, 1e5)], false, PACKETS), 1_296);
         let mut paths = [PathBudget::default(), PathBudget::default()];
         let mut sent = [0usize; 2];
         for tick in 0..10_000u32 {
             let now = start + Duration::from_millis(1) * tick;
-            budgets.paced_until = None;
+            link.paced_until = None;
             for (at, layer) in [&fog, &cloud].into_iter().enumerate() {
-                if budgets.may_send(now, layer, &mut paths[at]) {
-                    budgets.spend(now, layer, &mut paths[at], 1_296);
+                if link.may_send(now, layer, &mut paths[at]) {
+                    link.spend(now, layer, &mut paths[at], 1_296);
                     sent[at] += 1_376;
                 }
             }
-            assert!(budgets.paced_until.is_none_or(|until| until > now));
+            assert!(link.paced_until.is_none_or(|until| until > now));
         }
-        assert_eq!(sent[0], 10_000 * 1_376, "nothing but the pacer of the process bounds the fog");
+        assert_eq!(
+            sent[0],
+            10_000 * 1_376,
+            "nothing but the pacer of the process bounds the fog"
+        );
         assert!((970_000..=1_000_000).contains(&sent[1]), "{sent:?}");
+    }
+
+    /// Datagrams that may leave at once after a pause.
+    fn burst(link: &mut Budgets, now: Instant, layer: &LayerName, path: &mut PathBudget) -> usize {
+        let mut datagrams = 0;
+        while datagrams < 100 && link.may_send(now, layer, path) {
+            link.spend(now, layer, path, 1_296);
+            datagrams += 1;
+        }
+        datagrams
+    }
+
+    #[test]
+    fn bursts_are_as_long_as_packets_are_large() {
+        const SECOND: Duration = Duration::from_secs(1);
+        let start = Instant::now();
+        let cloud: LayerName = "cloud".parse().unwrap();
+        let narrow = PacketSize {
+            whole_header: 0,
+            prefix: 0,
+            ..PACKETS
+        };
+        // The limit is that of the layer, and then that of the path.
+        for (layers, adaptive) in [(&[(&cloud, 1e6)][..], false), (&[][..], true)] {
+            let (mut link, mut path) = (Budgets::default(), PathBudget::default());
+            // So many small ones, before it is known how large they are.
+            link.set(start, budgets(1e6, layers, adaptive, narrow), 100);
+            link.fit(start, &cloud, 100, &mut path);
+            assert_eq!(burst(&mut link, start + SECOND, &cloud, &mut path), 1);
+            link.set(start + SECOND, budgets(1e6, layers, adaptive, PACKETS), 1_296);
+            link.fit(start + SECOND, &cloud, 1_296, &mut path);
+            assert_eq!(
+                burst(&mut link, start + SECOND * 2, &cloud, &mut path),
+                3,
+                "two, and one into debt"
+            );
+        }
+    }
+
+    #[test]
+    fn what_is_small_has_its_share_after_an_outage() {
+        let start = Instant::now();
+        let cloud: LayerName = "cloud".parse().unwrap();
+        let (mut link, mut path) = (Budgets::default(), PathBudget::default());
+        // Told before there is anything to follow.
+        path.set_needed(start, 100_000.0);
+        link.set(start, budgets(1e6, &[], true, PACKETS), 1_296);
+        link.fit(start, &cloud, 1_296, &mut path);
+        path.outage(start);
+        let capacity = path.capacity().unwrap();
+        assert_eq!(capacity.state, State::SlowStart);
+        assert!((capacity.bytes_per_s - 125_000.0).abs() < 1.0, "{capacity:?}");
     }
 
     #[test]

@@ -20,7 +20,7 @@ use bytes::Bytes;
 use prost::Message as _;
 
 use super::addresses::Addresses;
-use super::budget::{Budgets, LinkBudgets};
+use super::budget::{Budgets, LinkBudgets, LinkCapacity};
 use super::clock::Clocks;
 use super::event::{LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit};
 use super::lifecycle::Missed;
@@ -212,11 +212,29 @@ impl Engine {
 
     /// What may go to each peer from now on. Before the first call nothing is held back here.
     pub fn set_budgets(&mut self, now: Instant, budgets: LinkBudgets) {
-        let burst = self.budgets.burst_bytes(self.config.max_datagram);
-        self.budgets.set(budgets, burst, now);
+        let max_datagram = self.config.max_datagram;
+        self.budgets.set(now, budgets, max_datagram);
         for peer in self.peers.iter_mut().flatten() {
-            self.budgets.fit(now, &peer.endpoint.flow.layer, burst, &mut peer.path);
+            let layer = &peer.endpoint.flow.layer;
+            self.budgets.fit(now, layer, max_datagram, &mut peer.path);
         }
+    }
+
+    /// What is small needs so many wire bytes per second to each flow; to those that are not named nothing.
+    pub fn set_needed(&mut self, now: Instant, wire_bytes_per_s: &BTreeMap<FlowId, f64>) {
+        for peer in self.peers.iter_mut().flatten() {
+            let needed = wire_bytes_per_s.get(&peer.endpoint.flow).copied();
+            peer.path.set_needed(now, needed.unwrap_or(0.0));
+        }
+    }
+
+    /// What is known of the links to flows that are up or suspect, where that is estimated.
+    #[must_use]
+    pub fn capacities(&self) -> Vec<(FlowId, LinkCapacity)> {
+        let connected = self.peers.iter().flatten().filter(|peer| peer.is_connected());
+        connected
+            .filter_map(|peer| Some((peer.endpoint.flow.clone(), peer.path.capacity()?)))
+            .collect()
     }
 
     /// When a peer may be sent to for which [`Engine::poll_transmit`] has something and its link no budget.
@@ -375,6 +393,14 @@ impl Engine {
         let peer = self.by_flow.get(flow).and_then(|at| self.peers[*at].as_ref());
         let says_so = |peer: &Peer| peer.hello.as_ref().is_some_and(|hello| hello.answers_written);
         peer.is_some_and(|peer| peer.is_connected() && says_so(peer))
+    }
+
+    /// Whether a flow says that it decompresses; one that was never heard does not.
+    #[must_use]
+    pub fn takes_lz4(&self, flow: &FlowId) -> bool {
+        let peer = self.by_flow.get(flow).and_then(|at| self.peers[*at].as_ref());
+        let hello = peer.and_then(|peer| peer.hello.as_ref());
+        hello.is_some_and(|hello| hello.takes_lz4)
     }
 
     /// Whether the queue of a class to a flow is empty, or takes so many bytes more and is at most half full then. Of a flow that

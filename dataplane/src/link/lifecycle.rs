@@ -86,8 +86,8 @@ impl Engine {
             max_datagram: self.config.max_datagram,
         });
         let mut peer = Peer::new(now, endpoint, self.next_link_epoch, limits, self.config.limits.streams);
-        let burst = self.budgets.burst_bytes(self.config.max_datagram);
-        self.budgets.fit(now, &peer.endpoint.flow.layer, burst, &mut peer.path);
+        let layer = &peer.endpoint.flow.layer;
+        self.budgets.fit(now, layer, self.config.max_datagram, &mut peer.path);
         self.next_link_epoch = self.next_link_epoch.saturating_add(3);
         self.by_flow.insert(peer.endpoint.flow.clone(), at);
         self.by_sender.insert(peer.sender, at);
@@ -311,6 +311,7 @@ impl Engine {
             send_ns: self.clocks.monotonic_ns(now),
             sender: self.sender,
             round_trip: peer.round_trip.get(),
+            packets: self.budgets.packets(),
             ledger: &mut self.ledger,
             counters: &mut self.counters,
         };

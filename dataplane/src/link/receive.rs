@@ -298,6 +298,7 @@ impl Engine {
             send_ns: now_ns,
             sender: self.sender,
             round_trip: peer.round_trip.get(),
+            packets: self.budgets.packets(),
             ledger: &mut self.ledger,
             counters: &mut self.counters,
         };
@@ -315,17 +316,13 @@ impl Engine {
             self.counters.stale += 1;
             return;
         }
-        let (delivered, lost) = sender.take_settled();
+        let (delivered_bytes, lost_bytes) = sender.take_settled();
         let round_trip = peer
             .round_trip
             .echo(now, now_ns, feedback.echo_send_ns, feedback.echo_held_ns);
-        let wire = |(samples, bytes): (u64, u64)| {
-            let headers = self.budgets.wire_bytes(0).unwrap_or(0) as u64;
-            bytes + samples * headers
-        };
         let seen = Seen {
-            delivered_bytes: wire(delivered),
-            lost_bytes: wire(lost),
+            delivered_bytes,
+            lost_bytes,
             round_trip,
         };
         peer.path.feedback(now, &seen);

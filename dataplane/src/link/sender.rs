@@ -19,6 +19,7 @@ use blaze_domain::{DropReason, Priority};
 use lru::LruCache;
 use smallvec::SmallVec;
 
+use super::budget::PacketSize;
 use super::clock::{LossMeter, RateMeter};
 use super::event::{LaneId, Ledger, LinkCounters, StreamKey, Submit, Tally};
 use super::outgoing::{Key, Messages, Outgoing, Part, PartRef};
@@ -109,8 +110,8 @@ pub(crate) struct SendClass {
     last_sweep: Option<Instant>,
     pub loss: LossMeter,
     pub rate: RateMeter,
-    /// Samples and bytes that were found to be received and lost, since the last [`SendClass::take_settled`].
-    settled: [(u64, u64); 2],
+    /// Wire bytes of samples that were found to be received and lost, since the last [`SendClass::take_settled`].
+    settled: [u64; 2],
 }
 
 /// What [`SendClass::transmit`] needs of its peer and engine.
@@ -119,6 +120,8 @@ pub(crate) struct SendContext<'a> {
     pub send_ns: u64,
     pub sender: SenderId,
     pub round_trip: Duration,
+    /// What datagrams become on the wire, where somebody wants to know.
+    pub packets: Option<PacketSize>,
     pub ledger: &'a mut Ledger,
     pub counters: &'a mut LinkCounters,
 }
@@ -155,7 +158,7 @@ impl SendClass {
             last_sweep: None,
             loss: LossMeter::default(),
             rate: RateMeter::default(),
-            settled: [(0, 0); 2],
+            settled: [0; 2],
         }
     }
 
@@ -190,8 +193,8 @@ impl SendClass {
         !(self.repairs.is_empty() && self.current.is_none() && self.waiting.is_empty())
     }
 
-    /// Samples and bytes that were received, and that were lost, since the last call.
-    pub(crate) fn take_settled(&mut self) -> ((u64, u64), (u64, u64)) {
+    /// Wire bytes of samples that were received, and that were lost, since the last call.
+    pub(crate) fn take_settled(&mut self) -> (u64, u64) {
         let [received, lost] = std::mem::take(&mut self.settled);
         (received, lost)
     }

@@ -188,6 +188,8 @@ pub(crate) struct Node {
     pub receiver_dropped: BTreeMap<DropReason, u64>,
     pub sent_bytes: u64,
     pub sent_datagrams: u64,
+    /// Datagrams to each flow, and their bytes.
+    pub sent_to: BTreeMap<FlowId, (u64, u64)>,
 }
 
 /// Engines on a network.
@@ -320,6 +322,7 @@ impl Sim {
             receiver_dropped: BTreeMap::new(),
             sent_bytes: 0,
             sent_datagrams: 0,
+            sent_to: BTreeMap::new(),
         });
     }
 
@@ -435,6 +438,8 @@ impl Sim {
             let node = &mut self.nodes[at];
             node.sent_bytes += transmit.datagram.len() as u64;
             node.sent_datagrams += 1;
+            let sent = node.sent_to.entry(transmit.to.flow.clone()).or_default();
+            *sent = (sent.0 + 1, sent.1 + transmit.datagram.len() as u64);
             assert!(transmit.datagram.len() <= 1300, "{} bytes", transmit.datagram.len());
             if let Some(rate) = node.rate {
                 #[allow(clippy::cast_precision_loss, reason = "a datagram")]
@@ -450,8 +455,10 @@ impl Sim {
     fn next_step(&self) -> Option<Instant> {
         let nodes = self.nodes.iter().filter(|node| node.alive);
         let timeouts = nodes.clone().filter_map(|node| node.engine.next_timeout());
-        let pacers = nodes.map(|node| node.free_at).filter(|at| *at > self.now);
-        timeouts.chain(pacers).chain(self.network.next_arrival()).min()
+        let pacers = nodes.clone().map(|node| node.free_at);
+        let links = nodes.filter_map(|node| node.engine.paced_until());
+        let later = pacers.chain(links).filter(|at| *at > self.now);
+        timeouts.chain(later).chain(self.network.next_arrival()).min()
     }
 
     /// Lets time pass up to an instant.

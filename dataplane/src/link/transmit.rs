@@ -125,6 +125,7 @@ impl Engine {
             ingress_bytes_per_s: None,
             answers_written: true,
             layer_away: self.layer_away,
+            takes_lz4: true,
             // Who is on the inter scope is a gateway, if its group has any.
             ..Hello::default()
         }
@@ -158,6 +159,7 @@ impl Engine {
             send_ns: self.clocks.monotonic_ns(now),
             sender: self.sender,
             round_trip: peer.round_trip.get(),
+            packets: self.budgets.packets(),
             ledger: &mut self.ledger,
             counters: &mut self.counters,
         };
@@ -197,6 +199,7 @@ impl Engine {
                     send_ns,
                     sender: self.sender,
                     round_trip: peer.round_trip.get(),
+                    packets: self.budgets.packets(),
                     ledger: &mut self.ledger,
                     counters: &mut self.counters,
                 };

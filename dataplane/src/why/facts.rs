@@ -60,6 +60,8 @@ pub struct BridgeFacts {
     pub sent: u64,
     /// Messages that it, or the way to it, dropped during the same time.
     pub dropped: BTreeMap<DropReason, u64>,
+    /// It is held to the rate that was advertised, because more is published.
+    pub exceeds_advertised: bool,
     /// Messages that the rules of `flow.access` kept from it during the same time; not among those of `dropped`.
     pub denied: u64,
 }

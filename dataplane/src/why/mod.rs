@@ -12,7 +12,7 @@ mod trace;
 #[cfg(test)]
 mod tests;
 
-use blaze_domain::{FlowId, Scope, TopicName, WhyCode};
+use blaze_domain::{DropReason, FlowId, Scope, TopicName, WhyCode};
 use serde::Serialize;
 
 pub use facts::{BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, LeaseHint, RouteFacts, WhyInput, WhyTarget};
@@ -114,9 +114,18 @@ pub fn explain(input: &WhyInput<'_>) -> Why {
         to: input.to.clone(),
         verdict,
         code,
-        remedy: remedy::remedy(code),
+        remedy: match code {
+            WhyCode::RateLimited if input.bridges.iter().any(exceeds) => remedy::OF_AN_EXCESS,
+            _ => remedy::remedy(code),
+        },
         steps,
     }
+}
+
+/// Whether messages are skipped because more is published than was advertised.
+fn exceeds(facts: &BridgeFacts) -> bool {
+    let skipped = facts.dropped.get(&DropReason::RateLimit);
+    facts.exceeds_advertised && skipped.is_some_and(|skipped| *skipped > 0)
 }
 
 /// The worst of those that were asked for; of everybody, degraded if some are served.

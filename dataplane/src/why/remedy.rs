@@ -2,6 +2,10 @@
 
 use blaze_domain::WhyCode;
 
+/// Where messages are skipped though there is room for them.
+pub(super) const OF_AN_EXCESS: &str =
+    "Let the publisher advertise the rate that it publishes at: more than it says is skipped, whatever the limit is.";
+
 /// One sentence for people.
 pub(super) fn remedy(code: WhyCode) -> &'static str {
     match code {

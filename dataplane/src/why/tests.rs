@@ -53,6 +53,7 @@ impl Setup {
             received: 10,
             sent: 10,
             dropped: BTreeMap::new(),
+            exceeds_advertised: false,
             denied: 0,
         };
         self.bridges = self.plan.bridges.iter().map(up).collect();
@@ -269,6 +270,26 @@ fn rows() -> Vec<Row> {
             flow: id("c/b"), to_layer: id("c/b").layer, receiver: None, step: StepKind::Deliver, ok: true, code: WhyCode::NativePath,
         }) => Flowing Ok;
     }
+}
+
+/// More budget would not help where more is published than was advertised.
+#[test]
+fn whoever_publishes_more_than_it_says_is_told_so() {
+    let mut setup = Setup::new(world(PAIR));
+    setup.drops(DropReason::RateLimit, 4);
+    assert!(setup.why().remedy.contains("limit_mbps"));
+    setup.bridges[0].exceeds_advertised = true;
+    let why = setup.why();
+    assert_eq!((why.code, why.remedy), (WhyCode::RateLimited, remedy::OF_AN_EXCESS));
+    let admit = why.steps.iter().find(|step| step.code == WhyCode::RateLimited).unwrap();
+    assert!(
+        admit.detail.ends_with("more is published than was advertised"),
+        "{admit:?}"
+    );
+    // Skipped for nothing of the kind.
+    setup.bridges[0].dropped.clear();
+    setup.drops(DropReason::QueueFull, 4);
+    assert!(setup.why().remedy.contains("limit_mbps"));
 }
 
 #[test]

@@ -465,7 +465,16 @@ fn drops(trace: &mut Trace, hop: &Hop<'_>, facts: &BridgeFacts) {
             | DropReason::NoDestination
             | DropReason::Shutdown => continue,
         };
-        found.push((step, code, format!("{count} dropped ({reason}), {}", counts(facts))));
+        let excess = if *reason == DropReason::RateLimit && facts.exceeds_advertised {
+            "; more is published than was advertised"
+        } else {
+            ""
+        };
+        found.push((
+            step,
+            code,
+            format!("{count} dropped ({reason}), {}{excess}", counts(facts)),
+        ));
     }
     found.sort();
     for (step, code, detail) in found {

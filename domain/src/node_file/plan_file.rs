@@ -117,7 +117,11 @@ fn flow_of(s: &mut Section<'_>) -> Option<PlannedFlow> {
     let topics = s.need("topics", topics)?;
     let source = match (node_file, layer, node) {
         (Some(file), None, None) if !given_bandwidth => FlowSource::NodeFile(file),
-        (Some(_), _, _) => return s.node.fault("holds node_file and what a node file says; only one of both is allowed"),
+        (Some(_), _, _) => {
+            return s
+                .node
+                .fault("holds node_file and what a node file says; only one of both is allowed");
+        }
         (None, Some(layer), Some(node)) => FlowSource::Inline {
             flow: FlowId::new(layer, node),
             bandwidth: Box::new(bandwidth),
@@ -142,7 +146,7 @@ fn topic_of(s: &mut Section<'_>) -> Option<PlannedTopic> {
     let bytes = s.need("bytes", whole(0, MAX_BYTES));
     let writers = s.or("writers", whole(1, MAX_WRITERS), 1);
     let class = s.or("class", parsed, PlannedClass::Auto);
-    let lanes = s.need("lanes", |node| node.list(|lane| lane.section(lane_of).flatten()));
+    let lanes = s.need("lanes", lanes);
     Some(PlannedTopic {
         topic: topic?,
         rate_hz: rate_hz?,
@@ -151,6 +155,15 @@ fn topic_of(s: &mut Section<'_>) -> Option<PlannedTopic> {
         class,
         lanes: lanes?,
     })
+}
+
+fn lanes(node: &Node<'_>) -> Option<Vec<PlannedLane>> {
+    let lanes = node.list(|lane| lane.section(lane_of).flatten())?;
+    let mut seen = BTreeSet::new();
+    if let Some(twice) = lanes.iter().find(|lane| !seen.insert(&lane.layer)) {
+        return node.fault(format!("holds {} twice; a layer gets one copy", twice.layer));
+    }
+    Some(lanes)
 }
 
 fn lane_of(s: &mut Section<'_>) -> Option<PlannedLane> {
@@ -185,9 +198,15 @@ mod tests {
         let FlowSource::Inline { flow, bandwidth } = &plan.flows[1].source else {
             panic!("{plan:?}");
         };
-        assert_eq!((flow.to_string().as_str(), bandwidth.limit_mbps), ("edge/robot-2", 40.0));
+        assert_eq!(
+            (flow.to_string().as_str(), bandwidth.limit_mbps),
+            ("edge/robot-2", 40.0)
+        );
         let topic = &plan.flows[1].topics[0];
-        assert_eq!((topic.writers, topic.class, topic.lanes.len()), (1, PlannedClass::Auto, 2));
+        assert_eq!(
+            (topic.writers, topic.class, topic.lanes.len()),
+            (1, PlannedClass::Auto, 2)
+        );
         assert_eq!(topic.lanes[1].max_rate_hz, Some(5.0));
     }
 
@@ -214,7 +233,16 @@ mod tests {
             ]
         );
         let imu = json!({"topic": "imu", "rate_hz": 1, "bytes": 1, "lanes": []});
-        let twice = faults(&flow(json!({"layer": "edge", "node": "a", "topics": [imu.clone(), imu]})));
+        let twice = faults(&flow(
+            json!({"layer": "edge", "node": "a", "topics": [imu.clone(), imu]}),
+        ));
         assert_eq!(twice, ["flows[0].topics: holds imu twice; give it writers instead"]);
+        let lanes = json!([{"layer": "fog"}, {"layer": "cloud"}, {"layer": "fog", "max_rate_hz": 1}]);
+        let imu = json!({"topic": "imu", "rate_hz": 1, "bytes": 1, "lanes": lanes});
+        let twice = faults(&flow(json!({"layer": "edge", "node": "a", "topics": [imu]})));
+        assert_eq!(
+            twice,
+            ["flows[0].topics[0].lanes: holds fog twice; a layer gets one copy"]
+        );
     }
 }

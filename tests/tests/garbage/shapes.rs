@@ -175,7 +175,16 @@ fn allocation(admin: &Admin) {
         );
         assert!(["standard", "large"].contains(&row["class"].as_str().unwrap()));
         for lane in rows(row, "lanes") {
-            check(lane, &["layer:s", "allocated_hz:n?", "actual_hz:n", "skipped:n"]);
+            check(
+                lane,
+                &[
+                    "layer:s",
+                    "allocated_hz:n?",
+                    "actual_hz:n",
+                    "skipped:n",
+                    "exceeds_advertised:b",
+                ],
+            );
         }
     }
     for row in rows(&answer, "links") {

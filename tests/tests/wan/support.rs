@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use blaze_tests::network::{Host, inside};
+use blaze_tests::network::{Host, Link, inside};
 use blaze_tests::process::hurry;
 use parking_lot::Mutex as PlainMutex;
 
@@ -180,6 +180,48 @@ pub(crate) fn received_bytes(host: &Host, interface: &str) -> anyhow::Result<u64
         let number = line.and_then(|line| line.split_whitespace().next().map(str::to_owned));
         Ok(number.ok_or_else(|| anyhow::anyhow!("no {interface}"))?.parse()?)
     })
+}
+
+/// What has gone into a link in one direction, at some moment between two.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Reading {
+    from: Instant,
+    to: Instant,
+    bytes: u64,
+}
+
+impl Reading {
+    /// Of what goes forward.
+    pub(crate) fn of(link: &Link<'_>) -> anyhow::Result<Self> {
+        let from = Instant::now();
+        let bytes = link.stats()?.forward.taken.bytes;
+        Ok(Self {
+            from,
+            to: Instant::now(),
+            bytes,
+        })
+    }
+
+    /// Bytes per second up to a later one.
+    pub(crate) fn rate_to(&self, later: &Self) -> f64 {
+        (later.bytes - self.bytes) as f64 / (later.from - self.from).as_secs_f64().max(1e-3)
+    }
+
+    /// The same, at least: no more time can have passed.
+    fn least_rate_to(&self, later: &Self) -> f64 {
+        (later.bytes - self.bytes) as f64 / (later.to - self.from).as_secs_f64().max(1e-3)
+    }
+}
+
+/// Bytes per second of the busiest second, at least. How long it takes to ask is no excuse and no fault.
+pub(crate) fn busiest(readings: &[Reading]) -> f64 {
+    let seconds = readings.iter().enumerate().filter_map(|(index, first)| {
+        let last = readings[index..]
+            .iter()
+            .find(|last| last.to - first.from >= Duration::from_secs(1))?;
+        Some(first.least_rate_to(last))
+    });
+    seconds.fold(0.0, f64::max)
 }
 
 /// Whether a packet from one host reaches another, and which address it comes from.

@@ -29,7 +29,7 @@ fn there_and_back(payload: &[u8], level: u8) -> Option<usize> {
         block.len(),
         payload.len()
     );
-    let back = decompress(&block, payload.len() as u64, payload.len()).unwrap();
+    let back = decompress(&block, payload.len() as u64).unwrap();
     assert!(back == payload, "level {level}, {} bytes", payload.len());
     Some(block.len())
 }
@@ -97,35 +97,21 @@ fn the_result_holds_no_more_memory_than_it_has_bytes() {
 
 #[test]
 fn a_size_is_checked_before_memory_is_taken_for_it() {
-    let refused = |block, announced, most| check(block, announced, most).unwrap_err();
+    let refused = |block, announced| check(block, announced).unwrap_err();
+    let too_large = MAX_PAYLOAD_BYTES as u64 + 1;
+    for announced in [too_large, u64::MAX] {
+        assert_eq!(refused(1 << 20, announced), Refused::TooLarge { announced });
+    }
+    assert!(matches!(refused(10, 2_551), Refused::Impossible { found: 10, .. }));
+    assert!(matches!(refused(0, 1), Refused::Impossible { .. }));
     assert!(matches!(
-        refused(100, 1_001, 1_000),
-        Refused::TooLarge { most: 1_000, .. }
-    ));
-    assert!(matches!(
-        refused(1 << 20, u64::MAX, usize::MAX),
-        Refused::TooLarge {
-            most: MAX_PAYLOAD_BYTES,
-            ..
-        }
-    ));
-    assert!(matches!(
-        refused(1 << 20, MAX_PAYLOAD_BYTES as u64 + 1, usize::MAX),
-        Refused::TooLarge { .. }
-    ));
-    assert!(matches!(
-        refused(10, 2_551, 10_000),
-        Refused::Impossible { found: 10, .. }
-    ));
-    assert!(matches!(refused(0, 1, 10_000), Refused::Impossible { .. }));
-    assert!(matches!(
-        refused(MAX_PAYLOAD_BYTES + 1, 1, 10_000),
+        refused(MAX_PAYLOAD_BYTES + 1, 1),
         Refused::BlockTooLarge { .. }
     ));
-    assert!(matches!(refused(usize::MAX, 1, 10_000), Refused::BlockTooLarge { .. }));
-    assert_eq!(check(10, 2_550, 10_000), Ok((2_550, 2_550)));
+    assert!(matches!(refused(usize::MAX, 1), Refused::BlockTooLarge { .. }));
+    assert_eq!(check(10, 2_550), Ok((2_550, 2_550)));
     assert_eq!(
-        check(MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES as u64, usize::MAX).map(|size| size.0),
+        announced_size(MAX_PAYLOAD_BYTES, MAX_PAYLOAD_BYTES as u64),
         Ok(MAX_PAYLOAD_BYTES)
     );
 }
@@ -145,26 +131,19 @@ fn only_the_announced_size_is_accepted() {
     let payload = b"0123456789abcdef".repeat(100);
     let block = compress(&payload, 9).unwrap();
     for announced in [0, 1, 1_599, 1_601, 3_000] {
-        assert!(decompress(&block, announced, 100_000).is_err(), "{announced}");
+        assert!(decompress(&block, announced).is_err(), "{announced}");
     }
-    assert!(matches!(
-        decompress(&block, 1_600, 1_599),
-        Err(Refused::TooLarge { .. })
-    ));
-    assert_eq!(decompress(&block, 1_600, 1_600).unwrap(), payload);
+    assert_eq!(decompress(&block, 1_600).unwrap(), payload);
     assert_eq!(
-        decompress(&block, 1_700, 100_000),
+        decompress(&block, 1_700),
         Err(Refused::OtherSize {
             announced: 1_700,
             found: 1_600
         })
     );
-    assert_eq!(
-        decompress(&block, 1_500, 100_000),
-        Err(Refused::Damaged { announced: 1_500 })
-    );
-    assert!(decompress(b"", 0, 10).is_err());
-    assert_eq!(decompress(&[0], 0, 10).unwrap(), Bytes::new());
+    assert_eq!(decompress(&block, 1_500), Err(Refused::Damaged { announced: 1_500 }));
+    assert!(decompress(b"", 0).is_err());
+    assert_eq!(decompress(&[0], 0).unwrap(), Bytes::new());
 }
 
 /// A block as it might come from outside: damaged in some way, and a size that somebody announces for it.
@@ -227,19 +206,17 @@ fn codec_inputs() {
     let (mut taken, mut refused, mut longest) = (0, 0, Duration::ZERO);
     for number in 0..inputs() {
         let (block, announced) = strange_block(&mut noise, &good);
-        let most = [0, 1, 1_000, 20_000, 1 << 20, MAX_PAYLOAD_BYTES, usize::MAX][noise.below(7)];
         let began = Instant::now();
-        match decompress(&block, announced, most) {
+        match decompress(&block, announced) {
             Ok(payload) => {
                 assert_eq!(payload.len() as u64, announced, "input {number}");
-                assert!(payload.len() <= most.min(MAX_PAYLOAD_BYTES), "input {number}");
                 let capacity = Vec::from(payload).capacity();
-                assert!(capacity <= most.min(MAX_PAYLOAD_BYTES), "input {number}: {capacity}");
+                assert!(capacity <= MAX_PAYLOAD_BYTES, "input {number}: {capacity}");
                 taken += 1;
             }
             Err(reason) => {
                 let before_memory = !matches!(reason, Refused::Damaged { .. } | Refused::OtherSize { .. });
-                let allowed = announced <= most.min(MAX_PAYLOAD_BYTES) as u64 && announced <= block.len() as u64 * 255;
+                let allowed = announced <= MAX_PAYLOAD_BYTES as u64 && announced <= block.len() as u64 * 255;
                 assert_eq!(before_memory, !allowed, "input {number}: {reason}");
                 refused += 1;
             }
@@ -273,7 +250,7 @@ proptest! {
 
     #[test]
     fn random_bytes_never_panic(block in proptest::collection::vec(any::<u8>(), 0..200), announced in 0u64..60_000) {
-        if let Ok(payload) = decompress(&block, announced, 50_000) {
+        if let Ok(payload) = decompress(&block, announced) {
             prop_assert_eq!(payload.len() as u64, announced);
         }
     }

@@ -1,4 +1,4 @@
-//! Nothing overtakes; nothing is counted wrongly.
+//! Nothing overtakes within a line; nothing is counted wrongly; nobody is forgotten.
 
 use super::*;
 use proptest::prelude::*;
@@ -8,220 +8,265 @@ const ROOMY: Bounds = Bounds {
     bytes: 1_000_000,
     items_of_one: 1_000,
     bytes_of_one: 1_000_000,
+    waiting_of_one: 1_000_000,
 };
+const LONG: Urgency = Urgency::Long;
 
-fn queue(bounds: Bounds) -> InOrder<u8, char, u32> {
-    InOrder::new(bounds)
-}
+type Key = (u8, char);
+type Queue = InOrder<u8, char, u32>;
 
-fn pop_all(queue: &mut InOrder<u8, char, u32>, key: u8) -> Vec<u32> {
+fn pop_all(queue: &mut Queue, key: Key) -> Vec<u32> {
     std::iter::from_fn(|| queue.pop_ready(&key)).collect()
 }
 
+/// Keeps a place for which there is room.
+fn wait(queue: &mut Queue, key: Key, item: u32, bytes: usize, keep: usize) -> Vec<u32> {
+    let pushed = queue.push_waiting(key, LONG, item, bytes, keep);
+    assert!(pushed.refused.is_none());
+    pushed.gave_way
+}
+
+/// Who is begun with next.
+fn begin(queue: &mut Queue) -> Option<(Ticket<u8, char>, u32)> {
+    queue.begin(LONG).map(|(ticket, item)| (ticket, *item))
+}
+
 #[test]
-fn what_is_ready_waits_for_what_came_before() {
-    let mut queue = queue(ROOMY);
-    queue.push_ready(1, 1, 10).unwrap();
-    assert_eq!(pop_all(&mut queue, 1), [1]);
-    assert!(queue.is_clear(&1));
-    let first = queue.push_pending(1, 'a', 100).unwrap();
-    let second = queue.push_pending(1, 'b', 100).unwrap();
-    queue.push_ready(1, 4, 10).unwrap();
-    assert!(!queue.is_clear(&1));
-    // Another key does not wait.
-    queue.push_ready(2, 9, 10).unwrap();
-    assert_eq!(pop_all(&mut queue, 2), [9]);
-    queue.finish(&second, 3, 50).unwrap();
-    assert!(pop_all(&mut queue, 1).is_empty());
-    assert_eq!(queue.waiting(), Waiting { items: 3, bytes: 160 });
-    queue.finish(&first, 2, 50).unwrap();
-    assert_eq!(pop_all(&mut queue, 1), [2, 3, 4]);
+fn what_is_ready_waits_for_what_came_before_in_its_line() {
+    let mut queue = Queue::new(ROOMY);
+    let key = (1, 'a');
+    queue.push_ready(key, 1, 10).unwrap();
+    assert_eq!(pop_all(&mut queue, key), [1]);
+    assert!(queue.is_clear(&key) && !queue.holds(&1));
+    wait(&mut queue, key, 2, 100, 0);
+    wait(&mut queue, key, 3, 100, 0);
+    queue.push_ready(key, 4, 10).unwrap();
+    // Another writer of the topic does not wait, nor does another topic.
+    assert!(queue.is_clear(&(1, 'b')) && queue.holds(&1));
+    queue.push_ready((1, 'b'), 8, 10).unwrap();
+    queue.push_ready((2, 'a'), 9, 10).unwrap();
     assert_eq!(
-        (queue.waiting(), queue.waiting_of(&1)),
-        (Waiting::default(), Waiting::default())
+        (pop_all(&mut queue, (1, 'b')), pop_all(&mut queue, (2, 'a'))),
+        (vec![8], vec![9])
     );
+    let (first, item) = begin(&mut queue).unwrap();
+    assert_eq!((item, *first.key()), (2, key));
+    let (second, _) = begin(&mut queue).unwrap();
+    *queue.begun(&second).unwrap() = 33;
+    assert!(queue.finish(&second, 50));
+    assert!(pop_all(&mut queue, key).is_empty());
+    assert_eq!(queue.held(), Waiting { items: 3, bytes: 160 });
+    assert!(queue.finish(&first, 50));
+    assert_eq!(pop_all(&mut queue, key), [2, 33, 4]);
+    assert_eq!((queue.held(), queue.waits(LONG)), (Waiting::default(), Waiting::default()));
 }
 
 #[test]
-fn what_comes_to_nothing_holds_nobody_up() {
-    let mut queue = queue(ROOMY);
-    let first = queue.push_pending(1, 'a', 100).unwrap();
-    queue.push_ready(1, 2, 10).unwrap();
-    assert!(queue.begin(&first));
-    assert!(queue.give_up(&first));
-    assert_eq!(pop_all(&mut queue, 1), [2]);
-    assert!(!queue.give_up(&first) && !queue.begin(&first));
-    assert_eq!(queue.finish(&first, 7, 1), Err(7));
+fn what_comes_to_nothing_holds_nobody_up_and_a_ticket_is_good_once() {
+    let mut queue = Queue::new(ROOMY);
+    let key = (1, 'a');
+    wait(&mut queue, key, 1, 100, 0);
+    queue.push_ready(key, 2, 10).unwrap();
+    let (first, _) = begin(&mut queue).unwrap();
+    assert_eq!(queue.give_up(&first), Some(1));
+    assert_eq!(pop_all(&mut queue, key), [2]);
+    assert!(queue.give_up(&first).is_none() && queue.begun(&first).is_none() && !queue.finish(&first, 1));
+    wait(&mut queue, key, 3, 1, 0);
+    wait(&mut queue, key, 4, 1, 0);
+    let (third, _) = begin(&mut queue).unwrap();
+    let (fourth, _) = begin(&mut queue).unwrap();
+    assert!(queue.finish(&fourth, 1) && !queue.finish(&fourth, 1));
+    assert_eq!(queue.give_up(&fourth), None, "what is ready stays");
+    assert!(queue.finish(&third, 1));
+    assert_eq!(pop_all(&mut queue, key), [3, 4]);
+    assert_eq!(begin(&mut queue), None);
 }
 
 #[test]
-fn a_ticket_is_good_for_one_result() {
-    let mut queue = queue(ROOMY);
-    let blocker = queue.push_pending(1, 'a', 1).unwrap();
-    let ticket = queue.push_pending(1, 'a', 1).unwrap();
-    queue.finish(&ticket, 1, 1).unwrap();
-    assert_eq!(queue.finish(&ticket, 2, 1), Err(2));
-    assert!(!queue.give_up(&ticket), "what is ready stays");
-    queue.finish(&blocker, 0, 1).unwrap();
-    assert_eq!(pop_all(&mut queue, 1), [0, 1]);
-    assert_eq!(queue.finish(&ticket, 3, 1), Err(3));
-}
-
-#[test]
-fn a_writer_keeps_its_newest_and_what_is_begun() {
-    let mut queue = queue(ROOMY);
-    let tickets: Vec<_> = (0..5).map(|_| queue.push_pending(1, 'a', 10).unwrap()).collect();
-    let other = queue.push_pending(1, 'b', 10).unwrap();
-    assert!(queue.begin(&tickets[0]));
-    assert_eq!(queue.keep_newest(&1, &'a', 1), Waiting { items: 3, bytes: 30 });
-    assert_eq!(queue.keep_newest(&1, &'a', 1), Waiting::default());
-    let alive: Vec<bool> = tickets.iter().map(|ticket| queue.begin(ticket)).collect();
-    assert_eq!(alive, [true, false, false, false, true]);
-    assert_eq!(queue.finish(&tickets[2], 2, 1), Err(2));
-    for (at, ticket) in [(4, &tickets[4]), (5, &other), (0, &tickets[0])] {
-        queue.finish(ticket, at, 1).unwrap();
+fn of_what_waits_the_newest_stay_and_what_is_begun() {
+    let mut queue = Queue::new(ROOMY);
+    let key = (1, 'a');
+    for item in 0..4 {
+        assert!(wait(&mut queue, key, item, 10, 0).is_empty());
     }
-    assert_eq!(pop_all(&mut queue, 1), [0, 4, 5]);
-    // All of a key may go.
-    let last = queue.push_pending(1, 'a', 10).unwrap();
-    assert_eq!(queue.keep_newest(&1, &'a', 0), Waiting { items: 1, bytes: 10 });
-    assert!(queue.is_clear(&1) && !queue.begin(&last));
+    let (first, _) = begin(&mut queue).unwrap();
+    // What is to be done soon is not meant.
+    queue.push_waiting(key, Urgency::Quick, 9, 10, 1);
+    assert_eq!(wait(&mut queue, key, 4, 10, 2), [1, 2]);
+    assert_eq!(queue.held(), Waiting { items: 4, bytes: 40 });
+    assert_eq!(queue.waits(LONG), Waiting { items: 2, bytes: 20 });
+    assert_eq!(wait(&mut queue, key, 5, 10, 1), [3, 4]);
+    let (last, item) = begin(&mut queue).unwrap();
+    assert_eq!((item, begin(&mut queue)), (5, None));
+    assert!(queue.finish(&first, 1) && queue.finish(&last, 1));
+    assert_eq!(pop_all(&mut queue, key), [0], "the quick one comes before the last");
+}
+
+/// A frame that replaces a waiting one has waited as long as that: else who publishes often would never be begun with.
+#[test]
+fn who_gives_way_leaves_its_turn_to_the_newer_one() {
+    let mut queue = Queue::new(ROOMY);
+    wait(&mut queue, (1, 'a'), 1, 10, 1);
+    wait(&mut queue, (2, 'a'), 20, 10, 1);
+    for item in 2..10 {
+        assert_eq!(wait(&mut queue, (1, 'a'), item, 10, 1), [item - 1]);
+    }
+    assert_eq!(queue.waits(LONG), Waiting { items: 2, bytes: 20 });
+    let order: Vec<u32> = std::iter::from_fn(|| begin(&mut queue)).map(|(_, item)| item).collect();
+    assert_eq!(order, [9, 20]);
+}
+
+#[test]
+fn turns_go_round_groups_and_within_them_round_lines() {
+    let mut queue = Queue::new(ROOMY);
+    for item in 0..4 {
+        wait(&mut queue, (1, 'a'), item, 10, 0);
+    }
+    for item in 10..12 {
+        wait(&mut queue, (1, 'b'), item, 10, 0);
+    }
+    wait(&mut queue, (2, 'a'), 20, 10, 0);
+    wait(&mut queue, (2, 'a'), 21, 10, 0);
+    wait(&mut queue, (3, 'a'), 30, 10, 0);
+    queue.push_waiting((4, 'a'), Urgency::Quick, 40, 10, 0);
+    let order: Vec<u32> = std::iter::from_fn(|| begin(&mut queue)).map(|(_, item)| item).collect();
+    assert_eq!(order, [0, 20, 30, 10, 21, 1, 11, 2, 3]);
+    assert_eq!(queue.begin(Urgency::Quick).map(|(_, item)| *item), Some(40));
 }
 
 #[test]
 fn full_is_said_and_one_alone_always_fits() {
-    let mut queue = queue(Bounds {
+    let mut queue = Queue::new(Bounds {
         items: 4,
         bytes: 100,
         items_of_one: 3,
         bytes_of_one: 60,
+        waiting_of_one: 30,
     });
-    let large = queue.push_pending(1, 'a', 1_000).unwrap();
-    assert_eq!(queue.push_pending(1, 'a', 0), Err(Full::Key));
-    assert_eq!(queue.push_ready(2, 5, 1), Err((5, Full::All)));
-    assert!(queue.give_up(&large));
-    for _ in 0..3 {
-        queue.push_ready(1, 0, 20).unwrap();
-    }
-    assert_eq!(queue.push_ready(1, 7, 0), Err((7, Full::Key)), "items");
-    assert_eq!(queue.push_pending(2, 'a', 50), Err(Full::All), "bytes of all");
-    queue.push_ready(2, 0, 40).unwrap();
-    assert_eq!(queue.push_ready(3, 8, 0), Err((8, Full::All)), "items of all");
-    assert_eq!(queue.waiting(), Waiting { items: 4, bytes: 100 });
-    assert_eq!(pop_all(&mut queue, 1).len(), 3);
-    queue.push_ready(3, 0, 60).unwrap();
+    let full = |queue: &mut Queue, key: Key, bytes: usize| {
+        let refused = queue.push_waiting(key, LONG, 7, bytes, 0).refused;
+        refused.map(|(item, full)| {
+            assert_eq!(item, 7);
+            full
+        })
+    };
+    wait(&mut queue, (1, 'a'), 1, 1_000, 0);
+    assert_eq!(full(&mut queue, (1, 'b'), 0), Some(Full::Group));
+    assert_eq!(queue.push_ready((2, 'a'), 5, 1), Err((5, Full::All)));
+    let (large, _) = begin(&mut queue).unwrap();
+    assert_eq!(queue.give_up(&large), Some(1));
+    wait(&mut queue, (1, 'a'), 1, 20, 0);
+    assert_eq!(full(&mut queue, (1, 'b'), 11), Some(Full::Group), "too much waits");
+    let (begun, _) = begin(&mut queue).unwrap();
+    wait(&mut queue, (1, 'b'), 2, 30, 0);
+    assert_eq!(queue.push_ready((1, 'b'), 7, 11), Err((7, Full::Group)), "bytes");
+    queue.push_ready((1, 'b'), 3, 10).unwrap();
+    assert_eq!(queue.push_ready((1, 'c'), 7, 0), Err((7, Full::Group)), "items");
+    assert_eq!(full(&mut queue, (2, 'a'), 41), Some(Full::All), "bytes of all");
+    queue.push_ready((2, 'a'), 0, 40).unwrap();
+    assert_eq!(queue.push_ready((3, 'a'), 8, 0), Err((8, Full::All)), "items of all");
+    // Who makes room for himself fits; where that is not enough nothing gives way.
+    assert_eq!(wait(&mut queue, (1, 'b'), 4, 30, 1), [2]);
+    let refused = queue.push_waiting((1, 'b'), LONG, 5, 31, 1);
+    assert_eq!((refused.gave_way.len(), refused.refused), (0, Some((5, Full::Group))));
+    assert!(queue.finish(&begun, 1));
+    assert_eq!(pop_all(&mut queue, (1, 'a')), [1]);
 }
 
 #[test]
-fn a_removed_key_is_gone_and_comes_back_empty() {
-    let mut queue = queue(ROOMY);
-    let old = queue.push_pending(1, 'a', 10).unwrap();
-    queue.push_ready(1, 2, 5).unwrap();
-    assert_eq!(queue.remove_key(&1), Waiting { items: 2, bytes: 15 });
-    assert_eq!(
-        (queue.remove_key(&1), queue.waiting()),
-        (Waiting::default(), Waiting::default())
-    );
-    queue.push_pending(1, 'a', 10).unwrap();
-    assert_eq!(
-        queue.finish(&old, 1, 1),
-        Err(1),
-        "the old ticket is not one of the new life"
-    );
-    assert_eq!(old.key(), &1);
+fn everything_of_a_group_can_be_looked_at() {
+    let mut queue = Queue::new(ROOMY);
+    wait(&mut queue, (1, 'a'), 1, 10, 0);
+    wait(&mut queue, (1, 'b'), 2, 10, 0);
+    begin(&mut queue).unwrap();
+    queue.push_ready((1, 'a'), 3, 10).unwrap();
+    wait(&mut queue, (2, 'a'), 4, 10, 0);
+    let mut items: Vec<u32> = queue.items_mut(&1).map(|item| *item).collect();
+    items.sort_unstable();
+    assert_eq!(items, [1, 2, 3]);
+    assert_eq!(queue.items_mut(&9).count(), 0);
 }
 
 /// The same without any cleverness: one list of everything, in the order of arrival.
 #[derive(Default)]
 struct Model {
-    all: Vec<(u64, u8, char, usize, Step)>,
+    all: Vec<Entry>,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Step {
-    Waits,
-    Begun,
-    Ready(u32),
+#[derive(Debug, Clone, Copy)]
+struct Entry {
+    number: u64,
+    key: Key,
+    urgency: Urgency,
+    bytes: usize,
+    stage: Stage,
+    item: u32,
 }
 
 impl Model {
-    fn held(&self, key: Option<u8>) -> Waiting {
-        let of = self.all.iter().filter(|place| key.is_none_or(|key| key == place.1));
-        let (items, bytes) = of.fold((0, 0), |(items, bytes), place| (items + 1, bytes + place.3));
+    fn sum(&self, wanted: impl Fn(&Entry) -> bool) -> Waiting {
+        let of = self.all.iter().filter(|entry| wanted(entry));
+        let (items, bytes) = of.fold((0, 0), |(items, bytes), entry| (items + 1, bytes + entry.bytes));
         Waiting { items, bytes }
     }
 
-    fn room(&self, key: u8, bytes: usize, bounds: &Bounds) -> Result<(), Full> {
-        let fits = |held: Waiting, items, most| held.items < items && (held.items == 0 || held.bytes + bytes <= most);
-        if !fits(self.held(Some(key)), bounds.items_of_one, bounds.bytes_of_one) {
-            return Err(Full::Key);
+    fn room(&self, key: Key, bytes: usize, waits: bool, freed: Waiting, bounds: &Bounds) -> Result<(), Full> {
+        let fits = |held: Waiting, items, most| {
+            let held = held.without(freed);
+            held.items < items && (held.items == 0 || held.bytes + bytes <= most)
+        };
+        let of_one = self.sum(|entry| entry.key.0 == key.0);
+        let waiting = self.sum(|entry| entry.key.0 == key.0 && entry.stage == Stage::Waits);
+        if !fits(of_one, bounds.items_of_one, bounds.bytes_of_one)
+            || (waits && !fits(waiting, bounds.items_of_one, bounds.waiting_of_one))
+        {
+            return Err(Full::Group);
         }
-        let all = fits(self.held(None), bounds.items, bounds.bytes);
+        let all = fits(self.sum(|_| true), bounds.items, bounds.bytes);
         if all { Ok(()) } else { Err(Full::All) }
     }
 
-    fn pending(&mut self, number: u64) -> Option<usize> {
-        let is = |place: &(u64, u8, char, usize, Step)| place.0 == number && !matches!(place.4, Step::Ready(_));
+    /// What would have to give way.
+    fn surplus(&self, key: Key, urgency: Urgency, keep: usize) -> Vec<Entry> {
+        let waits = |entry: &&Entry| entry.key == key && entry.urgency == urgency && entry.stage == Stage::Waits;
+        let waiting: Vec<Entry> = self.all.iter().filter(waits).copied().collect();
+        let surplus = if keep == 0 { 0 } else { (waiting.len() + 1).saturating_sub(keep) };
+        waiting[..surplus].to_vec()
+    }
+
+    fn at(&self, number: u64, stage: Stage) -> Option<usize> {
+        let is = |entry: &Entry| entry.number == number && entry.stage == stage;
         self.all.iter().position(is)
     }
 
-    fn pop(&mut self, key: u8) -> Option<u32> {
-        let first = self.all.iter().position(|place| place.1 == key)?;
-        let Step::Ready(item) = self.all[first].4 else {
-            return None;
-        };
-        self.all.remove(first);
-        Some(item)
-    }
-
-    fn keep_newest(&mut self, key: u8, writer: char, keep: usize) -> Waiting {
-        let waits =
-            |place: &(u64, u8, char, usize, Step)| place.1 == key && place.2 == writer && place.4 == Step::Waits;
-        let surplus = self
-            .all
-            .iter()
-            .filter(|place| waits(place))
-            .count()
-            .saturating_sub(keep);
-        let (mut left, mut bytes) = (surplus, 0);
-        self.all.retain(|place| {
-            let goes = left > 0 && waits(place);
-            (left, bytes) = if goes {
-                (left - 1, bytes + place.3)
-            } else {
-                (left, bytes)
-            };
-            !goes
-        });
-        Waiting { items: surplus, bytes }
+    fn pop(&mut self, key: Key) -> Option<u32> {
+        let first = self.all.iter().position(|entry| entry.key == key)?;
+        let ready = self.all[first].stage == Stage::Ready;
+        ready.then(|| self.all.remove(first).item)
     }
 }
 
 #[derive(Debug, Clone)]
 enum Act {
-    Ready(u8, usize),
-    Pending(u8, char, usize),
-    Begin(usize),
+    Ready(Key, usize),
+    Wait(Key, Urgency, usize, usize),
+    Begin(Urgency),
     Finish(usize, usize),
     GiveUp(usize),
-    Pop(u8),
-    KeepNewest(u8, char, usize),
-    RemoveKey(u8),
+    Pop(Key),
 }
 
 fn act() -> impl Strategy<Value = Act> {
-    let (key, writer, bytes) = (0u8..3, prop_oneof![Just('a'), Just('b')], 0usize..40);
-    let pending =
-        (key.clone(), writer.clone(), bytes.clone()).prop_map(|(key, writer, bytes)| Act::Pending(key, writer, bytes));
+    let key = || (0u8..3, prop_oneof![Just('a'), Just('b')]);
+    let urgency = || prop_oneof![Just(Urgency::Quick), Just(Urgency::Long)];
     prop_oneof![
-        3 => (key.clone(), bytes.clone()).prop_map(|(key, bytes)| Act::Ready(key, bytes)),
-        6 => pending,
-        3 => (0usize..100).prop_map(Act::Begin),
-        5 => (0usize..100, bytes).prop_map(|(at, bytes)| Act::Finish(at, bytes)),
+        3 => (key(), 0usize..40).prop_map(|(key, bytes)| Act::Ready(key, bytes)),
+        7 => (key(), urgency(), 0usize..40, 0usize..4)
+            .prop_map(|(key, urgency, bytes, keep)| Act::Wait(key, urgency, bytes, keep)),
+        4 => urgency().prop_map(Act::Begin),
+        5 => (0usize..100, 0usize..40).prop_map(|(at, bytes)| Act::Finish(at, bytes)),
         2 => (0usize..100).prop_map(Act::GiveUp),
-        4 => key.clone().prop_map(Act::Pop),
-        1 => (key.clone(), writer, 0usize..4).prop_map(|(key, writer, keep)| Act::KeepNewest(key, writer, keep)),
-        1 => key.prop_map(Act::RemoveKey),
+        4 => key().prop_map(Act::Pop),
     ]
 }
 
@@ -229,69 +274,79 @@ proptest! {
     #[test]
     fn it_does_what_a_list_does(acts in proptest::collection::vec(act(), 1..120), tight: bool) {
         let bounds = if tight {
-            Bounds { items: 8, bytes: 150, items_of_one: 5, bytes_of_one: 80 }
+            Bounds { items: 8, bytes: 150, items_of_one: 5, bytes_of_one: 80, waiting_of_one: 60 }
         } else {
             ROOMY
         };
-        let (mut queue, mut model) = (queue(bounds), Model::default());
-        let mut tickets = Vec::new();
+        let (mut queue, mut model) = (Queue::new(bounds), Model::default());
+        let mut tickets: Vec<Ticket<u8, char>> = Vec::new();
         for (item, act) in (0u32..).zip(acts) {
             // Older tickets than these are tried too: they must do nothing.
-            let chosen = |at: usize, tickets: &[Ticket<u8>]| (!tickets.is_empty()).then(|| tickets[at % tickets.len()]);
+            let chosen = |at: usize, tickets: &[Ticket<u8, char>]| (!tickets.is_empty()).then(|| tickets[at % tickets.len()]);
+            let number = queue.next;
             match act {
                 Act::Ready(key, bytes) => {
-                    let room = model.room(key, bytes, &bounds);
-                    let number = queue.next;
+                    let room = model.room(key, bytes, false, Waiting::default(), &bounds);
                     prop_assert_eq!(queue.push_ready(key, item, bytes), room.map_err(|full| (item, full)));
                     if room.is_ok() {
-                        model.all.push((number, key, '-', bytes, Step::Ready(item)));
+                        let urgency = Urgency::Quick;
+                        model.all.push(Entry { number, key, urgency, bytes, stage: Stage::Ready, item });
                     }
                 }
-                Act::Pending(key, writer, bytes) => {
-                    let room = model.room(key, bytes, &bounds);
-                    let pushed = queue.push_pending(key, writer, bytes);
-                    prop_assert_eq!(pushed.map(|_| ()), room);
-                    if let Ok(ticket) = pushed {
-                        model.all.push((ticket.number, key, writer, bytes, Step::Waits));
+                Act::Wait(key, urgency, bytes, keep) => {
+                    let surplus = model.surplus(key, urgency, keep);
+                    let mut freed = Waiting::default();
+                    surplus.iter().for_each(|entry| freed.add(entry.bytes));
+                    let room = model.room(key, bytes, true, freed, &bounds);
+                    let pushed = queue.push_waiting(key, urgency, item, bytes, keep);
+                    prop_assert_eq!(pushed.refused, room.err().map(|full| (item, full)));
+                    let expected: Vec<u32> = surplus.iter().map(|entry| entry.item).collect();
+                    prop_assert_eq!(pushed.gave_way, if room.is_ok() { expected } else { Vec::new() });
+                    if room.is_ok() {
+                        model.all.retain(|entry| surplus.iter().all(|gone| gone.number != entry.number));
+                        model.all.push(Entry { number, key, urgency, bytes, stage: Stage::Waits, item });
+                    }
+                }
+                Act::Begin(urgency) => {
+                    let begun = queue.begin(urgency).map(|(ticket, item)| (ticket, *item));
+                    let waits = model.sum(|entry| entry.urgency == urgency && entry.stage == Stage::Waits);
+                    prop_assert_eq!(begun.is_some(), waits.items > 0, "whoever waits has a turn");
+                    if let Some((ticket, item)) = begun {
+                        let at = model.at(ticket.number, Stage::Waits).unwrap();
+                        prop_assert_eq!((model.all[at].item, model.all[at].urgency), (item, urgency));
+                        let key = model.all[at].key;
+                        let older = model.all[..at].iter();
+                        let mut older = older.filter(|entry| entry.key == key && entry.urgency == urgency);
+                        prop_assert!(older.all(|entry| entry.stage != Stage::Waits), "the oldest of its line first");
+                        model.all[at].stage = Stage::Begun;
                         tickets.push(ticket);
                     }
                 }
-                Act::Begin(at) => if let Some(ticket) = chosen(at, &tickets) {
-                    let there = model.all.iter().any(|place| place.0 == ticket.number);
-                    prop_assert_eq!(queue.begin(&ticket), there);
-                    if let Some(at) = model.pending(ticket.number) {
-                        model.all[at].4 = Step::Begun;
-                    }
-                },
                 Act::Finish(at, bytes) => if let Some(ticket) = chosen(at, &tickets) {
-                    let at = model.pending(ticket.number);
-                    prop_assert_eq!(queue.finish(&ticket, item, bytes), at.map(|_| ()).ok_or(item));
+                    let at = model.at(ticket.number, Stage::Begun);
+                    prop_assert_eq!(queue.finish(&ticket, bytes), at.is_some());
                     if let Some(at) = at {
-                        (model.all[at].3, model.all[at].4) = (bytes, Step::Ready(item));
+                        (model.all[at].bytes, model.all[at].stage) = (bytes, Stage::Ready);
                     }
                 },
                 Act::GiveUp(at) => if let Some(ticket) = chosen(at, &tickets) {
-                    let at = model.pending(ticket.number);
-                    prop_assert_eq!(queue.give_up(&ticket), at.is_some());
-                    at.map(|at| model.all.remove(at));
+                    let at = model.at(ticket.number, Stage::Begun);
+                    let expected = at.map(|at| model.all.remove(at).item);
+                    prop_assert_eq!(queue.give_up(&ticket), expected);
                 },
                 Act::Pop(key) => prop_assert_eq!(queue.pop_ready(&key), model.pop(key)),
-                Act::KeepNewest(key, writer, keep) => {
-                    prop_assert_eq!(queue.keep_newest(&key, &writer, keep), model.keep_newest(key, writer, keep));
-                }
-                Act::RemoveKey(key) => {
-                    prop_assert_eq!(queue.remove_key(&key), model.held(Some(key)));
-                    model.all.retain(|place| place.1 != key);
-                }
             }
-            prop_assert_eq!(queue.waiting(), model.held(None));
-            for key in 0..3 {
-                prop_assert_eq!(queue.waiting_of(&key), model.held(Some(key)));
-                prop_assert_eq!(queue.is_clear(&key), model.held(Some(key)).items == 0);
-                let queue = queue.queues.get(&key);
-                let waits: usize = queue.map_or(0, |queue| queue.waits.values().map(VecDeque::len).sum());
-                let expected = model.all.iter().filter(|place| place.1 == key && place.4 == Step::Waits).count();
-                prop_assert_eq!(waits, expected, "nothing is left behind");
+            prop_assert_eq!(queue.held(), model.sum(|_| true));
+            for urgency in Urgency::ALL {
+                let waits = |entry: &Entry| entry.urgency == urgency && entry.stage == Stage::Waits;
+                prop_assert_eq!(queue.waits(urgency), model.sum(waits));
+            }
+            for group in 0..3 {
+                prop_assert_eq!(queue.holds(&group), model.sum(|entry| entry.key.0 == group).items > 0);
+                for line in ['a', 'b'] {
+                    let key = (group, line);
+                    prop_assert_eq!(queue.is_clear(&key), model.sum(|entry| entry.key == key).items == 0);
+                }
             }
         }
     }

@@ -2,6 +2,7 @@
 
 mod allocation;
 mod load;
+mod press;
 mod succession;
 
 use std::collections::BTreeMap;
@@ -29,6 +30,8 @@ struct NotingLink {
     gone: Option<FlowId>,
     /// Messages that may wait when more are released; 0 = any number.
     room: u64,
+    /// Flows that know nothing of compression.
+    old: Vec<FlowId>,
 }
 
 impl LaneLink for NotingLink {
@@ -54,6 +57,9 @@ impl LaneLink for NotingLink {
     }
     fn has_room(&self, _to: &FlowId, _class: Priority, _bytes: usize) -> bool {
         self.room == 0 || self.waiting.values().sum::<u64>() < self.room
+    }
+    fn takes_lz4(&self, to: &FlowId) -> bool {
+        !self.old.contains(to)
     }
     fn tell(&mut self, _now: Instant, to: &FlowId, body: Body) -> bool {
         self.told.push((to.clone(), body));

@@ -242,6 +242,51 @@ fn what_is_small_passes_after_an_outage_as_before() {
     assert!(sent > 395e3, "{sent}");
 }
 
+/// On a small limit a thirty-second part of it is less than an IMU and odometry need.
+#[test]
+fn slow_start_does_not_begin_below_what_is_small() {
+    const SMALL: f64 = 150e3;
+    let mut simulator = Simulator::new(1e6, Link::default(), 3);
+    simulator.demand = Demand::Even(SMALL);
+    let now = simulator.instant();
+    simulator.capacity.set_needed(SMALL, now);
+    simulator.capacity.outage(now);
+    assert!((simulator.capacity.bytes_per_s() - START_MARGIN * SMALL).abs() < 1.0);
+    assert_eq!(simulator.capacity.state(), State::SlowStart);
+    simulator.run(1.0);
+    let sent = simulator.mean_sent(0.0, 1.0);
+    assert!(sent > 0.95 * SMALL, "{sent} in the first second");
+    // Where it is known only after the peer is back it rises at once.
+    let now = simulator.instant();
+    simulator.capacity.set_needed(0.0, now);
+    simulator.capacity.outage(now);
+    assert!((simulator.capacity.bytes_per_s() - 1e6 / 32.0).abs() < 1.0);
+    simulator.capacity.set_needed(SMALL, now);
+    assert!((simulator.capacity.bytes_per_s() - START_MARGIN * SMALL).abs() < 1.0);
+    // Never above the limit.
+    simulator.capacity.set_needed(2e6, now);
+    assert!((simulator.capacity.bytes_per_s() - 1e6).abs() < 1.0);
+}
+
+#[test]
+fn what_small_needs_does_not_raise_a_rate_that_is_known() {
+    let link = Link {
+        rate: 250e3,
+        ..Link::default()
+    };
+    let mut simulator = Simulator::new(1e6, link, 3);
+    for _ in 0..600 {
+        simulator.run(0.1);
+        if simulator.capacity.state() == State::Steady {
+            break;
+        }
+    }
+    assert_eq!(simulator.capacity.state(), State::Steady);
+    let (before, now) = (simulator.capacity.bytes_per_s(), simulator.instant());
+    simulator.capacity.set_needed(500e3, now);
+    assert!((simulator.capacity.bytes_per_s() - before).abs() < 1e-6, "{before}");
+}
+
 #[test]
 fn a_longer_route_costs_two_trials_and_no_more() {
     let mut simulator = Simulator::new(LIMIT, Link::default(), 3);

@@ -62,9 +62,9 @@ impl SendClass {
             let parts = std::mem::take(&mut sample.parts);
             // A probe is no message: its size says nothing of the link.
             if !sample.probe {
-                let settled = &mut self.settled[usize::from(is_missing)];
-                settled.0 += 1;
-                settled.1 += u64::from(sample.bytes);
+                let bytes = sample.bytes as usize;
+                let wire_bytes = ctx.packets.map_or(bytes, |packets| packets.wire_bytes(bytes));
+                self.settled[usize::from(is_missing)] += wire_bytes as u64;
             }
             if is_missing && sample.announces.is_some() {
                 self.announce = self.announce.max(sample.announces);
@@ -183,5 +183,79 @@ impl SendClass {
         self.started.clear();
         self.streams.clear();
         self.missing.clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use blaze_domain::Priority;
+
+    use super::*;
+    use crate::link::PacketSize;
+    use crate::link::event::{LaneId, Ledger, LinkCounters, StreamKey, Submit};
+    use crate::link::sender::SendLimits;
+    use crate::link::sim::{Post, flow, frame, writer};
+    use crate::link::wire::SenderId;
+
+    #[test]
+    fn what_arrives_counts_with_the_headers_of_all_its_packets() {
+        let (now, to) = (Instant::now(), flow("fog/b"));
+        let packets = PacketSize {
+            prefix: 8,
+            align: 4,
+            whole: 1_404,
+            whole_header: 72,
+            last_part: 1_396,
+            part: 1_280,
+            part_header: 84,
+        };
+        let (mut ledger, mut counters) = (Ledger::default(), LinkCounters::default());
+        let mut ctx = SendContext {
+            now,
+            send_ns: 1,
+            sender: SenderId::of(&flow("edge/a"), 1),
+            round_trip: Duration::from_millis(10),
+            packets: Some(packets),
+            ledger: &mut ledger,
+            counters: &mut counters,
+        };
+        let limits = SendLimits {
+            queue_bytes: 1 << 20,
+            streams: 8,
+            max_datagram: 60_000,
+        };
+        let mut class = SendClass::new(Priority::Bulk, 1, limits);
+        let submit = Submit {
+            to: &to,
+            class: Priority::Bulk,
+            lane: LaneId(1),
+            stream: StreamKey {
+                topic: 1,
+                writer: writer(1),
+            },
+            frame: frame(Post::large(1, 30_000), 1),
+            arrived: now,
+            reliable: true,
+            lifespan: None,
+            keep_newest: 0,
+        };
+        class.submit(submit, ctx.ledger);
+        let (datagram, _) = class.transmit(&mut ctx).unwrap();
+        let view = FeedbackView {
+            link_epoch: 1,
+            highest_sequence: 1,
+            missing: &[],
+            given_up: &[],
+            received_bytes: datagram.len() as u64,
+            window_bytes: 1 << 20,
+            delivered_message: 1,
+        };
+        assert!(class.feedback(&mut ctx, &view));
+        let wire_bytes = packets.wire_bytes(datagram.len());
+        assert_eq!(class.take_settled(), (wire_bytes as u64, 0));
+        assert!(wire_bytes > datagram.len() + 2_000, "{wire_bytes} bytes of 24 packets");
+        assert_eq!(class.take_settled(), (0, 0));
     }
 }

@@ -53,6 +53,15 @@ fn peers_are_up_after_a_round_trip_and_know_their_clocks() {
 }
 
 #[test]
+fn a_flow_that_is_heard_says_that_it_decompresses() {
+    let mut sim = Sim::new(1, Weather::delay(10), &["edge/a", "fog/b"]);
+    let (a, b) = (sim.id(0), sim.id(1));
+    assert!(!sim.nodes[0].engine.takes_lz4(&b), "it may be of an older version");
+    sim.run_ms(100);
+    assert!(sim.nodes[0].engine.takes_lz4(&b) && sim.nodes[1].engine.takes_lz4(&a));
+}
+
+#[test]
 fn one_side_is_enough_for_discovery() {
     let mut sim = Sim::new(1, Weather::delay(10), &["edge/a", "fog/b", "cloud/c"]);
     sim.nodes[2].alive = false;

@@ -2,6 +2,7 @@
 //! `BLAZE_LINK_SEEDS` says.
 
 mod bounds;
+mod budgets;
 mod delivery;
 mod lives;
 mod order;

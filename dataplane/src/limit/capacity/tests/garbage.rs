@@ -55,6 +55,7 @@ fn garbage_does_no_harm() {
                 2 => now = start.checked_sub(Duration::from_secs(random.below(100))).unwrap(),
                 3..8 => now += Duration::from_millis(random.below(200)),
                 8..11 => capacity.sent(now, usize::try_from(bytes).unwrap_or(usize::MAX)),
+                11 => capacity.set_needed(LIMITS[random.below(LIMITS.len() as u64) as usize], now),
                 _ => {
                     let seen = Seen {
                         delivered_bytes: bytes,
