@@ -209,9 +209,10 @@ pub struct Reckoned {
 impl Reckoned {
     pub(super) fn add(&mut self, layer: &LayerName, bytes: u64) {
         self.all += bytes;
+        let layers = self.by_layer.len();
         match self.by_layer.get_mut(layer) {
             Some(sum) => *sum += bytes,
-            None if self.by_layer.len() < MAX_LAYERS => {
+            None if layers < MAX_LAYERS => {
                 self.by_layer.insert(layer.clone(), bytes);
             }
             None => {}

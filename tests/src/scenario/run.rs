@@ -500,6 +500,7 @@ fn words(stream: &Stream) -> String {
         bytes,
         lifespan,
         payloads,
+        reliable: _,
     } = stream;
     let file = payloads.map(|file| format!(",@{file}")).unwrap_or_default();
     format!("{topic},{reliability},{hz},{bytes},{}{file}", lifespan.as_millis())
