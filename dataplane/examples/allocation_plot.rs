@@ -53,7 +53,11 @@ fn main() {
 fn panel(svg: &mut String, left: f64, sharing: Sharing, title: &str) {
     let x = |mbps: f64| left + MARGIN + (WIDTH - MARGIN - 12.0) * mbps / MOST_MBPS;
     let y = |hz: f64| HEIGHT - 30.0 - (HEIGHT - 60.0) * hz / MOST_HZ;
-    let _ = writeln!(svg, "<text x=\"{}\" y=\"18\" font-weight=\"bold\">{title}</text>", x(0.0));
+    let _ = writeln!(
+        svg,
+        "<text x=\"{}\" y=\"18\" font-weight=\"bold\">{title}</text>",
+        x(0.0)
+    );
     for hz in [0.0, 10.0, 20.0, 30.0, 40.0, 50.0] {
         let _ = writeln!(
             svg,

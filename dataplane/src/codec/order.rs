@@ -249,14 +249,7 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
     /// Keeps a place, behind what its line holds, for something that is yet to be done. `bytes`: what it holds until
     /// then. Of the places of the line and urgency that nobody works on yet only the newest `keep` stay, this one among
     /// them; 0: all of them.
-    pub fn push_waiting(
-        &mut self,
-        key: (G, L),
-        urgency: Urgency,
-        item: T,
-        bytes: usize,
-        keep: usize,
-    ) -> Pushed<T> {
+    pub fn push_waiting(&mut self, key: (G, L), urgency: Urgency, item: T, bytes: usize, keep: usize) -> Pushed<T> {
         let freed = self.surplus(&key, urgency, keep);
         if let Err(full) = self.room(&key.0, bytes, true, freed) {
             return Pushed {

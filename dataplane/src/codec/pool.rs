@@ -149,11 +149,7 @@ impl CodecPool {
     ///
     /// # Errors
     /// That of the spawner; threads that were started end.
-    pub fn start(
-        threads: usize,
-        spawner: Spawner,
-        run: impl Fn(Urgency) + Send + Sync + 'static,
-    ) -> io::Result<Self> {
+    pub fn start(threads: usize, spawner: Spawner, run: impl Fn(Urgency) + Send + Sync + 'static) -> io::Result<Self> {
         let pool = Self {
             shared: Arc::new(Shared {
                 run: Box::new(run),

@@ -11,10 +11,7 @@ fn payloads_go_there_and_back() {
     assert_eq!((compressed.before, compressed.level), (80_000, 9));
     assert!(compressed.after() < 1_000 && compressed.taken > Duration::ZERO && compressed.processor > Duration::ZERO);
     let block = compressed.block.unwrap();
-    assert_eq!(
-        Work::Decompress(80_000).run(&block),
-        Done::Decompressed(payload.into())
-    );
+    assert_eq!(Work::Decompress(80_000).run(&block), Done::Decompressed(payload.into()));
     assert!(matches!(Work::Decompress(80_001).run(&block), Done::Refused(_)));
     let Done::Compressed(few) = Work::Compress(9).run(b"few") else {
         panic!("it was to be tried");

@@ -263,7 +263,9 @@ pub async fn start_with(
 
     let live = shared.live.lock().clone();
     shared.set_bandwidth(now, &live.bandwidth);
-    shared.plane.read(|state| state.core.set_compression(live.compression.clone()));
+    shared
+        .plane
+        .read(|state| state.core.set_compression(live.compression.clone()));
     if shared.inter.is_some() {
         start_pool(&shared.plane, live.pool_threads, &supervisor)?;
     }

@@ -23,9 +23,9 @@ use super::allocation::Reckoned;
 use super::early::Early;
 use super::kept::KeptMessages;
 use super::measure::micros;
-use super::press::{Press, ToLanes};
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use super::places::topic_id;
+use super::press::{Press, ToLanes};
 use super::reading::For;
 use super::stats::Drops;
 use super::succession::Succession;
@@ -339,11 +339,17 @@ impl DataCore {
 
     /// The link has sent the last byte of a message for the first time.
     pub fn lane_sent(&mut self, now: Instant, lane: LaneId, bytes: u64, wait: Duration) {
-        let Some((topic, at)) = self.lanes.get(lane.0 as usize) else { return };
-        let Some(path) = self.topics.get_mut(topic.0 as usize) else { return };
+        let Some((topic, at)) = self.lanes.get(lane.0 as usize) else {
+            return;
+        };
+        let Some(path) = self.topics.get_mut(topic.0 as usize) else {
+            return;
+        };
         // As large as the allocation takes each of them for; one that is larger has just been seen for the first time.
         let reckoned = path.granted.map_or(bytes, |granted| granted.size_bytes.max(bytes));
-        let Some(bridge) = path.bridges.get_mut(*at) else { return };
+        let Some(bridge) = path.bridges.get_mut(*at) else {
+            return;
+        };
         bridge.out_rate.add(now, bytes);
         bridge.stats.latency.record(micros(wait));
         if let Some((layer, _)) = bridge.receiver() {
@@ -418,13 +424,25 @@ impl DataCore {
         self.topics.get_mut(topic.0 as usize)?.bridges.get_mut(bridge)
     }
 
-    pub(super) fn fan_out(&mut self, now: Instant, topic: TopicId, from: Scope, message: &Admitted, link: &mut dyn LaneLink) {
+    pub(super) fn fan_out(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        from: Scope,
+        message: &Admitted,
+        link: &mut dyn LaneLink,
+    ) {
         self.kept.keep(now, topic, from, message);
         let path = &mut self.topics[topic.0 as usize];
         let large = path.is_large(self.config.large_bytes);
         let mut lanes = ToLanes::new();
         let mut offered = false;
-        for (at, bridge) in path.bridges.iter_mut().enumerate().filter(|(_, bridge)| bridge.from == from) {
+        for (at, bridge) in path
+            .bridges
+            .iter_mut()
+            .enumerate()
+            .filter(|(_, bridge)| bridge.from == from)
+        {
             if bridge.takes() && bridge.wants(message) && bridge.is_meant(message.meant) {
                 offered |= bridge.lane_id().is_some();
                 let waiting = bridge.pass(now, message, large, &mut path.gates);

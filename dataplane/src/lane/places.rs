@@ -6,8 +6,8 @@ use std::time::Instant;
 use blaze_domain::{TopicName, WriterId};
 
 use super::core::{DRAIN, DataCore, FORGET, LaneLink, MAX_TOPICS};
-use super::press::ToLanes;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
+use super::press::ToLanes;
 use super::succession::LONGEST_WAIT;
 use super::writer::NewWriter;
 use crate::link::LaneId;

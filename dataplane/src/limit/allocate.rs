@@ -126,7 +126,8 @@ impl Grant {
     /// What a lane of the topic runs at, in Hz.
     #[must_use]
     pub fn lane_hz(&self, lane: &Lane) -> f64 {
-        lane.max_rate_hz.map_or(self.rate_hz, |most| self.rate_hz.min(most.max(0.0)))
+        lane.max_rate_hz
+            .map_or(self.rate_hz, |most| self.rate_hz.min(most.max(0.0)))
     }
 }
 
@@ -148,7 +149,10 @@ impl Demand {
     fn new(at: usize, topic: &Topic<'_>, terms: &Terms) -> Self {
         let advertised_hz = sane(topic.advertised_hz);
         let message_bytes = topic.size_bytes as f64 * terms.overhead;
-        let ask = |lane: &Lane| lane.max_rate_hz.map_or(advertised_hz, |most| sane(most).min(advertised_hz));
+        let ask = |lane: &Lane| {
+            lane.max_rate_hz
+                .map_or(advertised_hz, |most| sane(most).min(advertised_hz))
+        };
         let mut lanes_hz: Vec<f64> = topic.lanes.iter().map(ask).collect();
         lanes_hz.sort_by(f64::total_cmp);
         let by_size = if topic.size_bytes > terms.large_bytes {

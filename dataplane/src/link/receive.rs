@@ -326,7 +326,10 @@ impl Engine {
             round_trip,
         };
         peer.path.feedback(now, &seen);
-        let silent = peer.last_feedback.replace(now).map(|last| now.saturating_duration_since(last));
+        let silent = peer
+            .last_feedback
+            .replace(now)
+            .map(|last| now.saturating_duration_since(last));
         if peer.phase == Phase::Suspect {
             peer.phase = Phase::Up;
             // After a moment the way is the same one; a slow start would cost more than it spares.

@@ -45,10 +45,10 @@ pub use services::{
     AdminSection, CacheSection, ConfigSection, DatabaseSection, LogFormat, LogSection, MonitorSection, WorkerSection,
 };
 
+use crate::MAX_PAYLOAD_BYTES;
 use crate::identity::FlowId;
 use crate::names::{LayerName, NodeName};
 use crate::qos::LayerKind;
-use crate::MAX_PAYLOAD_BYTES;
 use readers::{parsed, path};
 use walk::{Node, Report, Section};
 

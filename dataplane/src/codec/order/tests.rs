@@ -58,7 +58,10 @@ fn what_is_ready_waits_for_what_came_before_in_its_line() {
     assert_eq!(queue.held(), Waiting { items: 3, bytes: 160 });
     assert!(queue.finish(&first, 50));
     assert_eq!(pop_all(&mut queue, key), [2, 33, 4]);
-    assert_eq!((queue.held(), queue.waits(LONG)), (Waiting::default(), Waiting::default()));
+    assert_eq!(
+        (queue.held(), queue.waits(LONG)),
+        (Waiting::default(), Waiting::default())
+    );
 }
 
 #[test]
@@ -230,7 +233,11 @@ impl Model {
     fn surplus(&self, key: Key, urgency: Urgency, keep: usize) -> Vec<Entry> {
         let waits = |entry: &&Entry| entry.key == key && entry.urgency == urgency && entry.stage == Stage::Waits;
         let waiting: Vec<Entry> = self.all.iter().filter(waits).copied().collect();
-        let surplus = if keep == 0 { 0 } else { (waiting.len() + 1).saturating_sub(keep) };
+        let surplus = if keep == 0 {
+            0
+        } else {
+            (waiting.len() + 1).saturating_sub(keep)
+        };
         waiting[..surplus].to_vec()
     }
 

@@ -105,7 +105,11 @@ fn quick_turns_go_first_but_not_always() {
     eventually(|| pool.counters().done == 41);
     let order = gate.begun.lock().clone();
     let long: Vec<usize> = (1..=40).filter(|at| order[*at] == Urgency::Long).collect();
-    assert_eq!(long[..3], [9, 18, 23], "one after eight, and after the last quick one the rest: {order:?}");
+    assert_eq!(
+        long[..3],
+        [9, 18, 23],
+        "one after eight, and after the last quick one the rest: {order:?}"
+    );
 }
 
 /// What came over the link does not wait until large payloads are compressed.

@@ -196,7 +196,8 @@ impl Pair {
 
     fn dropped(&self, reason: DropReason) -> u64 {
         let topic = self.topic;
-        self.robot.read(|state| state.core.path(topic).bridges[0].stats.dropped.get(reason))
+        self.robot
+            .read(|state| state.core.path(topic).bridges[0].stats.dropped.get(reason))
     }
 }
 

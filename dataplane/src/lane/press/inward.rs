@@ -76,7 +76,9 @@ impl DataCore {
         done: Done,
         link: &mut dyn LaneLink,
     ) {
-        let Some(message) = self.press.into.begun(place) else { return };
+        let Some(message) = self.press.into.begun(place) else {
+            return;
+        };
         let frame = match done {
             Done::Decompressed(payload) => message.frame.decompressed(payload).ok(),
             Done::Compressed(_) | Done::Refused(_) | Done::Failed => None,

@@ -21,12 +21,19 @@ fn plain() -> Terms {
 }
 
 fn rates(budget: f64, terms: &Terms, topics: &[Topic<'_>]) -> Vec<f64> {
-    allocate(budget, terms, topics).grants.iter().map(|grant| grant.rate_hz).collect()
+    allocate(budget, terms, topics)
+        .grants
+        .iter()
+        .map(|grant| grant.rate_hz)
+        .collect()
 }
 
 fn assert_near(got: &[f64], wanted: &[f64]) {
     let near = |(a, b): (&f64, &f64)| (a - b).abs() <= 1e-9 * b.abs().max(1.0);
-    assert!(got.len() == wanted.len() && got.iter().zip(wanted).all(near), "{got:?}, not {wanted:?}");
+    assert!(
+        got.len() == wanted.len() && got.iter().zip(wanted).all(near),
+        "{got:?}, not {wanted:?}"
+    );
 }
 
 #[test]
@@ -44,7 +51,10 @@ fn small_topics_come_first_and_images_share_what_remains_by_demand() {
 #[test]
 fn no_topic_takes_more_than_its_share() {
     assert_near(&rates(10e6, &plain(), &[topic("camera", 1_000_000, 30.0)]), &[9.5]);
-    assert_near(&rates(10e6, &plain(), &[topic("scan", 50_000, 1_000.0)]), &[0.0095e6 / 50.0]);
+    assert_near(
+        &rates(10e6, &plain(), &[topic("scan", 50_000, 1_000.0)]),
+        &[0.0095e6 / 50.0],
+    );
 }
 
 #[test]
@@ -68,7 +78,9 @@ fn lanes_are_filled_from_the_slowest() {
     camera.lanes = vec![
         Lane { max_rate_hz: None },
         Lane { max_rate_hz: Some(5.0) },
-        Lane { max_rate_hz: Some(60.0) },
+        Lane {
+            max_rate_hz: Some(60.0),
+        },
     ];
     // 2.5 MB/s are 25 copies a second: 5 for the slow lane, 10 for each of the others.
     let terms = Terms { share: 1.0, ..plain() };
@@ -80,7 +92,11 @@ fn lanes_are_filled_from_the_slowest() {
 
 #[test]
 fn a_stop_signal_is_not_starved_by_a_large_standard_topic() {
-    let topics = [topic("points", 60_000, 100.0), topic("stop", 100, 10.0), topic("b", 60_000, 100.0)];
+    let topics = [
+        topic("points", 60_000, 100.0),
+        topic("stop", 100, 10.0),
+        topic("b", 60_000, 100.0),
+    ];
     let got = allocate(1e6, &plain(), &topics);
     assert!(!got.feasible);
     // The smallest first; b before points, because its name is; β caps each.
@@ -91,7 +107,11 @@ fn a_stop_signal_is_not_starved_by_a_large_standard_topic() {
 
 #[test]
 fn floors_that_exceed_the_budget_are_given_and_reported() {
-    let got = allocate(1e6, &plain(), &[topic("a", 1_000_000, 30.0), topic("b", 1_000_000, 1.0)]);
+    let got = allocate(
+        1e6,
+        &plain(),
+        &[topic("a", 1_000_000, 30.0), topic("b", 1_000_000, 1.0)],
+    );
     assert!(!got.feasible);
     assert_near(&[got.grants[0].rate_hz, got.grants[1].rate_hz], &[2.0, 1.0]);
 }
@@ -121,9 +141,15 @@ fn nothing_is_gained_by_numbers_that_are_none() {
             odd.lanes.push(Lane {
                 max_rate_hz: Some(number),
             });
-            let got = allocate(budget, &terms, &[odd, topic("empty", 0, 10.0), topic("good", 100, 10.0)]);
+            let got = allocate(
+                budget,
+                &terms,
+                &[odd, topic("empty", 0, 10.0), topic("good", 100, 10.0)],
+            );
             assert!(
-                got.grants.iter().all(|grant| grant.rate_hz.is_finite() && grant.rate_hz >= 0.0),
+                got.grants
+                    .iter()
+                    .all(|grant| grant.rate_hz.is_finite() && grant.rate_hz >= 0.0),
                 "{number} {budget}: {got:?}"
             );
         }

@@ -109,7 +109,11 @@ fn the_size_falls_when_the_level_rises_again() {
     let mut next = 0;
     assert_eq!(hands.path().level(), 3);
     stream(&mut hands, &mut next, 10, 25);
-    assert_eq!((hands.path().level(), hands.size()), (1, AT_1), "with frames tried at level 3 in between");
+    assert_eq!(
+        (hands.path().level(), hands.size()),
+        (1, AT_1),
+        "with frames tried at level 3 in between"
+    );
     stream(&mut hands, &mut next, 1, 40);
     assert_eq!((hands.path().level(), hands.size()), (3, AT_3));
 }
@@ -135,7 +139,10 @@ fn only_messages_that_are_worth_it_and_pass_some_lane_are_work_for_the_pool() {
     };
     run(&mut hands);
     let found = rate(&mut hands);
-    assert!((found - 5.0).abs() < 1.0, "{found} of 20 Hz, and as many small messages");
+    assert!(
+        (found - 5.0).abs() < 1.0,
+        "{found} of 20 Hz, and as many small messages"
+    );
     // Two lanes with buckets of their own admit different frames, and each of these is to be compressed.
     let mut faster = lane("fog/f", true);
     faster.lane.max_rate_hz = Some(7.0);

@@ -85,7 +85,9 @@ impl Hands {
             bridges: vec![lane],
             ..TopicPlan::default()
         };
-        core.apply(self.bench.now, topic, TopicInfo::default(), &plan, |_| Err(String::new()));
+        core.apply(self.bench.now, topic, TopicInfo::default(), &plan, |_| {
+            Err(String::new())
+        });
         topic
     }
 
@@ -168,7 +170,13 @@ fn without_a_pool_any_more_what_waits_is_dropped_and_the_rest_goes_as_it_is() {
     assert_eq!(hands.sent(), [], "one is being compressed");
     hands.end(0);
     hands.publish(1, 6, LARGE);
-    let raw: Vec<bool> = hands.bench.link.submitted.iter().map(|(.., frame)| !frame.is_compressed()).collect();
+    let raw: Vec<bool> = hands
+        .bench
+        .link
+        .submitted
+        .iter()
+        .map(|(.., frame)| !frame.is_compressed())
+        .collect();
     assert_eq!(raw, [false, true, true, true]);
     assert_eq!(hands.sent(), [(0, 1, 1), (0, 1, 4), (0, 1, 5), (0, 1, 6)]);
     hands.check();
@@ -217,7 +225,11 @@ fn a_receiver_that_does_not_decompress_gets_what_was_published() {
     let compressed: Vec<bool> = sent.iter().map(|(.., frame)| frame.is_compressed()).collect();
     assert_eq!(compressed, [true, false]);
     assert_eq!(sent[1].2.payload().len(), LARGE);
-    assert_eq!(hands.path().sent_size.largest(), LARGE as u64, "the largest that is sent");
+    assert_eq!(
+        hands.path().sent_size.largest(),
+        LARGE as u64,
+        "the largest that is sent"
+    );
     // Where nobody does nothing is compressed.
     hands.bench.link.old = vec![old("fog/f"), old("cloud/c")];
     hands.publish(1, 2, LARGE);
@@ -229,7 +241,13 @@ fn a_receiver_that_does_not_decompress_gets_what_was_published() {
     hands.begin(Urgency::Long);
     hands.bench.link.old = vec![old("cloud/c")];
     hands.end(0);
-    let compressed: Vec<bool> = hands.bench.link.submitted.iter().map(|(.., frame)| frame.is_compressed()).collect();
+    let compressed: Vec<bool> = hands
+        .bench
+        .link
+        .submitted
+        .iter()
+        .map(|(.., frame)| frame.is_compressed())
+        .collect();
     assert_eq!(compressed, [false, true]);
 }
 

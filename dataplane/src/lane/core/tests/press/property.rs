@@ -98,8 +98,16 @@ impl Hands {
             }
         }
         self.check();
-        let taken: Vec<u64> = self.path().bridges.iter().map(|bridge| bridge.stats.taken.messages).collect();
-        assert!(seen.taken.iter().zip(&taken).all(|(before, now)| before <= now), "a counter goes back");
+        let taken: Vec<u64> = self
+            .path()
+            .bridges
+            .iter()
+            .map(|bridge| bridge.stats.taken.messages)
+            .collect();
+        assert!(
+            seen.taken.iter().zip(&taken).all(|(before, now)| before <= now),
+            "a counter goes back"
+        );
         seen.taken = taken;
     }
 
