@@ -156,7 +156,7 @@ impl DataCore {
             for (frame, lanes) in passed {
                 // From the codec it would come back behind what is held.
                 if passed_on.is_some() {
-                    self.to_lanes(now, topic, lanes, link);
+                    self.put_to_lanes(now, topic, lanes, link);
                 } else {
                     self.press_out(now, topic, &frame, lanes, link);
                 }

@@ -180,7 +180,7 @@ mod tests {
     fn control_goes_into_debt_that_data_waits_off() {
         let start = Instant::now();
         let mut pacer = Pacer::new(1000.0, 100, start);
-        pacer.spend(582, start);
+        pacer.spend(588, start);
         assert_eq!(pacer.wait(start).as_millis(), 600);
         assert!(pacer.wait(start + Duration::from_millis(601)).is_zero());
     }

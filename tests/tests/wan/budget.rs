@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use blaze::demo::recording::{Body, load_built_in};
+use blaze_cli::demo::recording::{Body, load_built_in};
 use blaze_domain::LayerName;
 use blaze_flow::limit::allocate::{Sharing, Terms};
 use blaze_flow::limit::pacer::allocated;

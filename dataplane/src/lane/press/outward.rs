@@ -75,7 +75,7 @@ impl DataCore {
         let bytes = frame.payload().len();
         let level = self.level_for(now, topic, bytes, &lanes, link);
         if level.is_none() && self.press.out.is_clear(&line) {
-            self.to_lanes(now, topic, lanes, link);
+            self.put_to_lanes(now, topic, lanes, link);
             return;
         }
         let path = &mut self.topics[topic.0 as usize];
@@ -217,12 +217,12 @@ impl DataCore {
             for (at, waiting) in &lanes {
                 self.topics[topic.0 as usize].bridges[*at].comes_from_press(waiting.bytes);
             }
-            self.to_lanes(now, topic, lanes, link);
+            self.put_to_lanes(now, topic, lanes, link);
         }
     }
 
     /// To the queues of the lanes. One that has ended meanwhile has nobody to send to.
-    pub(in crate::lane) fn to_lanes(&mut self, now: Instant, topic: TopicId, lanes: ToLanes, link: &mut dyn LaneLink) {
+    pub(in crate::lane) fn put_to_lanes(&mut self, now: Instant, topic: TopicId, lanes: ToLanes, link: &mut dyn LaneLink) {
         for (at, waiting) in lanes {
             let bridge = &mut self.topics[topic.0 as usize].bridges[at];
             if matches!(bridge.phase, Phase::Up { .. } | Phase::Draining { .. }) {
