@@ -9,6 +9,14 @@ use crate::lane::path::{BareInfo, TopicInfo};
 use crate::registry::{LeaseView, Registry, Terms};
 use crate::world::{FlowView, OriginFilter};
 
+/// The largest payload in bytes that any flow announces of a topic. Of which connection a message goes to its broker is decided by
+/// that where it arrives as well: a flow whose own services only ask for it has no other way to know before one has come.
+pub(super) fn announced_bytes(holders: &[(&FlowId, &FlowView)], topic: &TopicName) -> Option<u64> {
+    let entries = holders.iter().filter_map(|(_, view)| view.topics.get(topic));
+    let scopes = entries.flat_map(|entry| [&entry.node, &entry.layer, &entry.outside]);
+    scopes.filter_map(|scope| scope.advertise.as_ref()?.max_bytes).max()
+}
+
 /// What the advertisements of a topic on this flow's own brokers say.
 pub(super) fn local_info(registry: &Registry, topic: &TopicName) -> TopicInfo {
     let all: Vec<LeaseView<'_>> = registry.local_advertisers(topic).collect();

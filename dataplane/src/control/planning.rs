@@ -6,7 +6,7 @@ use std::time::Instant;
 use blaze_domain::TopicName;
 use blaze_domain::control::EventKind;
 
-use super::info::{Sources, durable_sources, local_info};
+use super::info::{Sources, announced_bytes, durable_sources, local_info};
 use super::routes::route_states;
 use super::{ControlCore, LATEST, Output, QUIET, event};
 use crate::plan::{Survey, TopicPlan, plan_within};
@@ -21,6 +21,8 @@ struct Draft {
     plan: TopicPlan,
     /// Who advertises the topic as transient_local.
     durable: Sources,
+    /// The largest payload that any flow announces of it, in bytes.
+    max_bytes: Option<u64>,
     /// Some flow announces something of the topic.
     is_known: bool,
 }
@@ -98,6 +100,7 @@ impl ControlCore {
             Draft {
                 plan: plan_within(&survey, topic, &self.config.rules, self.plans.get(topic)),
                 durable: durable_sources(&holders, topic),
+                max_bytes: announced_bytes(&holders, topic),
                 is_known: holders.iter().any(|(_, flow)| flow.topics.contains_key(topic)),
             }
         };
@@ -109,6 +112,7 @@ impl ControlCore {
         let Draft {
             mut plan,
             durable,
+            max_bytes,
             is_known,
         } = draft;
         if is_known && previous == Some(&plan) && plan.bridges.is_empty() && self.is_idle(topic, &durable.known) {
@@ -130,7 +134,8 @@ impl ControlCore {
         self.forget_writers(now, topic, durable);
         let has_route = !plan.bridges.is_empty();
         let duty = self.duty(now, topic, carried, &plan);
-        let info = Box::new(local_info(&self.registry, topic));
+        let mut info = Box::new(local_info(&self.registry, topic));
+        info.max_bytes = info.max_bytes.max(max_bytes);
         if plan.bridges.is_empty() && !is_known {
             self.plans.remove(topic);
         } else {

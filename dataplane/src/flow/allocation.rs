@@ -24,7 +24,8 @@ impl Shared {
             let (moved, reckoned, capacities) = self.plane.read(|state| {
                 let moved = state.core.look_at_rates(now, window);
                 let capacities = state.engine.as_ref().map(Engine::capacities);
-                (moved, state.core.reckoned().clone(), capacities.unwrap_or_default())
+                let being_sent = state.engine.iter().flat_map(Engine::begun);
+                (moved, state.core.reckoned(being_sent), capacities.unwrap_or_default())
             });
             if moved {
                 limiter.touch();

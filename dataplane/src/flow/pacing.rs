@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use blaze_domain::{LayerName, Priority};
 use parking_lot::Mutex;
 
-use super::plane::Plane;
+use super::plane::{Next, Plane};
 use crate::lane::measure::RateMeter;
 use crate::limit::pacer::{BURST_DATAGRAMS, Pacer};
 use crate::limit::wire_factor::MAX_LAYERS;
@@ -98,7 +98,14 @@ impl Egress {
             let wait = pacer.wait(now);
             // Data waits off a debt. LinkControl does not, where that is long: peers would think this flow dead.
             let transmit = if wait.is_zero() {
-                plane.next_transmit(IDLE)
+                match plane.next_transmit(IDLE) {
+                    Next::Datagram(transmit) => Some(transmit),
+                    Next::HeldBack => None,
+                    Next::Nothing => {
+                        pacer.rest(now);
+                        None
+                    }
+                }
             } else {
                 let control = if wait > LONG_DEBT { plane.next_control() } else { None };
                 if control.is_none() {

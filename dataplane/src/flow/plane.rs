@@ -56,6 +56,17 @@ pub fn wall_ns() -> u64 {
     u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
 }
 
+/// What [`Plane::next_transmit`] has found.
+#[derive(Debug)]
+pub enum Next {
+    /// A datagram to send.
+    Datagram(Transmit),
+    /// Something waits, but the budget of its link does not let it out yet.
+    HeldBack,
+    /// Nothing is to be sent.
+    Nothing,
+}
+
 /// Message path and link, without a lock: what the simulated network drives too.
 pub struct PlaneState {
     /// Topics, bridges, duplicate windows.
@@ -153,6 +164,7 @@ impl PlaneState {
                 LinkEvent::LaneOut {
                     lane, messages, bytes, ..
                 } => self.core.lane_out(lane, messages, bytes as u64),
+                LinkEvent::LaneCut { lane, begun } => self.core.lane_cut(lane, begun),
                 LinkEvent::LaneDropped {
                     lane, reason, messages, ..
                 } => self.core.lane_dropped(lane, reason, messages),
@@ -364,18 +376,21 @@ impl Plane {
     }
 
     /// The next datagram to send, or how long there is nothing to do (at most `idle`). Waits that long.
-    pub fn next_transmit(&self, idle: Duration) -> Option<Transmit> {
+    pub fn next_transmit(&self, idle: Duration) -> Next {
         self.transmit(idle, Engine::poll_transmit)
     }
 
     /// The next datagram that carries no message; for a pacer in debt. Does not wait.
     pub fn next_control(&self) -> Option<Transmit> {
-        self.transmit(Duration::ZERO, Engine::poll_control)
+        match self.transmit(Duration::ZERO, Engine::poll_control) {
+            Next::Datagram(transmit) => Some(transmit),
+            Next::HeldBack | Next::Nothing => None,
+        }
     }
 
-    fn transmit(&self, idle: Duration, next: impl Fn(&mut Engine, Instant) -> Option<Transmit>) -> Option<Transmit> {
+    fn transmit(&self, idle: Duration, next: impl Fn(&mut Engine, Instant) -> Option<Transmit>) -> Next {
         let mut told = false;
-        let (transmit, turns) = {
+        let (next, turns) = {
             let mut state = self.state.lock();
             let now = Instant::now();
             let due = state.run_timers(now);
@@ -386,18 +401,23 @@ impl Plane {
             state.pump(now, &mut tell);
             let transmit = state.engine.as_mut().and_then(|engine| next(engine, now));
             state.pump(now, &mut tell);
+            let paced = state.engine.as_ref().and_then(Engine::paced_until);
             if transmit.is_none() && !told && !idle.is_zero() && !state.core.has_turns() {
-                let paced = state.engine.as_ref().and_then(Engine::paced_until);
                 let until = [due, paced].into_iter().flatten().fold(now + idle, Instant::min);
                 self.work.wait_until(&mut state, until);
             }
-            (transmit, state.core.take_turns())
+            let next = match transmit {
+                Some(transmit) => Next::Datagram(transmit),
+                None if paced.is_some() => Next::HeldBack,
+                None => Next::Nothing,
+            };
+            (next, state.core.take_turns())
         };
         self.hand_out(turns);
         if told {
             self.news_waits.notify_one();
         }
-        transmit
+        next
     }
 
     /// Wakes the pacer.

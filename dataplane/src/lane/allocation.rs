@@ -21,6 +21,7 @@ use crate::limit::allocate::Class;
 use crate::limit::bucket::TokenBucket;
 use crate::limit::rates::{Demand, LaneDemand, Rates};
 use crate::limit::wire_factor::MAX_LAYERS;
+use crate::link::{Begun, LaneId};
 
 /// A measured rate is believed anew when it has moved by this share, and a publisher may be so much faster than it says.
 const MOVED: f64 = 0.1;
@@ -281,6 +282,12 @@ impl TopicPath {
         self.offered.add(now, bytes);
     }
 
+    /// As how many bytes a message counts: as many as the allocation takes each of them for. One that is larger has just been seen for
+    /// the first time.
+    pub(super) fn reckoned_bytes(&self, bytes: u64) -> u64 {
+        self.granted.map_or(bytes, |granted| granted.size_bytes.max(bytes))
+    }
+
     /// `r_adv`: what publishers say, or what was measured where one of them does not say.
     fn advertised(&mut self, now: Instant) -> Told {
         let said = self.info.rate_hz;
@@ -480,10 +487,33 @@ impl DataCore {
         }
     }
 
-    /// What was sent, as the allocation reckons.
+    /// What was sent, as the allocation reckons; of messages that are being sent the share that has left. Without that a single image
+    /// on a slow link would move the wire factor, whose wire bytes are counted as they leave.
     #[must_use]
-    pub fn reckoned(&self) -> &Reckoned {
-        &self.reckoned
+    pub fn reckoned(&self, being_sent: impl Iterator<Item = (LaneId, Begun)>) -> Reckoned {
+        let mut reckoned = self.reckoned.clone();
+        for (lane, begun) in being_sent {
+            if let Some((layer, bytes)) = self.what_left(lane, begun) {
+                reckoned.add(layer, bytes);
+            }
+        }
+        reckoned
+    }
+
+    /// A message is dropped of which some parts have left: they have cost what others do.
+    pub fn lane_cut(&mut self, lane: LaneId, begun: Begun) {
+        if let Some((layer, bytes)) = self.what_left(lane, begun) {
+            let layer = layer.clone();
+            self.reckoned.add(&layer, bytes);
+        }
+    }
+
+    fn what_left(&self, lane: LaneId, begun: Begun) -> Option<(&LayerName, u64)> {
+        let (topic, at) = self.lanes.get(lane.0 as usize)?;
+        let path = self.topics.get(topic.0 as usize)?;
+        let (layer, _) = path.bridges.get(*at)?.receiver()?;
+        let size = path.reckoned_bytes(begun.payload_bytes as u64);
+        Some((layer, size * begun.parts_sent as u64 / begun.parts.max(1) as u64))
     }
 
     /// Some of the topics that leave on the inter scope: those that are looked at next after one of them, or the first ones. The second is the last

@@ -345,8 +345,7 @@ impl DataCore {
         let Some(path) = self.topics.get_mut(topic.0 as usize) else {
             return;
         };
-        // As large as the allocation takes each of them for; one that is larger has just been seen for the first time.
-        let reckoned = path.granted.map_or(bytes, |granted| granted.size_bytes.max(bytes));
+        let reckoned = path.reckoned_bytes(bytes);
         let Some(bridge) = path.bridges.get_mut(*at) else {
             return;
         };

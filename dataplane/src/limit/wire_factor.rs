@@ -38,7 +38,7 @@ pub struct Totals {
     pub user_wire: u64,
     /// Wire bytes of all others.
     pub control_wire: u64,
-    /// `Σ s` of the messages that were sent, each copy counted once.
+    /// `Σ s` of the messages that were sent, each copy counted once, and of those that are being sent the part that has left.
     pub reckoned: u64,
 }
 
@@ -60,15 +60,15 @@ impl WireFactor {
             return;
         };
         let elapsed = now.saturating_duration_since(at).as_secs_f64();
-        let went_back = totals.reckoned < before.reckoned
-            || totals.user_wire < before.user_wire
-            || totals.control_wire < before.control_wire;
+        let went_back = totals.user_wire < before.user_wire || totals.control_wire < before.control_wire;
         if elapsed <= 0.0 || went_back {
             return;
         }
         let keeps = (-elapsed / TAU.as_secs_f64()).exp();
         self.user_wire = self.user_wire * keeps + (totals.user_wire - before.user_wire) as f64;
-        self.reckoned = self.reckoned * keeps + (totals.reckoned - before.reckoned) as f64;
+        // A little less than before where the size of a topic has just become smaller, of which a message is being sent.
+        let reckoned = totals.reckoned as f64 - before.reckoned as f64;
+        self.reckoned = (self.reckoned * keeps + reckoned).max(0.0);
         let control = (totals.control_wire - before.control_wire) as f64 / elapsed;
         self.control = self.control * keeps + control * (1.0 - keeps);
     }

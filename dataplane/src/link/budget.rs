@@ -129,6 +129,21 @@ impl Budgets {
         path.spend(now, wire_bytes);
     }
 
+    /// Nothing is to be sent to a peer; `of_layer`: nor to any other of its layer.
+    pub(crate) fn rest(&mut self, now: Instant, layer: &LayerName, path: &mut PathBudget, of_layer: bool) {
+        if of_layer && let Some(pacer) = self.layers.get_mut(layer) {
+            pacer.rest(now);
+        }
+        if let Some(follow) = &mut path.follow {
+            follow.pacer.rest(now);
+        }
+    }
+
+    /// Whether the links to a layer have a limit of their own.
+    pub(crate) fn has_limit(&self, layer: &LayerName) -> bool {
+        self.layers.contains_key(layer)
+    }
+
     /// Makes a peer's budget as it is set now.
     pub(crate) fn fit(&self, now: Instant, layer: &LayerName, max_datagram: usize, path: &mut PathBudget) {
         let adaptive = self.set.as_ref().filter(|set| set.adaptive);
@@ -327,6 +342,7 @@ mod tests {
             assert_eq!(burst(&mut link, start + SECOND, &cloud, &mut path), 1);
             link.set(start + SECOND, budgets(1e6, layers, adaptive, PACKETS), 1_296);
             link.fit(start + SECOND, &cloud, 1_296, &mut path);
+            link.rest(start + SECOND, &cloud, &mut path, true);
             assert_eq!(
                 burst(&mut link, start + SECOND * 2, &cloud, &mut path),
                 3,

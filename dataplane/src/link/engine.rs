@@ -22,7 +22,7 @@ use prost::Message as _;
 use super::addresses::Addresses;
 use super::budget::{Budgets, LinkBudgets, LinkCapacity};
 use super::clock::Clocks;
-use super::event::{LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit};
+use super::event::{Begun, LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit};
 use super::lifecycle::Missed;
 use super::peer::{FORGET_AFTER, HELLO_EVERY, MAX_CONTROLS, Peer, Phase};
 use super::sender::SendClass;
@@ -237,6 +237,12 @@ impl Engine {
             .collect()
     }
 
+    /// Messages of which some parts have left and others have not: at most one of each class and peer.
+    pub fn begun(&self) -> impl Iterator<Item = (LaneId, Begun)> {
+        let classes = self.peers.iter().flatten().flat_map(|peer| &peer.send);
+        classes.filter_map(SendClass::begun)
+    }
+
     /// When a peer may be sent to for which [`Engine::poll_transmit`] has something and its link no budget.
     #[must_use]
     pub fn paced_until(&self) -> Option<Instant> {
@@ -287,8 +293,29 @@ impl Engine {
         if submit.lifespan.is_some_and(|lifespan| age >= lifespan) {
             return Err(DropReason::Lifespan);
         }
-        peer.send[class_index(submit.class)].submit(submit, &mut self.ledger);
+        if !peer.has_work() {
+            self.note_rest(now, to.at);
+        }
+        if let Some(peer) = &mut self.peers[to.at] {
+            peer.send[class_index(submit.class)].submit(submit, &mut self.ledger);
+        }
         Ok(())
+    }
+
+    /// Nothing was to be sent to a peer until now.
+    fn note_rest(&mut self, now: Instant, at: usize) {
+        let Some(layer) = self.peers[at].as_ref().map(|peer| &peer.endpoint.flow.layer) else {
+            return;
+        };
+        let mut of_layer = self
+            .peers
+            .iter()
+            .flatten()
+            .filter(|peer| peer.endpoint.flow.layer == *layer);
+        let rests = self.budgets.has_limit(layer) && !of_layer.any(Peer::has_work);
+        if let Some(peer) = &mut self.peers[at] {
+            self.budgets.rest(now, &peer.endpoint.flow.layer, &mut peer.path, rests);
+        }
     }
 
     /// Queues a Delta, SnapshotRequest or Snapshot for a peer.

@@ -194,6 +194,13 @@ pub enum LinkEvent {
         /// Since it arrived at this flow.
         wait: Duration,
     },
+    /// A message is about to be dropped of which some parts have left and others have not.
+    LaneCut {
+        /// Its lane.
+        lane: LaneId,
+        /// What has left.
+        begun: Begun,
+    },
     /// A message was dropped.
     LaneDropped {
         /// Its lane.
@@ -214,6 +221,17 @@ pub enum LinkEvent {
         /// Messages.
         messages: u64,
     },
+}
+
+/// A message that is being sent: not all of its parts have left.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Begun {
+    /// Bytes of its payload.
+    pub payload_bytes: usize,
+    /// Parts that have left.
+    pub parts_sent: usize,
+    /// All of its parts; 1 or more.
+    pub parts: usize,
 }
 
 /// Messages and their bytes.
@@ -270,6 +288,10 @@ impl Ledger {
             bytes,
             wait,
         });
+    }
+
+    pub(crate) fn cut(&mut self, lane: LaneId, begun: Begun) {
+        self.events.push_back(LinkEvent::LaneCut { lane, begun });
     }
 
     pub(crate) fn dropped(&mut self, lane: LaneId, bytes: usize, reason: DropReason) {

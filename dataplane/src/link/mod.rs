@@ -41,5 +41,7 @@ mod tests;
 
 pub use budget::{LinkBudgets, LinkCapacity, PacketSize};
 pub use engine::{Engine, EngineConfig, Limits, MAX_PEERS, MIN_DATAGRAM_BYTES, PeerIndex};
-pub use event::{DownReason, LaneId, LinkCounters, LinkEvent, PeerInfo, PeerState, StreamKey, Submit, Tally, Transmit};
+pub use event::{
+    Begun, DownReason, LaneId, LinkCounters, LinkEvent, PeerInfo, PeerState, StreamKey, Submit, Tally, Transmit,
+};
 pub use wire::{HEADER_BYTES, RECORD_BYTES};

@@ -6,7 +6,7 @@ use blaze_proto::Frame;
 use smallvec::{SmallVec, smallvec};
 
 use super::clock::microseconds;
-use super::event::{LaneId, StreamKey, Submit};
+use super::event::{Begun, LaneId, StreamKey, Submit};
 use super::wire::Record;
 
 /// Where each part of a message is.
@@ -82,6 +82,16 @@ impl Outgoing {
 
     pub(crate) fn is_sent(&self) -> bool {
         self.next_part >= self.parts.len()
+    }
+
+    /// What has left, if that is neither nothing nor all.
+    pub(crate) fn begun(&self) -> Option<Begun> {
+        let parts = self.parts.len();
+        (1..parts).contains(&self.next_part).then(|| Begun {
+            payload_bytes: self.payload_bytes(),
+            parts_sent: self.next_part,
+            parts,
+        })
     }
 
     pub(crate) fn is_expired(&self, now: Instant) -> bool {

@@ -73,6 +73,11 @@ pub(crate) struct Peer {
 }
 
 impl Peer {
+    /// Whether messages wait to be sent, credit or not.
+    pub(crate) fn has_work(&self) -> bool {
+        self.send.iter().any(SendClass::has_work)
+    }
+
     pub(crate) fn new(
         now: Instant,
         endpoint: Endpoint,

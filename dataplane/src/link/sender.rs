@@ -21,7 +21,7 @@ use smallvec::SmallVec;
 
 use super::budget::PacketSize;
 use super::clock::{LossMeter, RateMeter};
-use super::event::{LaneId, Ledger, LinkCounters, StreamKey, Submit, Tally};
+use super::event::{Begun, LaneId, Ledger, LinkCounters, StreamKey, Submit, Tally};
 use super::outgoing::{Key, Messages, Outgoing, Part, PartRef};
 use super::wire::{DatagramBuilder, FLAG_REPAIR, HEADER_BYTES, LinkHeader, RECORD_BYTES, SenderId};
 
@@ -199,6 +199,12 @@ impl SendClass {
         (received, lost)
     }
 
+    /// What has left of the message that is being sent.
+    pub(crate) fn begun(&self) -> Option<(LaneId, Begun)> {
+        let message = self.messages.get(self.current?)?;
+        Some((message.lane, message.begun()?))
+    }
+
     /// Bytes that wait or may have to be repaired.
     pub(crate) fn queue_bytes(&self) -> usize {
         self.waiting_bytes + self.started_bytes
@@ -251,7 +257,7 @@ impl SendClass {
     /// Takes a message away and counts it. A started one leaves its place in the order to the one before it.
     fn drop_message(&mut self, key: Key, reason: DropReason, ledger: &mut Ledger) {
         if let Some(message) = self.take(key) {
-            ledger.dropped(message.lane, message.payload_bytes(), reason);
+            count_dropped(&message, reason, ledger);
             if message.is_started() {
                 let newest = self.streams.peek(&message.stream).copied();
                 if newest == Some(message.number) {
@@ -290,7 +296,7 @@ impl SendClass {
     /// Drops everything and begins a new link epoch, as when the peer went down.
     pub(crate) fn restart(&mut self, link_epoch: u32, reason: DropReason, ledger: &mut Ledger) {
         for message in self.messages.iter() {
-            ledger.dropped(message.lane, message.payload_bytes(), reason);
+            count_dropped(message, reason, ledger);
         }
         let untold = self.announce.is_some() || self.highest_reported < self.last_user_sequence;
         let used = self.next_number > 1 || untold;
@@ -520,4 +526,11 @@ impl SendClass {
             self.streams.pop_lru();
         }
     }
+}
+
+fn count_dropped(message: &Outgoing, reason: DropReason, ledger: &mut Ledger) {
+    if let Some(begun) = message.begun() {
+        ledger.cut(message.lane, begun);
+    }
+    ledger.dropped(message.lane, message.payload_bytes(), reason);
 }

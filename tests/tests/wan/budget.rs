@@ -181,6 +181,11 @@ const SMALL: f64 = 0.999;
 const LOOK: Duration = Duration::from_millis(50);
 
 fn scenario(row: &Row, shape: Shape) -> anyhow::Result<Scenario> {
+    scenario_on(row, shape, BrokerKind::Kafka)
+}
+
+/// With this broker in the cloud.
+fn scenario_on(row: &Row, shape: Shape, cloud: BrokerKind) -> anyhow::Result<Scenario> {
     let edge = Flow {
         limit_mbps: row.limit_mbps,
         bandwidth: match row.sharing {
@@ -199,17 +204,17 @@ fn scenario(row: &Row, shape: Shape) -> anyhow::Result<Scenario> {
             .with_link("robot-1", "cloud-1", shape),
         brokers: vec![
             broker("redis", "robot-1", BrokerKind::Redis),
-            broker("kafka", "cloud-1", BrokerKind::Kafka),
+            broker("cloud-broker", "cloud-1", cloud),
         ],
-        flows: vec![edge, flow("cloud", "cloud-1", "kafka", None, &[])],
+        flows: vec![edge, flow("cloud", "cloud-1", "cloud-broker", None, &[])],
         publishers: vec![
             publishes("driver", small()),
             publishes("front", vec![cameras[0].clone()]),
             publishes("rear", vec![cameras[1].clone()]),
         ],
         consumers: vec![
-            service("recorder", "cloud-1", "kafka", small()),
-            service("viewer", "cloud-1", "kafka", cameras),
+            service("recorder", "cloud-1", "cloud-broker", small()),
+            service("viewer", "cloud-1", "cloud-broker", cameras),
         ],
         faults: vec![],
         duration: Duration::ZERO,
@@ -363,6 +368,14 @@ fn play(row: &Row) -> anyhow::Result<()> {
         row.reported || seen.mean >= budget * USED,
         format!("only {:.0} of {budget:.0} bytes a second", seen.mean),
     );
+    let told = allocation["wire_factor"].as_f64().unwrap_or_default() * allocated(budget) / budget;
+    expect(
+        (told / seen.wire_factor - 1.0).abs() <= IMAGE_RATE,
+        format!(
+            "the flow takes {told:.4} for what the wire says is {:.4}",
+            seen.wire_factor
+        ),
+    );
     // What the reserve leaves is what is given out; all of the limit is shown beside it.
     let expected = reckoned(row, allocated(budget), seen.wire_factor, &allocation)?;
     let of_all = reckoned(row, budget, seen.wire_factor, &allocation)?;
@@ -471,7 +484,7 @@ fn the_limit_changes_while_the_flow_runs() -> anyhow::Result<()> {
     let limits = if long() {
         [160.0, 40.0, 160.0]
     } else {
-        [40.0, 20.0, 40.0]
+        [80.0, 40.0, 80.0]
     };
     let of = |limit_mbps| Row { limit_mbps, ..FULL };
     let wide = Shape {
@@ -485,10 +498,10 @@ fn the_limit_changes_while_the_flow_runs() -> anyhow::Result<()> {
     let since = running.now();
     for limit in &limits[1..] {
         let row = of(*limit);
-        // The same traffic costs the same before and after.
-        let wire_factor = look(&row, &running, measured() / 2)?.wire_factor;
+        // The same traffic costs the same before and after; that this is what the wire says, the rows show.
         let before = allocation(&running)?;
-        let expected = reckoned(&row, allocated(row.budget()), wire_factor, &before)?;
+        let wire_factor = before["wire_factor"].as_f64().context("it has measured")?;
+        let expected = reckoned(&row, row.budget(), wire_factor, &before)?;
         let begun = Instant::now();
         running.edit("robot-1", |spec| spec.limit_mbps = *limit)?;
         let mut seen = Value::Null;
@@ -630,7 +643,8 @@ fn small_messages_do_not_wait_behind_images() -> anyhow::Result<()> {
     let chunk = Duration::from_secs_f64(f64::from(steady.mtu) * 8.0 / (NARROW.link_mbit as f64 * 1e6));
     let mut p99 = Vec::new();
     for cameras in [false, true] {
-        let mut scenario = scenario(&NARROW, steady)?;
+        // What Kafka does to small messages while it takes images, and on the cores that it shares with the flows, is not the link's.
+        let mut scenario = scenario_on(&NARROW, steady, BrokerKind::Redis)?;
         if !cameras {
             scenario.publishers.truncate(1);
             scenario.consumers.truncate(1);

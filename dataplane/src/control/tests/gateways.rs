@@ -381,3 +381,29 @@ fn whoever_comes_is_ready_when_it_is_a_gateway_and_not_before() {
         assert_eq!((bench.core.state(), bench.own()), (FlowState::Ready, expected));
     }
 }
+
+/// Images come over the link for a service here. That they are large decides of the connection on which they are written, and its own
+/// services say nothing of it.
+#[test]
+fn how_large_a_topic_is_that_only_others_publish_is_known_before_it_comes() {
+    let mut bench = alone();
+    bench.wait(2_000);
+    bench.send(Scope::Layer, &lease("request", TOPIC));
+    bench.robot_says(
+        1,
+        Entry {
+            topic: TOPIC.into(),
+            node_advertise: Some(Advertise {
+                max_bytes: 921_600,
+                ..Advertise::default()
+            }),
+            ..Entry::default()
+        },
+    );
+    bench.wait(2_000);
+    let told = bench.outputs.iter().rev().find_map(|output| match output {
+        Output::Plan { topic, info, .. } if topic.as_str() == TOPIC => Some(info.max_bytes),
+        _ => None,
+    });
+    assert_eq!(told, Some(Some(921_600)));
+}

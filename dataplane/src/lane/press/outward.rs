@@ -222,7 +222,13 @@ impl DataCore {
     }
 
     /// To the queues of the lanes. One that has ended meanwhile has nobody to send to.
-    pub(in crate::lane) fn put_to_lanes(&mut self, now: Instant, topic: TopicId, lanes: ToLanes, link: &mut dyn LaneLink) {
+    pub(in crate::lane) fn put_to_lanes(
+        &mut self,
+        now: Instant,
+        topic: TopicId,
+        lanes: ToLanes,
+        link: &mut dyn LaneLink,
+    ) {
         for (at, waiting) in lanes {
             let bridge = &mut self.topics[topic.0 as usize].bridges[at];
             if matches!(bridge.phase, Phase::Up { .. } | Phase::Draining { .. }) {

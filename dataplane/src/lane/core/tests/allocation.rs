@@ -4,6 +4,7 @@ use blaze_domain::node_file::{BandwidthSection, WireOverhead};
 
 use super::*;
 use crate::limit::limiter::Limiter;
+use crate::link::Begun;
 
 const MILLISECOND: Duration = Duration::from_millis(1);
 
@@ -215,7 +216,7 @@ fn each_message_is_reckoned_as_the_largest() {
         limited.bench.now += MILLISECOND * 100;
     }
     let cloud: LayerName = "cloud".parse().unwrap();
-    let reckoned = limited.bench.core.reckoned().clone();
+    let reckoned = limited.bench.core.reckoned(std::iter::empty());
     assert_eq!((reckoned.all, reckoned.by_layer[&cloud]), (10_000_000, 10_000_000));
     // A lane that is forgotten takes nothing of it along.
     limited.bench.apply(Vec::new(), TopicInfo::default());
@@ -224,7 +225,32 @@ fn each_message_is_reckoned_as_the_largest() {
     limited.bench.now += FORGET;
     limited.bench.core.forget_unused(limited.bench.now);
     limited.bench.core.forget_unused(limited.bench.now + FORGET);
-    assert_eq!(*limited.bench.core.reckoned(), reckoned);
+    assert_eq!(limited.bench.core.reckoned(std::iter::empty()), reckoned);
+}
+
+/// An image takes seconds on a slow link: what of it has left counts, or the wire factor would jump with each.
+#[test]
+fn a_message_that_is_being_sent_is_reckoned_by_what_has_left() {
+    let mut limited = Limited::new(1e9, lane_spec(), Some(10.0));
+    limited.post(Scope::Node, 0, 100_000);
+    let (lane, ..) = limited.bench.link.submitted[0];
+    let of = |parts_sent| {
+        let begun = Begun {
+            payload_bytes: 40_000,
+            parts_sent,
+            parts: 50,
+        };
+        limited.bench.core.reckoned(std::iter::once((lane, begun))).all
+    };
+    assert_eq!((of(0), of(10), of(50)), (100_000, 120_000, 200_000));
+    // And if the rest of it is dropped that does not come back.
+    let begun = Begun {
+        payload_bytes: 40_000,
+        parts_sent: 10,
+        parts: 50,
+    };
+    limited.bench.core.lane_cut(lane, begun);
+    assert_eq!(limited.bench.core.reckoned(std::iter::empty()).all, 120_000);
 }
 
 /// Five seconds hold five messages of it or six, which is a tenth more than 1.09 Hz.
