@@ -23,6 +23,10 @@ use crate::plan::{Bridge, Target};
 /// Replaced writers of a bridge that may still have something to deliver.
 const MAX_PAST: usize = 4;
 
+/// Time that large messages of a best-effort topic may wait, as long as they do so in turn: two images at 16 Hz. Slower topics, whose
+/// images take longer than that, keep no more than the newest.
+const SLACK: Duration = Duration::from_millis(125);
+
 impl BridgeState {
     pub(super) fn new(now: Instant, planned: &Bridge, sink: Sink) -> Self {
         Self {
@@ -290,12 +294,13 @@ impl BridgeState {
         }
     }
 
-    /// So many large messages of a writer wait at most; 0: only bytes count.
+    /// So many large messages of a writer wait at most; 0: only bytes count. Of a fast topic these are as many as leave within [`SLACK`]:
+    /// what is admitted comes as unevenly as it is published, and each that gives way while the link has room for it is missing.
     pub(super) fn keep_newest(&self) -> usize {
         if self.lane.reliable {
-            0
-        } else {
-            self.lane.depth.max(1) as usize
+            return 0;
         }
+        let within_slack = (self.allocated_hz.unwrap_or(0.0) * SLACK.as_secs_f64()) as usize;
+        within_slack.max(self.lane.depth as usize).max(1)
     }
 }

@@ -36,6 +36,12 @@ pub struct Route {
 }
 
 impl Route {
+    /// Missing between the first received and the last received: while publishers go on, what came after that may be on its way.
+    #[must_use]
+    pub fn gaps(&self) -> u64 {
+        self.lost.saturating_sub(self.sent.saturating_sub(self.last))
+    }
+
     /// The latency in ms that a share (0 to 1) of the messages does not exceed; `None` without any.
     #[must_use]
     pub fn latency_ms(&self, share: f64) -> Option<f64> {

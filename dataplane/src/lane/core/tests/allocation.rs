@@ -491,3 +491,24 @@ fn facts_are_taken_a_few_topics_at_a_time() {
     }
     assert_eq!(names, ["imu/data", "a", "b", "c", "d"]);
 }
+
+/// Images are admitted as unevenly as they come. Of a fast topic one more may wait for that; of a slow one an older image is of no use.
+#[test]
+fn of_a_fast_topic_more_than_one_image_may_wait() {
+    let lane = || crate::plan::LaneSpec {
+        reliable: false,
+        depth: 1,
+        ..lane_spec()
+    };
+    for (bytes_per_s, waiting) in [(1_000_000.0, 1), (2_500_000.0, 2)] {
+        let mut limited = Limited::new(bytes_per_s, lane(), Some(30.0));
+        limited.publish(30, 100_000, 2);
+        let path = limited.path();
+        assert_eq!(
+            path.bridges[0].keep_newest(),
+            waiting,
+            "{:?}",
+            path.bridges[0].allocated_hz
+        );
+    }
+}
