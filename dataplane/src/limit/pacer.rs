@@ -163,7 +163,7 @@ mod tests {
         assert!(total as f64 > 0.999 * 10.0 * paced(LIMIT), "{total} bytes in 10 s");
         assert!(most <= 1_000_000, "{most} bytes in a second");
         // Not what was missed for longer.
-        let (total, _) = sent_by_a_thread_that_wakes_late(LATE * 5);
+        let (total, _) = sent_by_a_thread_that_wakes_late(LATE * 10);
         assert!((total as f64) < 0.4 * 10.0 * LIMIT, "{total} bytes in 10 s");
     }
 
@@ -185,7 +185,7 @@ mod tests {
         assert_eq!(leaves_at_once(&mut pacer, later + Duration::from_secs(1)), 3);
         assert_eq!(
             leaves_at_once(&mut pacer, later + Duration::from_secs(2)),
-            5,
+            4,
             "it did not rest"
         );
     }
@@ -251,7 +251,7 @@ mod tests {
         let start = Instant::now();
         let mut pacer = Pacer::new(1000.0, 100, start);
         pacer.spend(588, start);
-        assert_eq!(pacer.wait(start).as_millis(), 600);
+        assert_eq!(pacer.wait(start).as_millis(), 593);
         assert!(pacer.wait(start + Duration::from_millis(601)).is_zero());
     }
 }

@@ -500,7 +500,7 @@ fn of_a_fast_topic_more_than_one_image_may_wait() {
         depth: 1,
         ..lane_spec()
     };
-    for (bytes_per_s, waiting) in [(1_000_000.0, 1), (2_500_000.0, 2)] {
+    for (bytes_per_s, waiting) in [(1_000_000.0, 1), (2_500_000.0, 3)] {
         let mut limited = Limited::new(bytes_per_s, lane(), Some(30.0));
         limited.publish(30, 100_000, 2);
         let path = limited.path();
