@@ -214,6 +214,8 @@ const WAITS: &str = "the node file has changes that need a restart";
 fn needs_restart(started: &NodeFile, file: &NodeFile) -> bool {
     let mut same = started.clone();
     same.flow.bandwidth = file.flow.bandwidth.clone();
+    same.flow.compression = file.flow.compression;
+    same.flow.pool_threads = file.flow.pool_threads;
     same.flow.topics.clone_from(&file.flow.topics);
     same.flow.access.clone_from(&file.flow.access);
     same.log.level.clone_from(&file.log.level);
@@ -274,7 +276,9 @@ mod tests {
     #[test]
     fn only_what_changes_while_it_runs_needs_no_restart() {
         let started = file(json!({}));
-        let live = json!({"flow": {"bandwidth": {"limit_mbps": 7}}, "log": {"level": "debug"}});
+        let live = json!({
+            "flow": {"bandwidth": {"limit_mbps": 7}, "compression": {"level": 1}, "pool_threads": 1}, "log": {"level": "debug"},
+        });
         assert!(!needs_restart(&started, &file(live)));
         for other in [
             json!({"admin": {"flow": "127.0.0.1:9999"}}),

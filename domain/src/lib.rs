@@ -18,5 +18,8 @@ pub use reasons::{DropReason, WhyCode};
 /// Largest payload of one message, in bytes (16 MiB).
 pub const MAX_PAYLOAD_BYTES: usize = 16 * 1024 * 1024;
 
+/// Highest rate of a topic, in Hz. Above it nothing is measured or planned.
+pub const MAX_RATE_HZ: f64 = 1_000_000.0;
+
 /// Largest encoded message header, in bytes.
 pub const MAX_HEADER_BYTES: usize = 4096;

@@ -104,7 +104,10 @@ pub(super) async fn run(options: &TopOptions, format: Format) -> Result<Exit, Cl
     let flow = &options.target.flow;
     let mut looks = 0;
     loop {
-        let value = get_json(flow, "/v1/allocation").await?;
+        let value = tokio::select! {
+            value = get_json(flow, "/v1/allocation") => value?,
+            _ = tokio::signal::ctrl_c() => return Ok(Exit::Done),
+        };
         let text = match format {
             Format::Json => value.to_string(),
             Format::Table | Format::Yaml => {
@@ -175,7 +178,11 @@ fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String
         ));
     }
     for link in &answer.links {
-        let limit = link.limit_bytes_per_s.unwrap_or(answer.budget_bytes_per_s);
+        // Its own, or that of all links where that is less.
+        let limit = link
+            .limit_bytes_per_s
+            .unwrap_or(f64::INFINITY)
+            .min(answer.budget_bytes_per_s);
         let measured = link
             .measured_bytes_per_s
             .map(|measured| format!(", measured {}/s", bytes(measured)))

@@ -248,9 +248,9 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
 
     /// Keeps a place, behind what its line holds, for something that is yet to be done. `bytes`: what it holds until
     /// then. Of the places of the line and urgency that nobody works on yet only the newest `keep` stay, this one among
-    /// them; 0: all of them.
+    /// them, and fewer where the group has no room for its bytes otherwise; 0: all of them.
     pub fn push_waiting(&mut self, key: (G, L), urgency: Urgency, item: T, bytes: usize, keep: usize) -> Pushed<T> {
-        let freed = self.surplus(&key, urgency, keep);
+        let freed = self.surplus(&key, urgency, bytes, keep);
         if let Err(full) = self.room(&key.0, bytes, true, freed) {
             return Pushed {
                 gave_way: Vec::new(),
@@ -271,14 +271,28 @@ impl<G: Copy + Eq + Hash, L: Copy + Eq + Hash, T> InOrder<G, L, T> {
     }
 
     /// What has to give way if one more comes and only `keep` may stay.
-    fn surplus(&self, (group, line): &(G, L), urgency: Urgency, keep: usize) -> Waiting {
+    fn surplus(&self, (group, line): &(G, L), urgency: Urgency, bytes: usize, keep: usize) -> Waiting {
         let mut surplus = Waiting::default();
-        let line = self.groups.get(group).and_then(|group| group.lines.get(line));
-        let Some(line) = line.filter(|_| keep > 0) else {
+        let group = self.groups.get(group).filter(|_| keep > 0);
+        let Some((group, line)) = group.and_then(|group| Some((group, group.lines.get(line)?))) else {
             return surplus;
         };
         let waits = &line.waits[urgency as usize];
-        for number in waits.iter().take((waits.len() + 1).saturating_sub(keep)) {
+        let Bounds {
+            items_of_one,
+            waiting_of_one,
+            ..
+        } = self.bounds;
+        for (at, number) in waits.iter().enumerate() {
+            let too_many = waits.len() - at + 1 > keep;
+            if !too_many
+                && group
+                    .waits
+                    .without(surplus)
+                    .has_room(bytes, items_of_one, waiting_of_one)
+            {
+                break;
+            }
             surplus.add(line.places.get(number).map_or(0, |place| place.bytes));
         }
         surplus

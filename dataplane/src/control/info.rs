@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use blaze_domain::control::DEFAULT_ENCODING;
-use blaze_domain::{Durability, FlowId, Reliability, Scope, TopicName};
+use blaze_domain::{Durability, FlowId, MAX_PAYLOAD_BYTES, Reliability, Scope, TopicName};
 
 use crate::lane::path::{BareInfo, TopicInfo};
 use crate::registry::{LeaseView, Registry, Terms};
@@ -14,7 +14,8 @@ use crate::world::{FlowView, OriginFilter};
 pub(super) fn announced_bytes(holders: &[(&FlowId, &FlowView)], topic: &TopicName) -> Option<u64> {
     let entries = holders.iter().filter_map(|(_, view)| view.topics.get(topic));
     let scopes = entries.flat_map(|entry| [&entry.node, &entry.layer, &entry.outside]);
-    scopes.filter_map(|scope| scope.advertise.as_ref()?.max_bytes).max()
+    let largest = scopes.filter_map(|scope| scope.advertise.as_ref()?.max_bytes).max();
+    largest.map(|bytes| bytes.min(MAX_PAYLOAD_BYTES as u64))
 }
 
 /// What the advertisements of a topic on this flow's own brokers say.

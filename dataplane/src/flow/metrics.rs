@@ -287,6 +287,7 @@ impl Page {
         let granted = path.granted.map(|granted| granted.advertised_hz);
         let advertised = granted.or(path.info.rate_hz).unwrap_or(measured);
         let mut receivers = Vec::new();
+        let mut local = Vec::new();
         for bridge in &mut path.bridges {
             let to = bridge.to_label();
             let from = bridge.from.as_str();
@@ -324,9 +325,13 @@ impl Page {
             // What goes to one flow is one lane, on whatever scope it was published.
             let counts = match bridge.receiver() {
                 Some((_, receiver)) => matches!(bridge.phase, Phase::Up { .. }) && !receivers.contains(receiver),
-                None => bridge.from != Scope::Inter,
+                // Nor does it count twice what several bridges write to one broker.
+                None => bridge.from != Scope::Inter && !local.contains(&to),
             };
             if counts {
+                if bridge.receiver().is_none() {
+                    local.push(to.clone());
+                }
                 receivers.extend(bridge.receiver().map(|(_, receiver)| receiver.clone()));
                 rate("advertised").add(advertised);
                 if let Some(allocated) = bridge.allocated_hz {

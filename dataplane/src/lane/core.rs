@@ -25,7 +25,7 @@ use super::kept::KeptMessages;
 use super::measure::micros;
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicPath};
 use super::places::topic_id;
-use super::press::{Press, ToLanes};
+use super::press::{Arrival, Press, ToLanes};
 use super::reading::For;
 use super::stats::Drops;
 use super::succession::Succession;
@@ -457,7 +457,7 @@ impl DataCore {
             self.note_size(now, topic, bytes, link);
         }
         if !lanes.is_empty() {
-            self.press_out(now, topic, &message.frame, lanes, link);
+            self.press_out(now, topic, &message.frame, lanes, Arrival::Live, link);
         }
     }
 }

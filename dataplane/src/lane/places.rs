@@ -7,7 +7,7 @@ use blaze_domain::{TopicName, WriterId};
 
 use super::core::{DRAIN, DataCore, FORGET, LaneLink, MAX_TOPICS};
 use super::path::{BridgeState, Phase, Sink, TopicId, TopicInfo, TopicPath};
-use super::press::ToLanes;
+use super::press::{Arrival, ToLanes};
 use super::succession::LONGEST_WAIT;
 use super::writer::NewWriter;
 use crate::link::LaneId;
@@ -158,7 +158,7 @@ impl DataCore {
                 if passed_on.is_some() {
                     self.put_to_lanes(now, topic, lanes, link);
                 } else {
-                    self.press_out(now, topic, &frame, lanes, link);
+                    self.press_out(now, topic, &frame, lanes, Arrival::Kept, link);
                 }
             }
             let path = &mut self.topics[topic.0 as usize];

@@ -33,6 +33,16 @@ pub use level::{PressStats, TopicEffort};
 use outward::Outward;
 pub(super) use outward::ToLanes;
 
+/// Whether a message comes alone or as one of many at the same moment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Arrival {
+    /// As it was published.
+    Live,
+    /// With all that is kept for a late joiner, before anything of it can be compressed. What the codec has no room for goes as it is: nobody
+    /// sends it again.
+    Kept,
+}
+
 /// Of what came over the link so many bytes wait for the pool (16 MiB) before the thread that brings more does the work itself.
 const OWN_ABOVE: usize = 16 * 1024 * 1024;
 

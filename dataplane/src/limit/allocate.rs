@@ -353,7 +353,8 @@ fn is_within(sum: f64, budget: f64) -> bool {
 }
 
 fn sane(number: f64) -> f64 {
-    if number.is_finite() { number.max(0.0) } else { 0.0 }
+    // One that is too large is still large: as 0 it would silence whom it belongs to.
+    if number.is_nan() { 0.0 } else { number.clamp(0.0, 1e15) }
 }
 
 #[cfg(test)]

@@ -11,12 +11,14 @@
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::RandomState;
+use std::num::NonZeroUsize;
 use std::time::{Duration, Instant};
 
 use blaze_domain::{DropReason, FlowId, LayerKind, Priority};
 use blaze_proto::link::LinkControl;
 use blaze_proto::link::link_control::{Body, Egress, LayerScope, State};
 use bytes::Bytes;
+use lru::LruCache;
 use prost::Message as _;
 
 use super::addresses::Addresses;
@@ -34,6 +36,8 @@ pub const MIN_DATAGRAM_BYTES: usize = 1024;
 /// Peers of one flow, at most. Each takes six file descriptors (RustDDS has two per writer), twelve for as long as a dead
 /// participant is laid aside, up to 3.3 MiB in DDS, and a look at each datagram that is sent; and all flows know all writers of all.
 pub const MAX_PEERS: usize = 128;
+/// Flows that are remembered as heard when they have no place any more; beyond that those that went first are forgotten.
+const MAX_HEARD: NonZeroUsize = NonZeroUsize::new(8 * MAX_PEERS).unwrap();
 /// Most GUID prefixes that a Hello announces.
 const MAX_GUID_PREFIXES: usize = 4;
 
@@ -104,6 +108,8 @@ pub struct Engine {
     pub(super) by_sender: HashMap<SenderId, usize>,
     /// Flows that were heard before a new life began, here or there, and not since.
     pub(super) missed: BTreeMap<FlowId, Missed>,
+    /// Flows that were heard in a place that they have no more: what their links carry has to be found out from below when they come back.
+    pub(super) heard: LruCache<FlowId, ()>,
     /// Flows that found no place, those first that wait longest.
     pub(super) waiting: VecDeque<Endpoint>,
     /// When it was last told that one found none.
@@ -138,6 +144,7 @@ impl Engine {
             by_flow: HashMap::new(),
             by_sender: HashMap::new(),
             missed: BTreeMap::new(),
+            heard: LruCache::new(MAX_HEARD),
             waiting: VecDeque::new(),
             refusal_told: None,
             next_link_epoch: 1,

@@ -86,6 +86,7 @@ impl Engine {
             max_datagram: self.config.max_datagram,
         });
         let mut peer = Peer::new(now, endpoint, self.next_link_epoch, limits, self.config.limits.streams);
+        peer.was_heard = self.heard.pop(&peer.endpoint.flow).is_some();
         let layer = &peer.endpoint.flow.layer;
         self.budgets.fit(now, layer, self.config.max_datagram, &mut peer.path);
         self.next_link_epoch = self.next_link_epoch.saturating_add(3);
@@ -250,6 +251,9 @@ impl Engine {
         if let Some(peer) = self.peers.get_mut(at).and_then(Option::take) {
             self.by_flow.remove(&peer.endpoint.flow);
             self.by_sender.remove(&peer.sender);
+            if peer.was_heard {
+                self.heard.put(peer.endpoint.flow.clone(), ());
+            }
             self.ledger.events.push_back(LinkEvent::PeerRemoved {
                 flow: peer.endpoint.flow,
                 epoch: peer.endpoint.epoch,

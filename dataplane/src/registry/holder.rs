@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use blaze_domain::control::{Common, ControlError, ControlMessage, ErrorCode, LeaseKind};
-use blaze_domain::{FlowId, LayerName, NodeName, Scope, TopicName};
+use blaze_domain::{FlowId, LayerName, MAX_PAYLOAD_BYTES, MAX_RATE_HZ, NodeName, Scope, TopicName};
 
 use super::leases::{Lease, LeaseKey, Terms};
 
@@ -64,8 +64,9 @@ pub(super) fn lease_of<'m>(
             LeaseKind::Advertise,
             message.ttl_s,
             Terms::Advertise {
-                rate_hz: message.rate_hz,
-                max_bytes: message.max_bytes,
+                // More cannot be published, and would take the room of those who publish something.
+                rate_hz: message.rate_hz.map(|hz| hz.min(MAX_RATE_HZ)),
+                max_bytes: message.max_bytes.map(|bytes| bytes.min(MAX_PAYLOAD_BYTES as u64)),
                 quality: message.quality.clone(),
             },
         ),

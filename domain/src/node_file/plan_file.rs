@@ -14,12 +14,11 @@ use super::flow::BandwidthSection;
 use super::readers::{number, parsed, path, whole};
 use super::walk::{Node, Report, Section};
 use super::{Fault, MAX_BYTES};
+use crate::MAX_RATE_HZ;
 use crate::identity::FlowId;
 use crate::names::{LayerName, NodeName, TopicName};
 use crate::qos::{UnknownWord, word_enum};
 
-/// Highest rate of a topic, in Hz.
-const MAX_RATE_HZ: f64 = 1_000_000.0;
 /// Most publishers of a topic on one flow.
 const MAX_WRITERS: u32 = 10_000;
 

@@ -171,9 +171,10 @@ impl<T: Send + Sync + 'static> Task<T> {
     }
 }
 
-/// Waits until nothing has changed for a while, but not for ever.
+/// Waits until nothing has changed for a while, but not for long: in a directory in which others write as well that may never be, and a
+/// change is to be in effect within a second.
 async fn quiet(changed: &mut mpsc::Receiver<()>, debounce: Duration) {
-    let latest = Instant::now() + debounce * 10;
+    let latest = Instant::now() + debounce * 4;
     while Instant::now() < latest {
         if tokio::time::timeout(debounce, changed.recv()).await.is_err() {
             return;

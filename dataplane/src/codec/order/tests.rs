@@ -137,6 +137,22 @@ fn turns_go_round_groups_and_within_them_round_lines() {
     assert_eq!(queue.begin(Urgency::Quick).map(|(_, item)| *item), Some(40));
 }
 
+/// Whoever wants the newest alone gets it, also where fewer fit than may wait.
+#[test]
+fn where_bytes_are_short_the_oldest_give_way() {
+    let mut queue = Queue::new(Bounds {
+        waiting_of_one: 30,
+        ..ROOMY
+    });
+    wait(&mut queue, (1, 'a'), 1, 12, 3);
+    wait(&mut queue, (1, 'a'), 2, 12, 3);
+    assert_eq!(wait(&mut queue, (1, 'a'), 3, 12, 3), [1]);
+    assert_eq!(wait(&mut queue, (1, 'a'), 4, 25, 3), [2, 3]);
+    // Another line has nothing of its own to give.
+    let pushed = queue.push_waiting((1, 'b'), LONG, 5, 12, 3);
+    assert_eq!((pushed.gave_way.len(), pushed.refused), (0, Some((5, Full::Group))));
+}
+
 #[test]
 fn full_is_said_and_one_alone_always_fits() {
     let mut queue = Queue::new(Bounds {
@@ -230,14 +246,23 @@ impl Model {
     }
 
     /// What would have to give way.
-    fn surplus(&self, key: Key, urgency: Urgency, keep: usize) -> Vec<Entry> {
+    fn surplus(&self, key: Key, urgency: Urgency, bytes: usize, keep: usize, bounds: &Bounds) -> Vec<Entry> {
         let waits = |entry: &&Entry| entry.key == key && entry.urgency == urgency && entry.stage == Stage::Waits;
         let waiting: Vec<Entry> = self.all.iter().filter(waits).copied().collect();
-        let surplus = if keep == 0 {
-            0
-        } else {
-            (waiting.len() + 1).saturating_sub(keep)
+        if keep == 0 {
+            return Vec::new();
+        }
+        let of_group = self.sum(|entry| entry.key.0 == key.0 && entry.stage == Stage::Waits);
+        let fits = |gone: &[Entry]| {
+            let gone: usize = gone.iter().map(|entry| entry.bytes).sum::<usize>();
+            of_group.bytes - gone + bytes <= bounds.waiting_of_one
         };
+        let is_enough = |count: &usize| {
+            let left = of_group.items - count;
+            let has_room = left == 0 || (left < bounds.items_of_one && fits(&waiting[..*count]));
+            waiting.len() - count < keep && has_room
+        };
+        let surplus = (0..=waiting.len()).find(is_enough).unwrap_or(waiting.len());
         waiting[..surplus].to_vec()
     }
 
@@ -301,7 +326,7 @@ proptest! {
                     }
                 }
                 Act::Wait(key, urgency, bytes, keep) => {
-                    let surplus = model.surplus(key, urgency, keep);
+                    let surplus = model.surplus(key, urgency, bytes, keep, &bounds);
                     let mut freed = Waiting::default();
                     surplus.iter().for_each(|entry| freed.add(entry.bytes));
                     let room = model.room(key, bytes, true, freed, &bounds);

@@ -38,6 +38,10 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
                 "outstanding_bytes": peer.outstanding_bytes, "window_bytes": peer.window_bytes, "queue_bytes": peer.queue_bytes,
                 "receiving_bytes_per_s": peer.receiving_bytes_per_s.round(),
                 "queueing_delay_ms": rounded(peer.queueing_delay.as_secs_f64() * 1e3),
+                "capacity": peer.capacity.map(|capacity| json!({
+                    "state": capacity.state.as_str(), "bytes_per_s": capacity.bytes_per_s.round(),
+                    "measured_bytes_per_s": capacity.measured_bytes_per_s.map(f64::round),
+                })),
             })
         })
         .collect();

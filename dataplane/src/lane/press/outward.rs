@@ -6,7 +6,7 @@ use blaze_domain::{DropReason, WriterId};
 use blaze_proto::Frame;
 use smallvec::SmallVec;
 
-use super::{Line, PressJob, PressTicket};
+use super::{Arrival, Line, PressJob, PressTicket};
 use crate::codec::order::Ticket;
 use crate::codec::pool::Urgency;
 use crate::codec::{Done, Work};
@@ -69,6 +69,7 @@ impl DataCore {
         topic: TopicId,
         frame: &Frame,
         lanes: ToLanes,
+        arrival: Arrival,
         link: &mut dyn LaneLink,
     ) {
         let line = (topic, frame.writer());
@@ -97,7 +98,13 @@ impl DataCore {
             for out in &pushed.gave_way {
                 self.lose(topic, out, DropReason::QueueFull);
             }
-            pushed.refused
+            match pushed.refused {
+                Some((out, _)) if arrival == Arrival::Kept => {
+                    let as_it_is = Outward { level: 0, ..out };
+                    self.press.out.push_ready(line, as_it_is, bytes).err()
+                }
+                refused => refused,
+            }
         } else {
             let out = Outward { level: 0, lanes };
             self.press.out.push_ready(line, out, bytes).err()

@@ -136,6 +136,44 @@ fn after_an_outage_a_link_begins_low_and_with_what_is_small() {
     }
 }
 
+/// Cut for so long that the flow is forgotten: the estimate is gone, and the way may be another one.
+#[test]
+fn whoever_comes_back_after_it_was_forgotten_begins_low_as_well() {
+    let mut sim = Sim::new(1, Weather::delay(25), &["edge/a", "fog/b"]);
+    limit(&mut sim, &[], true);
+    sim.run_ms(1_500);
+    let (a, b) = (sim.id(0), sim.id(1));
+    assert_eq!(
+        capacity(&sim).state,
+        State::Unknown,
+        "at first nothing is known against it"
+    );
+    sim.network.set_partition(&a, &b, true);
+    sim.run_ms(70_000);
+    assert!(
+        sim.nodes[0]
+            .engine
+            .peer(&b)
+            .is_none_or(|peer| peer.state == PeerState::Down)
+    );
+    sim.network.set_partition(&a, &b, false);
+    for node in [0, 1] {
+        sim.announce(node);
+    }
+    let is_up = |sim: &Sim| {
+        let peer = sim.nodes[0].engine.peer(&sim.id(1));
+        peer.is_some_and(|peer| peer.state == PeerState::Up)
+    };
+    sim.run_to(Duration::from_secs(10), "it is back", is_up);
+    assert_eq!(capacity(&sim).state, State::SlowStart);
+    // The same with a new life of it.
+    publish(&mut sim, &[1], 100_000, 10_000);
+    assert_eq!(capacity(&sim).state, State::Unknown);
+    sim.crash(1);
+    sim.run_to(Duration::from_secs(10), "it is back", is_up);
+    assert_eq!(capacity(&sim).state, State::SlowStart);
+}
+
 #[test]
 fn two_peers_of_one_layer_share_its_limit_and_hold_up_nobody_else() {
     const OF_FOG: f64 = 100_000.0;

@@ -385,6 +385,25 @@ fn leases_survive_as_the_messages_that_made_them() {
     assert_eq!(request.quality().depth, 3);
 }
 
+/// The sum of two such rates is no number any more, and nothing would be left for others.
+#[test]
+fn what_nobody_can_publish_counts_as_the_most_that_one_can() {
+    let now = Instant::now();
+    let mut registry = registry(now);
+    send(
+        &mut registry,
+        now,
+        Scope::Node,
+        &json!([
+            {"op": "advertise", "topic": "t", "service": "a", "rate_hz": 1.7e308, "max_bytes": u64::MAX},
+            {"op": "advertise", "topic": "t", "service": "b", "rate_hz": 1.7e308, "max_bytes": 1},
+        ]),
+    );
+    let entry = registry.world().own().unwrap().topics[&topic("t")].clone();
+    let advertise = entry.node.advertise.unwrap();
+    assert_eq!((advertise.rate_hz, advertise.max_bytes), (Some(2e6), Some(16 << 20)));
+}
+
 #[test]
 fn services_of_one_scope_are_merged() {
     let now = Instant::now();

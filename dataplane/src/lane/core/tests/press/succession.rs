@@ -146,35 +146,65 @@ fn what_was_compressed_for_one_receiver_goes_to_an_older_one_as_it_was() {
     assert!(!frame.is_compressed() && *frame.payload() == vec![0; LARGE]);
 }
 
+fn durable(flow: &str) -> Vec<Bridge> {
+    let mut bridges = to(flow);
+    bridges[0].lane.durable = true;
+    bridges
+}
+
+/// A message that is kept with others before it.
+fn kept(sequence: u64, bytes: usize, depth: u32) -> Content {
+    let origin = Origin {
+        layer: "edge".into(),
+        node: "robot-1".into(),
+        service: "imu".into(),
+        ..Origin::default()
+    };
+    let header = Header {
+        depth,
+        ..Header::new("imu/data", origin, WriterId([1; 16]), sequence, WALL)
+    };
+    Content::Frame(Frame::new(&header, Bytes::from(vec![0; bytes])).unwrap())
+}
+
+/// More at once than may wait for the codec: nobody publishes it again, so the rest goes as it is.
+#[test]
+fn of_what_is_kept_nothing_is_refused() {
+    const IMAGE: usize = 1 << 20;
+    let mut hands = Hands::new(durable("a"));
+    for sequence in 1..=12 {
+        hands.bench.take(Scope::Node, vec![kept(sequence, IMAGE, 12)]);
+        hands.look();
+        hands.run();
+    }
+    hands.link_is_empty();
+    assert_eq!(hands.sent().len(), 12);
+    hands.plan([durable("a"), durable("b")].concat());
+    let Bench {
+        core, link, now, topic, ..
+    } = &mut hands.bench;
+    core.deliver_waiting(*now, *topic, link);
+    hands.look();
+    hands.run();
+    let sent = hands.sent();
+    let newest = sent.iter().map(|(lane, ..)| *lane).max();
+    let to_newest = sent.iter().filter(|(lane, ..)| Some(*lane) == newest);
+    let sequences: Vec<u64> = to_newest.map(|(.., sequence)| *sequence).collect();
+    assert_eq!(sequences, (1..=12).collect::<Vec<u64>>());
+    assert_eq!(hands.dropped(0), []);
+}
+
 /// What is kept for late joiners is older than what is held for them.
 #[test]
 fn what_is_kept_goes_before_what_is_held() {
-    let durable = |flow: &str| {
-        let mut bridges = to(flow);
-        bridges[0].lane.durable = true;
-        bridges
-    };
-    let kept = |sequence: u64, bytes: usize| {
-        let origin = Origin {
-            layer: "edge".into(),
-            node: "robot-1".into(),
-            service: "imu".into(),
-            ..Origin::default()
-        };
-        let header = Header {
-            depth: 2,
-            ..Header::new("imu/data", origin, WriterId([1; 16]), sequence, WALL)
-        };
-        Content::Frame(Frame::new(&header, Bytes::from(vec![0; bytes])).unwrap())
-    };
     let mut hands = Hands::new(durable("a"));
-    hands.bench.take(Scope::Node, vec![kept(1, LARGE)]);
+    hands.bench.take(Scope::Node, vec![kept(1, LARGE, 2)]);
     hands.look();
     hands.run();
     assert_eq!(hands.sent(), [(0, 1, 1)]);
     hands.link_is_empty();
     hands.plan(durable("b"));
-    hands.bench.take(Scope::Node, vec![kept(2, 100)]);
+    hands.bench.take(Scope::Node, vec![kept(2, 100, 2)]);
     let Bench {
         core, link, now, topic, ..
     } = &mut hands.bench;
