@@ -13,7 +13,7 @@
 //! | `r_lane` | [`Lane::max_rate_hz`] | what the requesters of one destination ask for at most |
 //!
 //! A topic of rate `r` costs `Σ over its lanes of min(r, r_lane) · s · α`, because each destination gets a copy. Everything below
-//! follows from "the largest `r` whose cost stays within so many bytes per second", [`Demand::rate_for`].
+//! follows from "the largest `r` whose cost stays within so many bytes per second", `Demand::rate_for`.
 //!
 //! 1. Standard topics (`s ≤ large_bytes`), largest demand `D = r_adv · s · α` first: `min(B_remaining, β·B_avail)`. If they alone exceed the
 //!    budget, smallest demand first: a large one does not starve a stop signal.
