@@ -312,8 +312,9 @@ impl Spending {
         let level = level(&bounds, self.remaining);
         for (demand, (floor, most)) in large.iter().zip(bounds) {
             let share = level.clamp(floor, most);
-            // Rounding must not make a topic that is served in full seem thinned.
-            let rate = if share >= demand.cost(demand.advertised_hz) {
+            // Rounding must not make a topic that is served in full seem thinned: the level is a difference of amounts up to the budget.
+            let rounding = 16.0 * f64::EPSILON * self.budget;
+            let rate = if share + rounding >= demand.cost(demand.advertised_hz) {
                 demand.advertised_hz
             } else {
                 demand.rate_for(share)

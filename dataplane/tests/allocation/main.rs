@@ -632,6 +632,16 @@ fn check_all(seeds: impl Iterator<Item = u64>) -> (Tally, Vec<String>) {
     (tally, failures)
 }
 
+/// Fair sharing where the level is just what a topic costs in full: rounding took it for thinned.
+#[test]
+fn sets_in_which_rounding_once_decided_hold() {
+    for seed in [588_560, 697_827, 927_582] {
+        if let Err(failure) = check(seed) {
+            panic!("{failure}");
+        }
+    }
+}
+
 #[test]
 fn rates_are_those_of_exact_arithmetic() {
     let seeds = seeds();
