@@ -247,20 +247,22 @@ impl PathBudget {
     }
 }
 
+/// Those of DDS over Ethernet.
+#[cfg(test)]
+pub(super) const ETHERNET: PacketSize = PacketSize {
+    prefix: 8,
+    align: 4,
+    whole: 1_404,
+    whole_header: 72,
+    last_part: 1_396,
+    part: 1_280,
+    part_header: 84,
+};
+
 #[cfg(test)]
 mod tests {
+    use super::ETHERNET as PACKETS;
     use super::*;
-
-    /// Those of DDS over Ethernet.
-    const PACKETS: PacketSize = PacketSize {
-        prefix: 8,
-        align: 4,
-        whole: 1_404,
-        whole_header: 72,
-        last_part: 1_396,
-        part: 1_280,
-        part_header: 84,
-    };
 
     #[test]
     fn a_datagram_has_the_headers_of_all_its_packets() {

@@ -56,7 +56,7 @@ pub(crate) struct Peer {
     /// When it was found, or left.
     pub since: Instant,
     pub last_hello: Option<Instant>,
-    /// It has been up in this life.
+    /// It has been up, in this place or in one before.
     pub was_heard: bool,
     pub hello: Option<Box<Hello>>,
     pub hello_at: Instant,

@@ -396,9 +396,10 @@ fn play(row: &Row) -> anyhow::Result<()> {
             seen.wire_factor
         ),
     );
-    // What the reserve leaves is what is given out; all of the limit is shown beside it.
+    // What the reserve leaves is what is given out.
     let expected = reckoned(row, allocated(budget), seen.wire_factor, &allocation)?;
-    let of_all = reckoned(row, budget, seen.wire_factor, &allocation)?;
+    // And all of the limit, with ω as the flow has it: the one seen is off by an image, which is much of a few.
+    let of_all = reckoned(row, budget, told, &allocation)?;
     let lines = streams()?
         .into_iter()
         .zip(expected.into_iter().zip(of_all))
@@ -426,6 +427,10 @@ fn play(row: &Row) -> anyhow::Result<()> {
             expect(
                 row.reported || (got - hz).abs() <= IMAGE_RATE * hz + edge,
                 format!("{topic}: {got:.2} Hz instead of {hz:.2}"),
+            );
+            expect(
+                row.reported || (got - of_all).abs() <= IMAGE_RATE * of_all + edge,
+                format!("{topic}: {got:.2} Hz instead of {of_all:.2} of the whole limit"),
             );
         } else {
             let all = (route.received + route.gaps()) as f64;

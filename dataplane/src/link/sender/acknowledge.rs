@@ -193,7 +193,7 @@ mod tests {
     use blaze_domain::Priority;
 
     use super::*;
-    use crate::link::PacketSize;
+    use crate::link::budget::ETHERNET;
     use crate::link::event::{LaneId, Ledger, LinkCounters, StreamKey, Submit};
     use crate::link::sender::SendLimits;
     use crate::link::sim::{Post, flow, frame, writer};
@@ -202,22 +202,13 @@ mod tests {
     #[test]
     fn what_arrives_counts_with_the_headers_of_all_its_packets() {
         let (now, to) = (Instant::now(), flow("fog/b"));
-        let packets = PacketSize {
-            prefix: 8,
-            align: 4,
-            whole: 1_404,
-            whole_header: 72,
-            last_part: 1_396,
-            part: 1_280,
-            part_header: 84,
-        };
         let (mut ledger, mut counters) = (Ledger::default(), LinkCounters::default());
         let mut ctx = SendContext {
             now,
             send_ns: 1,
             sender: SenderId::of(&flow("edge/a"), 1),
             round_trip: Duration::from_millis(10),
-            packets: Some(packets),
+            packets: Some(ETHERNET),
             ledger: &mut ledger,
             counters: &mut counters,
         };
@@ -253,7 +244,7 @@ mod tests {
             delivered_message: 1,
         };
         assert!(class.feedback(&mut ctx, &view));
-        let wire_bytes = packets.wire_bytes(datagram.len());
+        let wire_bytes = ETHERNET.wire_bytes(datagram.len());
         assert_eq!(class.take_settled(), (wire_bytes as u64, 0));
         assert!(wire_bytes > datagram.len() + 2_000, "{wire_bytes} bytes of 24 packets");
         assert_eq!(class.take_settled(), (0, 0));
