@@ -50,6 +50,7 @@ use crate::identity::FlowId;
 use crate::names::{LayerName, NodeName};
 use crate::qos::LayerKind;
 use readers::{parsed, path};
+pub(crate) use walk::{describe, nearest};
 use walk::{Node, Report, Section};
 
 /// Largest payload, as the readers of numbers take it.

@@ -1,0 +1,119 @@
+use std::fs;
+
+use serde_json::json;
+
+use super::*;
+
+const TWO: &str =
+    "# robots\nkind: Node\nname: robot-1\nspec: { layer: edge }\n---\n# the second\n\nkind: Node\nname: robot-2\n";
+
+fn read_text(name: &str, text: &str) -> Result<Vec<Source>, CliError> {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join(name);
+    fs::write(&file, text).unwrap();
+    read_from(&[file], &mut std::io::empty()).map_err(|error| match error {
+        CliError::Invalid(text) => CliError::Invalid(text.replace(&format!("{}/", directory.path().display()), "")),
+        other => other,
+    })
+}
+
+fn faults(name: &str, text: &str) -> String {
+    let error = read_text(name, text).unwrap_err();
+    assert_eq!(error.exit() as u8, 7);
+    error.to_string()
+}
+
+#[test]
+fn documents_know_where_they_come_from() {
+    let mut stdin = TWO.as_bytes();
+    let sources = read_from(&[PathBuf::from("-")], &mut stdin).unwrap();
+    let places: Vec<String> = sources.iter().map(|source| source.origin.to_string()).collect();
+    assert_eq!(places, ["stdin:2 (document 1)", "stdin:8 (document 2)"]);
+    assert_eq!(sources[0].value["spec"]["layer"], "edge");
+    assert_eq!(sources[1].key.to_string(), "Node/robot-2");
+    let one = read_from(&[PathBuf::from("-")], &mut "kind: Node\nname: a\n".as_bytes()).unwrap();
+    assert_eq!(one[0].origin.to_string(), "stdin:1");
+}
+
+#[test]
+fn lines_of_documents_follow_the_rules_of_yaml() {
+    for (text, lines) in [
+        ("", &[][..]),
+        ("# nothing\n", &[]),
+        ("a: 1\n", &[1]),
+        ("---\na: 1\n--- # x\n# y\nb: 2\n", &[2, 5]),
+        ("--- {a: 1}\n---\n---\nb: 1\n---\n", &[1, 4]),
+        ("a: 1\n...\n# c\nb: 2\n...\n", &[1, 4]),
+        ("%YAML 1.2\n---\na: 1\n", &[3]),
+        ("a: |\n  ---\n  x\n---x: 2\n", &[1]),
+    ] {
+        assert_eq!(document_lines(text), lines, "{text:?}");
+    }
+}
+
+#[test]
+fn every_fault_has_its_place_and_nothing_is_taken() {
+    assert!(
+        faults("a.yaml", "kind: Node\nname: a\nname: b\n").contains("a.yaml:3"),
+        "given twice"
+    );
+    let text = faults(
+        "a.yaml",
+        "kind: Node\nname: A\n---\nkind: Nod\nname: b\n---\njust text\n",
+    );
+    for part in [
+        "a.yaml:1 (document 1): name",
+        "a.yaml:4 (document 2): kind",
+        "did you mean Node?",
+        "a.yaml:7 (document 3)",
+    ] {
+        assert!(text.contains(part), "{part} in {text}");
+    }
+    let text = faults("a.json", "[{\"kind\":\"Node\",\n\"name\":\"a\",\"name\":\"b\"}]");
+    assert!(text.contains("a.json:2"), "{text}");
+    assert!(faults("a.yaml", "kind: [\n").contains("a.yaml"));
+}
+
+#[test]
+fn json_comes_as_one_document_a_list_or_what_get_prints() {
+    let node = json!({"kind": "Node", "name": "a", "spec": {}});
+    for text in [
+        node.to_string(),
+        json!([node]).to_string(),
+        json!({"items": [node], "revision": 7, "next_page_token": ""}).to_string(),
+    ] {
+        let sources = read_text("a.json", &text).unwrap();
+        assert_eq!(sources.len(), 1);
+        assert_eq!(sources[0].value, node);
+        let mut stdin = text.as_bytes();
+        assert_eq!(read_from(&[PathBuf::from("-")], &mut stdin).unwrap()[0].value, node);
+    }
+}
+
+#[test]
+fn directories_give_their_files_in_order() {
+    let directory = tempfile::tempdir().unwrap();
+    for (name, node) in [("b.yml", "b"), ("a.yaml", "a"), ("c.json", "c"), ("d.txt", "d")] {
+        let text = format!("{{\"kind\": \"Node\", \"name\": \"{node}\"}}");
+        fs::write(directory.path().join(name), text).unwrap();
+    }
+    fs::create_dir(directory.path().join("e.yaml")).unwrap();
+    let sources = read(&[directory.path().to_owned()]).unwrap();
+    let names: Vec<&str> = sources.iter().map(|source| source.key.name().as_str()).collect();
+    assert_eq!(names, ["a", "b", "c"]);
+    let error = read(&[directory.path().join("e.yaml")]).unwrap_err();
+    assert_eq!(error.exit() as u8, 2);
+}
+
+#[test]
+fn what_is_too_much_is_refused_before_anything_is_sent() {
+    let many = "---\nkind: Node\nname: a\n".repeat(MAX_DOCUMENTS + 1);
+    assert!(read_text("a.yaml", &many).is_err());
+    let large = format!("# {}\n", "x".repeat(MAX_BYTES));
+    let error = read_text("a.yaml", &large).unwrap_err();
+    assert!(error.to_string().contains("more than 8 MiB"), "{error}");
+    let twice = [PathBuf::from("-"), PathBuf::from("-")];
+    assert_eq!(read_from(&twice, &mut std::io::empty()).unwrap_err().exit() as u8, 2);
+    let error = read(&[PathBuf::from("/no/such/file.yaml")]).unwrap_err();
+    assert!(error.to_string().contains("/no/such/file.yaml"), "{error}");
+}

@@ -1,0 +1,273 @@
+//! JSON Schemas of services: whether they are sound, and whether effective configurations match them.
+
+use std::num::NonZeroUsize;
+use std::sync::Arc;
+
+use blaze_domain::config::{Code, Document, FieldFault, Key, MAX_EFFECTIVE_BYTES};
+use blaze_domain::ServiceName;
+use jsonschema::{Draft, PatternOptions, Validator};
+use lru::LruCache;
+use parking_lot::Mutex;
+use serde_json::{Map, Value};
+use sha2::{Digest as _, Sha256};
+
+use super::affected::touched;
+use super::effective::{At, Sources};
+use super::secrets::as_text;
+use super::state::State;
+use crate::secrets::Keyring;
+
+/// Compiled schemas that are kept.
+const CACHED: NonZeroUsize = NonZeroUsize::MIN.saturating_add(511);
+/// Faults that are told, at most.
+pub(crate) const MAX_FAULTS: usize = 20;
+/// Compiled patterns may take so many bytes each.
+const PATTERN_BYTES: usize = 1 << 20;
+/// Sections of the node file: they have a schema of their own.
+pub(crate) const NODE_FILE_SECTIONS: &[&str] = &[
+    "brokers",
+    "cache",
+    "config",
+    "control_plane",
+    "database",
+    "flow",
+    "layer",
+    "log",
+    "monitor",
+    "node",
+    "worker",
+];
+
+/// A schema, in full and without `required`.
+struct Compiled {
+    full: Validator,
+    partial: Validator,
+}
+
+/// Compiled schemas, the most recently used.
+pub(crate) struct Schemas {
+    cache: Mutex<LruCache<[u8; 32], Arc<Compiled>>>,
+}
+
+impl Default for Schemas {
+    fn default() -> Self {
+        Self {
+            cache: Mutex::new(LruCache::new(CACHED)),
+        }
+    }
+}
+
+impl Schemas {
+    /// What is wrong with the schema itself.
+    pub(crate) fn check(&self, schema: &Value) -> Result<(), String> {
+        self.compiled(schema).map(|_| ())
+    }
+
+    fn compiled(&self, schema: &Value) -> Result<Arc<Compiled>, String> {
+        let text = schema.to_string();
+        let id: [u8; 32] = Sha256::digest(text.as_bytes()).into();
+        if let Some(found) = self.cache.lock().get(&id) {
+            return Ok(Arc::clone(found));
+        }
+        if let Some(reference) = foreign_reference(schema) {
+            return Err(format!("$ref {reference:?} leads out of the schema; only #… is followed"));
+        }
+        let build = |schema: &Value| {
+            let patterns = PatternOptions::regex().size_limit(PATTERN_BYTES).dfa_size_limit(PATTERN_BYTES);
+            jsonschema::options()
+                .with_draft(Draft::Draft202012)
+                .offline()
+                .with_pattern_options(patterns)
+                .build(schema)
+                .map_err(|error| error.to_string().chars().take(500).collect::<String>())
+        };
+        jsonschema::draft202012::meta::validate(schema)
+            .map_err(|error| error.masked().to_string().chars().take(500).collect::<String>())?;
+        let compiled = Arc::new(Compiled {
+            full: build(schema)?,
+            partial: build(&without_required(schema))?,
+        });
+        self.cache.lock().put(id, Arc::clone(&compiled));
+        Ok(compiled)
+    }
+
+    /// Checks every effective configuration that changed documents can concern: its size, and its service's schema.
+    pub(crate) fn check_effective(&self, state: &State, keys: &[Key], keyring: &Keyring) -> Vec<FieldFault> {
+        let any_schema = |service: &ServiceName| schema_of(state, service).is_some();
+        let mut faults = Vec::new();
+        for at in touched(state, keys) {
+            if faults.len() >= MAX_FAULTS {
+                break;
+            }
+            let Some(service) = &at.service else { continue };
+            let has_schema = any_schema(service);
+            if !has_schema && !state.has_big() {
+                continue;
+            }
+            let sources = Sources::at(state, &at);
+            if state.has_big() && sources.size_bound() > MAX_EFFECTIVE_BYTES {
+                faults.extend(size_fault(&sources, &at));
+            }
+            if has_schema && let Some(document) = schema_of(state, service) {
+                self.check_one(&document, &sources, &at, keyring, &mut faults);
+            }
+        }
+        faults.truncate(MAX_FAULTS);
+        faults
+    }
+
+    fn check_one(&self, service: &Document, sources: &Sources, at: &At, keyring: &Keyring, faults: &mut Vec<FieldFault>) {
+        let Some(schema) = service.spec_member("schema") else { return };
+        let Ok(compiled) = self.compiled(schema) else {
+            // It was sound when it was written; a newer program may see it otherwise, and must not block every write.
+            tracing::warn!(service = %service.key, "the stored schema cannot be compiled; it is not checked");
+            return;
+        };
+        let mut config = sources.merged_with(|document, value| as_text(keyring, document, value));
+        if let Value::Object(members) = &mut config {
+            members.retain(|name, _| !NODE_FILE_SECTIONS.contains(&name.as_str()));
+        }
+        let validator = if at.instance.is_some() { &compiled.full } else { &compiled.partial };
+        for error in validator.iter_errors(&config).take(MAX_FAULTS - faults.len().min(MAX_FAULTS)) {
+            let found: String = error.masked().to_string().chars().take(300).collect();
+            faults.push(FieldFault {
+                pointer: format!("/spec/config{}", error.instance_path().as_str()),
+                code: Code::SchemaMismatch,
+                detail: format!("effective configuration of {}: {found}", described(at)),
+                document: None,
+            });
+        }
+    }
+}
+
+fn schema_of(state: &State, service: &ServiceName) -> Option<Arc<Document>> {
+    let held = state.get(&Key::service(service))?;
+    held.document.spec_member("schema").is_some().then(|| Arc::clone(&held.document))
+}
+
+fn size_fault(sources: &Sources, at: &At) -> Option<FieldFault> {
+    let bytes = sources.merged().to_string().len();
+    (bytes > MAX_EFFECTIVE_BYTES).then(|| FieldFault {
+        pointer: "/spec/config".to_owned(),
+        code: Code::ValidationFailed,
+        detail: format!(
+            "effective configuration of {}: {bytes} bytes, at most {MAX_EFFECTIVE_BYTES} are allowed",
+            described(at)
+        ),
+        document: None,
+    })
+}
+
+fn described(at: &At) -> String {
+    let mut out = at.service.as_ref().map(ToString::to_string).unwrap_or_default();
+    if let Some(instance) = &at.instance {
+        out.push_str(&format!("/{instance}"));
+    }
+    match (&at.node, &at.layer) {
+        (Some(node), _) => out.push_str(&format!(" on node {node}")),
+        (None, Some(layer)) => out.push_str(&format!(" in layer {layer}")),
+        (None, None) => {}
+    }
+    out
+}
+
+/// Keywords whose value is one schema.
+const ONE: &[&str] = &[
+    "additionalProperties",
+    "contains",
+    "contentSchema",
+    "else",
+    "if",
+    "items",
+    "not",
+    "propertyNames",
+    "then",
+    "unevaluatedItems",
+    "unevaluatedProperties",
+];
+/// Keywords whose value is a list of schemas.
+const LIST: &[&str] = &["allOf", "anyOf", "oneOf", "prefixItems"];
+/// Keywords whose value is an object of schemas under free names.
+const NAMED: &[&str] = &["$defs", "definitions", "dependentSchemas", "patternProperties", "properties"];
+
+/// The same schema with the keyword `required` taken out wherever it is a keyword (a property may be called so).
+pub(crate) fn without_required(schema: &Value) -> Value {
+    let Value::Object(members) = schema else {
+        return schema.clone();
+    };
+    let mut out = Map::new();
+    for (name, value) in members {
+        let kept = match (name.as_str(), value) {
+            ("required", _) => continue,
+            (name, value) if ONE.contains(&name) => without_required(value),
+            (name, Value::Array(list)) if LIST.contains(&name) => list.iter().map(without_required).collect(),
+            (name, Value::Object(named)) if NAMED.contains(&name) => named
+                .iter()
+                .map(|(name, value)| (name.clone(), without_required(value)))
+                .collect::<Map<_, _>>()
+                .into(),
+            _ => value.clone(),
+        };
+        out.insert(name.clone(), kept);
+    }
+    Value::Object(out)
+}
+
+/// A `$ref` that is not within the document.
+fn foreign_reference(value: &Value) -> Option<String> {
+    match value {
+        Value::Object(members) => members.iter().find_map(|(name, value)| match (name.as_str(), value) {
+            ("$ref" | "$dynamicRef", Value::String(target)) if !target.starts_with('#') => Some(target.clone()),
+            (_, value) => foreign_reference(value),
+        }),
+        Value::Array(list) => list.iter().find_map(foreign_reference),
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn required_goes_as_a_keyword_and_stays_as_a_property() {
+        let schema = json!({
+            "type": "object", "required": ["a"],
+            "properties": { "required": { "type": "array" }, "a": { "required": ["b"], "type": "object" } },
+            "allOf": [{ "required": ["c"] }], "enum": [{ "required": 1 }],
+        });
+        let expected = json!({
+            "type": "object",
+            "properties": { "required": { "type": "array" }, "a": { "type": "object" } },
+            "allOf": [{}], "enum": [{ "required": 1 }],
+        });
+        assert_eq!(without_required(&schema), expected);
+    }
+
+    #[test]
+    fn a_schema_is_judged_by_itself() {
+        let schemas = Schemas::default();
+        assert!(schemas.check(&json!({ "type": "object" })).is_ok());
+        assert!(schemas.check(&json!(true)).is_ok());
+        for (bad, why) in [
+            (json!({ "type": "objekt" }), "objekt"),
+            (json!({ "pattern": "(" }), ""),
+            (json!({ "pattern": "(a)\\1" }), ""),
+            (json!({ "properties": { "a": { "$ref": "http://example.org/s" } } }), "leads out of the schema"),
+            (json!({ "$ref": "#/$defs/missing" }), ""),
+        ] {
+            let error = schemas.check(&bad).unwrap_err();
+            assert!(error.contains(why), "{bad}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_pattern_takes_linear_time() {
+        let schemas = Schemas::default();
+        let compiled = schemas.compiled(&json!({ "pattern": "^(a+)+$" })).unwrap();
+        let text = Value::from("a".repeat(50_000) + "!");
+        assert!(!compiled.full.is_valid(&text));
+    }
+}

@@ -1,0 +1,285 @@
+//! Tokens, refusals, audit.
+
+use std::collections::HashMap;
+use std::net::IpAddr;
+use std::time::{Duration, Instant};
+
+use blaze_domain::config::{Code, FieldFault, Key, Problem, Timestamp};
+use blaze_domain::LayerName;
+
+use super::super::committer::{now, unavailable};
+use super::super::page::Position;
+use super::super::types::{Answer, Caller, Page, ReadOptions, TokenRequest};
+use super::ConfigService;
+use crate::auth::{Claims, NewToken, Right, Role};
+use crate::store::{AuditEntry, AuditQuery, StoreError, TokenRecord};
+
+/// Refusals per address and second that are written to the audit; the rest is counted.
+const DENIALS_PER_S: u32 = 10;
+/// Addresses that are told apart at once.
+const MAX_ADDRESSES: usize = 4096;
+/// Longest life of a token, in seconds: a year.
+const MAX_EXPIRES_S: u32 = 31_536_000;
+/// Longest subject, in bytes.
+const MAX_SUBJECT: usize = 256;
+/// Entries of a page of the audit.
+const PAGE: usize = 100;
+/// The same, at most.
+const MAX_PAGE: usize = 1000;
+
+/// How many refusals of an address are written in this second.
+#[derive(Default)]
+pub(super) struct DenialLimit {
+    second: Option<Instant>,
+    counts: HashMap<IpAddr, u32>,
+    /// Refusals that were not written.
+    pub(super) skipped: u64,
+}
+
+impl DenialLimit {
+    fn admit(&mut self, address: IpAddr) -> bool {
+        let now = Instant::now();
+        if self.second.is_none_or(|since| now.duration_since(since) >= Duration::from_secs(1)) {
+            self.second = Some(now);
+            self.counts.clear();
+        }
+        let known = self.counts.len() < MAX_ADDRESSES || self.counts.contains_key(&address);
+        let admitted = known && {
+            let count = self.counts.entry(address).or_default();
+            *count += 1;
+            *count <= DENIALS_PER_S
+        };
+        self.skipped += u64::from(!admitted);
+        admitted
+    }
+}
+
+impl ConfigService {
+    /// Notes a refusal (401, 403) for the audit: at most ten per address and second, the rest is counted.
+    #[allow(clippy::too_many_arguments, reason = "each is a column of the audit")]
+    pub fn denied(
+        &self,
+        claims: Option<&Claims>,
+        problem: &Problem,
+        action: &str,
+        key: Option<&Key>,
+        request_id: &str,
+        address: IpAddr,
+    ) {
+        if !self.inner.denials.lock().admit(address) {
+            return;
+        }
+        let entry = AuditEntry {
+            id: uuid::Uuid::now_v7().to_string(),
+            time: now(),
+            revision: None,
+            subject: claims.map(|claims| claims.subject.clone()).unwrap_or_default(),
+            roles: claims.map(|claims| claims.roles.clone()).unwrap_or_default(),
+            action: action.to_owned(),
+            key: key.cloned(),
+            allowed: false,
+            code: Some(problem.code.as_str().to_owned()),
+            paths: Vec::new(),
+            request_id: request_id.to_owned(),
+            address: address.to_string(),
+            detail: problem.internal.clone(),
+        };
+        if self.inner.denied.try_send(entry).is_err() {
+            self.inner.denials.lock().skipped += 1;
+        }
+    }
+
+    /// Refusals that are not in the audit because there were too many.
+    #[must_use]
+    pub fn denials_skipped(&self) -> u64 {
+        self.inner.denials.lock().skipped
+    }
+
+    pub(super) fn entry(caller: &Caller, action: &str, key: Option<&Key>) -> AuditEntry {
+        AuditEntry {
+            id: uuid::Uuid::now_v7().to_string(),
+            time: now(),
+            revision: None,
+            subject: caller.claims.subject.clone(),
+            roles: caller.claims.roles.clone(),
+            action: action.to_owned(),
+            key: key.cloned(),
+            allowed: true,
+            code: None,
+            paths: Vec::new(),
+            request_id: caller.request_id.clone(),
+            address: caller.address.to_string(),
+            detail: None,
+        }
+    }
+
+    /// The audit, newest first.
+    ///
+    /// # Errors
+    /// [`Problem`].
+    pub async fn audit(
+        &self,
+        caller: &Caller,
+        mut query: AuditQuery,
+        page_token: &str,
+        read: &ReadOptions,
+    ) -> Result<Answer<Page<AuditEntry>>, Problem> {
+        self.authorize(&caller.claims, Right::Admin)?;
+        let state = self.read_state(read).await?;
+        let bound = format!("audit {query:?}");
+        if !page_token.is_empty() {
+            query.below = Some(self.inner.pages.position(&bound, page_token)?.after);
+        }
+        let limit = match query.limit {
+            0 => PAGE,
+            limit if limit <= MAX_PAGE => limit,
+            _ => return Err(Problem::new(Code::InvalidRequest, format!("limit: 1 to {MAX_PAGE}"))),
+        };
+        query.limit = limit + 1;
+        let mut items = self.inner.store.audit(&query).await.map_err(|error| unavailable(&error))?;
+        let more = items.len() > limit;
+        items.truncate(limit);
+        let next = items.last().filter(|_| more).map(|entry| Position {
+            revision: state.revision(),
+            after: entry.id.clone(),
+        });
+        Ok(Answer {
+            revision: state.revision(),
+            replayed: false,
+            value: Page {
+                next_page_token: next.map(|position| self.inner.pages.token(&bound, &position)).unwrap_or_default(),
+                items,
+            },
+        })
+    }
+
+    /// Gives out a token. Its text is kept nowhere.
+    ///
+    /// # Errors
+    /// [`Problem`]; [`Code::SigningDisabled`] without a key to sign with.
+    pub async fn create_token(
+        &self,
+        caller: &Caller,
+        request: TokenRequest,
+    ) -> Result<Answer<(TokenRecord, String)>, Problem> {
+        self.authorize(&caller.claims, Right::Admin)?;
+        check_token(&request)?;
+        let disabled = || {
+            let detail = "no key with sign: true is configured (control_plane.auth.keys)";
+            Problem::new(Code::SigningDisabled, detail)
+        };
+        let authenticator = self.inner.authenticator.as_ref().ok_or_else(disabled)?;
+        let time = now();
+        let expires = time.as_millis() / 1000 + i64::from(request.expires_in_s);
+        let record = TokenRecord {
+            id: uuid::Uuid::now_v7().to_string(),
+            subject: request.subject,
+            roles: request.roles,
+            layer: request.layer,
+            create_time: time,
+            expire_time: Timestamp::from_millis(expires * 1000),
+            revoke_time: None,
+        };
+        let token = NewToken {
+            subject: &record.subject,
+            roles: &record.roles,
+            layer: record.layer.as_deref(),
+            issued_s: time.as_millis() / 1000,
+            expires_s: expires,
+            id: &record.id,
+        };
+        let text = authenticator.sign(&token).ok_or_else(disabled)?;
+        let text = text.map_err(|error| {
+            tracing::error!(%error, "a token could not be signed");
+            Problem::new(Code::Internal, "the token could not be signed; see the log of the service")
+        })?;
+        let entry = Self::entry(caller, "token_create", None);
+        let added = self.inner.store.add_token(&record, &entry).await;
+        added.map_err(|error| unavailable(&error))?;
+        Ok(Answer {
+            revision: self.revision(),
+            replayed: false,
+            value: (record, text),
+        })
+    }
+
+    /// Tokens that were given out and have not run out.
+    ///
+    /// # Errors
+    /// [`Problem`].
+    pub async fn tokens(&self, caller: &Caller, read: &ReadOptions) -> Result<Answer<Vec<TokenRecord>>, Problem> {
+        self.authorize(&caller.claims, Right::Admin)?;
+        let state = self.read_state(read).await?;
+        let tokens = self.inner.store.tokens(now()).await.map_err(|error| unavailable(&error))?;
+        Ok(Answer {
+            revision: state.revision(),
+            replayed: false,
+            value: tokens,
+        })
+    }
+
+    /// Takes a token back: it is refused everywhere within five seconds and its streams end.
+    ///
+    /// # Errors
+    /// [`Code::NotFound`] for an id that was not given out here, or other [`Problem`]s.
+    pub async fn revoke_token(&self, caller: &Caller, id: &str) -> Result<Answer<()>, Problem> {
+        self.authorize(&caller.claims, Right::Admin)?;
+        let entry = Self::entry(caller, "token_revoke", None);
+        let revoked = self.inner.store.revoke_token(id, now(), &entry).await;
+        if !revoked.map_err(|error| unavailable(&error))? {
+            return Err(Problem::new(Code::NotFound, format!("no token has the id {id:?}")));
+        }
+        self.refresh_tokens().await.map_err(|error| unavailable(&error))?;
+        Ok(Answer {
+            revision: self.revision(),
+            replayed: false,
+            value: (),
+        })
+    }
+
+    /// Reads which tokens are revoked.
+    pub(super) async fn refresh_tokens(&self) -> Result<(), StoreError> {
+        let tokens = self.inner.store.tokens(now()).await?;
+        let revoked = tokens.into_iter().filter(|token| token.revoke_time.is_some());
+        let entries = revoked.map(|token| (token.id, token.expire_time.as_millis() / 1000));
+        self.inner.revocations.learn(entries, now().as_millis() / 1000);
+        Ok(())
+    }
+}
+
+fn check_token(request: &TokenRequest) -> Result<(), Problem> {
+    let mut faults = Vec::new();
+    let mut fault = |pointer: &str, detail: String| {
+        faults.push(FieldFault {
+            pointer: pointer.to_owned(),
+            code: Code::ValidationFailed,
+            detail,
+            document: None,
+        });
+    };
+    if request.subject.is_empty() || request.subject.len() > MAX_SUBJECT {
+        fault("/subject", format!("1 to {MAX_SUBJECT} bytes"));
+    }
+    if request.roles.is_empty() {
+        fault("/roles", "at least one role".to_owned());
+    }
+    for (index, role) in request.roles.iter().enumerate() {
+        if let Err(error) = role.parse::<Role>() {
+            fault(&format!("/roles/{index}"), error);
+        }
+    }
+    let is_worker = request.roles.iter().any(|role| role == Role::Worker.as_str());
+    match &request.layer {
+        None if is_worker => fault("/layer", "a worker's token is bound to a layer".to_owned()),
+        Some(layer) => {
+            if let Err(error) = layer.parse::<LayerName>() {
+                fault("/layer", format!("the name {error}"));
+            }
+        }
+        None => {}
+    }
+    if request.expires_in_s == 0 || request.expires_in_s > MAX_EXPIRES_S {
+        fault("/expires_in_s", format!("1 to {MAX_EXPIRES_S}"));
+    }
+    if faults.is_empty() { Ok(()) } else { Err(Problem::faults(faults)) }
+}

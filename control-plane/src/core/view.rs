@@ -1,0 +1,108 @@
+//! What a token sees and may change: the one place that decides it, for reads and writes of every interface.
+
+use blaze_domain::config::{Code, Document, Key, Kind, Problem};
+use blaze_domain::LayerName;
+
+use super::placement::{Placement, placement};
+use super::state::State;
+use crate::auth::{Claims, Right, Role, allowed};
+
+/// What one token sees.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct View {
+    layer: Option<LayerName>,
+}
+
+/// The view of a token.
+pub(crate) fn view(claims: &Claims) -> View {
+    View {
+        layer: claims.layer.clone(),
+    }
+}
+
+/// Refuses what a role does not allow.
+pub(crate) fn authorize(claims: &Claims, right: Right) -> Result<(), Problem> {
+    allowed(claims, right).map_err(|reason| {
+        let needed = match right {
+            Right::Read => "viewer, operator, admin or worker",
+            Right::Write => "operator or admin",
+            Right::Admin => "admin",
+            Right::Sync => "worker",
+        };
+        let detail = format!("the token has no role for this; it needs {needed}");
+        Problem::new(Code::PermissionDenied, detail).because(reason)
+    })
+}
+
+/// Whether a token may have secrets as text.
+pub(crate) fn may_reveal(claims: &Claims) -> bool {
+    claims.roles.iter().any(|role| role == Role::Admin.as_str())
+}
+
+impl View {
+    /// The layer that it is bound to.
+    pub(crate) fn layer(&self) -> Option<&LayerName> {
+        self.layer.as_ref()
+    }
+
+    /// Whether a document that counts there is seen.
+    pub(crate) fn sees(&self, placement: &Placement) -> bool {
+        self.layer.as_ref().is_none_or(|layer| placement.visible.contains(layer))
+    }
+
+    /// Whether a document is seen.
+    pub(crate) fn sees_document(&self, state: &State, document: &Document) -> bool {
+        self.layer.is_none() || self.sees(&placement(state, document))
+    }
+
+    /// Refuses a layer that is not the token's own.
+    pub(crate) fn check_layer(&self, layer: &LayerName) -> Result<(), Problem> {
+        match &self.layer {
+            Some(own) if own != layer => Err(self.outside(&format!("layer {layer}"))),
+            _ => Ok(()),
+        }
+    }
+
+    /// Refuses a key that is outside the view, existing or not.
+    pub(crate) fn check_key(&self, state: &State, key: &Key) -> Result<(), Problem> {
+        if self.layer.is_none() {
+            return Ok(());
+        }
+        match state.get(key) {
+            Some(held) if self.sees_document(state, &held.document) => Ok(()),
+            _ => Err(self.outside(&key.to_string())),
+        }
+    }
+
+    /// Refuses a change that reaches beyond the layer that the token is bound to: the document before and after must count
+    /// in that layer alone. Services belong to all layers.
+    pub(crate) fn check_write(
+        &self,
+        (before, was): (&State, Option<&Document>),
+        (after, is): (&State, Option<&Document>),
+    ) -> Result<(), Problem> {
+        let Some(layer) = &self.layer else { return Ok(()) };
+        for (state, document) in [(before, was), (after, is)] {
+            let Some(document) = document else { continue };
+            let own = match document.key.kind() {
+                Kind::Service => false,
+                Kind::Rollout => {
+                    super::placement::rollout_target(document).is_none_or(|target| target.kind() != Kind::Service)
+                        && self.sees_document(state, document)
+                }
+                Kind::Layer | Kind::Node | Kind::Instance => placement(state, document).layer.as_ref() == Some(layer),
+            };
+            if !own {
+                return Err(self.outside(&document.key.to_string()));
+            }
+        }
+        Ok(())
+    }
+
+    /// The same answer whether it exists or not.
+    pub(crate) fn outside(&self, what: &str) -> Problem {
+        let layer = self.layer.as_ref().map_or("", LayerName::as_str);
+        let detail = format!("the token is bound to layer {layer}; {what} is outside of it");
+        Problem::new(Code::PermissionDenied, detail).because("outside the token's layer")
+    }
+}

@@ -1,0 +1,232 @@
+//! Documents in a MongoDB replica set, for any number of processes.
+//!
+//! ```text
+//! meta        store: identity, min_version · lease: who migrates · trimmed · settled
+//! migrations  which steps are done
+//! events      one record per commit, _id = revision: the log, and the fence between writers
+//! versions    one record per change, _id = key@revision: history; with `events` the log
+//! documents   one record per document, _id = key: what is now; and `floor`, the guard of the log
+//! audit, idempotency, tokens     removed by the server when they expire
+//! ```
+//!
+//! A group of commits is one transaction, acknowledged when a majority of the members has it in its journal. No process
+//! leads. Documents are JSON texts: the database looks at no key or value of a user's.
+
+mod archive;
+mod client;
+mod commit;
+mod errors;
+mod follow;
+mod migrate;
+mod read;
+mod rows;
+mod stale;
+mod transaction;
+mod trim;
+mod upkeep;
+
+use std::future::IntoFuture;
+
+use async_trait::async_trait;
+use blaze_domain::config::{Document as Config, Key, Timestamp};
+use futures::TryStreamExt as _;
+use mongodb::bson::Document;
+use mongodb::{ClientSession, Cursor};
+use tokio::sync::mpsc;
+use tokio::time::Instant;
+
+use self::client::{Tables, USUAL, limited_steps};
+use self::errors::store_error;
+use self::follow::Stream;
+use super::encode::encode_group;
+use super::migrate::{Migrations, Plan};
+use super::upkeep::{Piece, Restored, Rewriter, Upkeep};
+use super::{
+    Archive, AuditEntry, AuditQuery, CommitBatch, CommitError, CommitLog, CommitRecord, IdempotencyRecord, Snapshot,
+    StoreError, TokenRecord, TokenStore, Version,
+};
+
+/// A store in a database of a replica set.
+pub struct MongoStore {
+    tables: Tables,
+    /// Which opening of the store this is; marks its commits, so that it need not be told of them.
+    writer: String,
+    /// The session of all commits; none before the first one, and while one is under way.
+    session: tokio::sync::Mutex<Option<ClientSession>>,
+    /// Commits of others.
+    stream: tokio::sync::Mutex<Option<Stream>>,
+    /// A revision that could not be written because an open transaction holds it, and since when.
+    held: parking_lot::Mutex<Option<(i64, Instant)>>,
+}
+
+impl MongoStore {
+    /// Connects to the replica set, and migrates the database.
+    ///
+    /// # Errors
+    /// [`StoreError::Refused`] for a server without transactions, a wrong password, a database of a newer program;
+    /// [`StoreError::Unavailable`] if no primary answers.
+    pub async fn open(uri: &str, database: &str) -> Result<Self, StoreError> {
+        Self::open_with(uri, database, &Migrations::default()).await
+    }
+
+    /// As [`MongoStore::open`], with migrations of one's own.
+    ///
+    /// # Errors
+    /// As [`MongoStore::open`].
+    pub async fn open_with(uri: &str, database: &str, migrations: &Migrations) -> Result<Self, StoreError> {
+        let store = Self::connect(uri, database).await?;
+        store.migrate(migrations).await?;
+        Ok(store)
+    }
+
+    /// What opening the database would migrate. Nothing is changed.
+    ///
+    /// # Errors
+    /// As [`MongoStore::open`].
+    pub async fn plan(uri: &str, database: &str, migrations: &Migrations) -> Result<Plan, StoreError> {
+        let store = Self::connect(uri, database).await?;
+        let plan = store.plan_of(migrations).await;
+        store.close().await;
+        plan
+    }
+
+    /// Reads a whole database while other processes use it, as [`Upkeep::export`] does.
+    ///
+    /// # Errors
+    /// [`StoreError::Refused`] if it is of another schema than this program's; [`StoreError`].
+    pub async fn export_beside(uri: &str, database: &str, pieces: mpsc::Sender<Piece>) -> Result<(), StoreError> {
+        let store = Self::connect(uri, database).await?;
+        let plan = store.plan_of(&Migrations::default()).await?;
+        let done = match plan.pending.is_empty() {
+            true => store.send_all(&pieces).await,
+            false => Err(StoreError::Refused(format!(
+                "{database} is no store of schema {}: run `blaze-config migrate` first",
+                plan.target
+            ))),
+        };
+        store.close().await;
+        done
+    }
+
+    async fn connect(uri: &str, database: &str) -> Result<Self, StoreError> {
+        Ok(Self {
+            tables: Tables::connect(uri, database).await?,
+            writer: uuid::Uuid::now_v7().to_string(),
+            session: tokio::sync::Mutex::new(None),
+            stream: tokio::sync::Mutex::new(None),
+            held: parking_lot::Mutex::new(None),
+        })
+    }
+}
+
+/// Reads all that a query finds.
+async fn collect<T>(
+    find: impl IntoFuture<Output = mongodb::error::Result<Cursor<Document>>>,
+    read: impl Fn(&Document) -> Result<T, StoreError>,
+) -> Result<Vec<T>, StoreError> {
+    limited_steps(USUAL, async {
+        let mut cursor = find.into_future().await.map_err(store_error)?;
+        let mut all = Vec::new();
+        while let Some(found) = cursor.try_next().await.map_err(store_error)? {
+            all.push(read(&found)?);
+        }
+        Ok(all)
+    })
+    .await
+}
+
+#[async_trait]
+impl CommitLog for MongoStore {
+    fn is_shared(&self) -> bool {
+        true
+    }
+
+    async fn load(&self) -> Result<Snapshot, StoreError> {
+        self.read_all().await
+    }
+
+    async fn head(&self) -> Result<u64, StoreError> {
+        self.read_head().await
+    }
+
+    async fn commits_after(&self, revision: u64, limit: usize) -> Result<CommitBatch, StoreError> {
+        self.read_commits(revision, limit).await
+    }
+
+    async fn commit(&self, records: &[CommitRecord]) -> Result<(), CommitError> {
+        let group = encode_group(records).map_err(CommitError::NotWritten)?;
+        self.write_group(&group).await
+    }
+
+    async fn foreign_commit(&self) {
+        self.wait_for_others().await;
+    }
+}
+
+#[async_trait]
+impl Archive for MongoStore {
+    async fn versions(&self, key: &Key, below: Option<u64>, limit: usize) -> Result<Vec<Version>, StoreError> {
+        self.read_versions(key, below, limit).await
+    }
+
+    async fn documents_at(&self, revision: u64, until: u64) -> Result<Vec<(Key, Option<Config>)>, StoreError> {
+        self.read_documents_at(revision, until).await
+    }
+
+    async fn trim(&self, floor: u64, keep_versions: u32) -> Result<u64, StoreError> {
+        self.trim_to(floor, keep_versions).await
+    }
+
+    async fn revision_before(&self, time: Timestamp) -> Result<u64, StoreError> {
+        self.find_revision_before(time).await
+    }
+
+    async fn append_audit(&self, entries: &[AuditEntry]) -> Result<(), StoreError> {
+        self.write_audit(entries).await
+    }
+
+    async fn audit(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, StoreError> {
+        self.read_audit(query).await
+    }
+
+    async fn idempotency(&self, id: &str, now: Timestamp) -> Result<Option<IdempotencyRecord>, StoreError> {
+        self.read_answer(id, now).await
+    }
+}
+
+#[async_trait]
+impl TokenStore for MongoStore {
+    async fn add_token(&self, token: &TokenRecord, audit: &AuditEntry) -> Result<(), StoreError> {
+        self.write_token(token, audit).await
+    }
+
+    async fn revoke_token(&self, id: &str, time: Timestamp, audit: &AuditEntry) -> Result<bool, StoreError> {
+        self.write_revocation(id, time, audit).await
+    }
+
+    async fn tokens(&self, now: Timestamp) -> Result<Vec<TokenRecord>, StoreError> {
+        self.read_tokens(now).await
+    }
+}
+
+#[async_trait]
+impl Upkeep for MongoStore {
+    async fn export(&self, pieces: mpsc::Sender<Piece>) -> Result<(), StoreError> {
+        self.send_all(&pieces).await
+    }
+
+    async fn import(&self, pieces: mpsc::Receiver<Piece>) -> Result<Restored, StoreError> {
+        self.receive_all(pieces).await
+    }
+
+    async fn rewrite(&self, make: Rewriter<'_>) -> Result<u64, StoreError> {
+        self.rewrite_all(make, &|| Box::pin(std::future::ready(Ok(())))).await
+    }
+
+    async fn close(&self) {
+        // Both hold on to the connection.
+        self.stream.lock().await.take();
+        self.session.lock().await.take();
+        self.tables.client.clone().shutdown().immediate(true).await;
+    }
+}
