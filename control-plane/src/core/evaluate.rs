@@ -397,13 +397,7 @@ fn precondition(state: &State, request: &Request, item: &Item, current: Option<&
 
 /// A document as a user wrote it, checked by itself.
 fn written(state: &State, input: &DocumentInput, current: Option<&Document>) -> Result<Target, Box<Problem>> {
-    let mut faults = spec::check(&input.key, &input.labels, &input.annotations, &input.spec);
-    let mut stored_form = |pointer: &str, value: &Value| {
-        if matches!(secret::Secret::of(value), Some(Ok(secret::Secret::Stored { .. }))) {
-            faults.push(invalid(&format!("/spec{pointer}"), "this form of a secret is the store's own; write its text"));
-        }
-    };
-    secret::walk(&input.spec, &mut stored_form);
+    let faults = spec::check(&input.key, &input.labels, &input.annotations, &input.spec);
     let bytes = spec::document_size(&input.labels, &input.annotations, &input.spec);
     if bytes > MAX_DOCUMENT_BYTES {
         let detail = format!("{} has {bytes} bytes, at most {MAX_DOCUMENT_BYTES} are allowed", input.key);

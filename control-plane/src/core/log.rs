@@ -78,13 +78,10 @@ impl Log {
         self.inner.read().floor
     }
 
-    /// Raises the floor.
+    /// Raises the floor. What is in memory stays: a watch that began above the old floor still gets all of it.
     pub(crate) fn raise_floor(&self, floor: u64) {
         let mut inner = self.inner.write();
         inner.floor = inner.floor.max(floor);
-        while inner.commits.front().is_some_and(|applied| applied.commit.revision <= inner.floor) {
-            inner.drop_oldest();
-        }
     }
 
     /// Applies the next commit; one that is there already changes nothing. `false` if one before it is missing.

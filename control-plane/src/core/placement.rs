@@ -1,6 +1,6 @@
 //! Where a document counts: which layers see it, and where an instance runs.
 
-use blaze_domain::config::{Document, Key, Kind};
+use blaze_domain::config::{Document, Key, Kind, spec};
 use blaze_domain::{LayerName, NodeName};
 use serde_json::Value;
 
@@ -116,14 +116,7 @@ fn instance(state: &State, document: &Document) -> Placement {
 
 /// The document that a roll-out changes.
 pub(crate) fn rollout_target(rollout: &Document) -> Option<Key> {
-    let target = rollout.spec_member("target")?;
-    let text = |member: &str| target.get(member).and_then(Value::as_str);
-    let kind: Kind = text("kind")?.parse().ok()?;
-    let service = match text("service") {
-        Some(service) => Some(service.parse().ok()?),
-        None => None,
-    };
-    Key::new(kind, service, text("name")?.parse().ok()?).ok()
+    spec::rollout_target(rollout.spec_member("target")?)
 }
 
 /// Whether a roll-out is on its canaries now.

@@ -3,7 +3,8 @@
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
-use blaze_domain::config::{Code, Document, FieldFault, Key, MAX_EFFECTIVE_BYTES};
+use blaze_domain::config::spec::NODE_FILE_SECTIONS;
+use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_EFFECTIVE_BYTES};
 use blaze_domain::ServiceName;
 use jsonschema::{Draft, PatternOptions, Validator};
 use lru::LruCache;
@@ -23,21 +24,6 @@ const CACHED: NonZeroUsize = NonZeroUsize::MIN.saturating_add(511);
 pub(crate) const MAX_FAULTS: usize = 20;
 /// Compiled patterns may take so many bytes each.
 const PATTERN_BYTES: usize = 1 << 20;
-/// Sections of the node file: they have a schema of their own.
-pub(crate) const NODE_FILE_SECTIONS: &[&str] = &[
-    "brokers",
-    "cache",
-    "config",
-    "control_plane",
-    "database",
-    "flow",
-    "layer",
-    "log",
-    "monitor",
-    "node",
-    "worker",
-];
-
 /// A schema, in full and without `required`.
 struct Compiled {
     full: Validator,
@@ -94,8 +80,18 @@ impl Schemas {
     /// Checks every effective configuration that changed documents can concern: its size, and its service's schema.
     pub(crate) fn check_effective(&self, state: &State, keys: &[Key], keyring: &Keyring) -> Vec<FieldFault> {
         let any_schema = |service: &ServiceName| schema_of(state, service).is_some();
+        // Most writes concern no schema at all; to find the places that they touch would cost more than the write.
+        let matters = |key: &&Key| {
+            state.has_big()
+                || match (key.kind(), key.service_name()) {
+                    (Kind::Service, _) => any_schema(&ServiceName::from(key.name())),
+                    (Kind::Instance, Some(service)) => any_schema(service),
+                    _ => state.has_schemas(),
+                }
+        };
+        let keys: Vec<Key> = keys.iter().filter(matters).cloned().collect();
         let mut faults = Vec::new();
-        for at in touched(state, keys) {
+        for at in touched(state, &keys) {
             if faults.len() >= MAX_FAULTS {
                 break;
             }

@@ -470,12 +470,13 @@ async fn a_bound_token_sees_and_changes_its_own_layer_alone() {
             false => assert_eq!(code(result), Code::PermissionDenied, "{name}"),
         }
     }
-    let service = w.service.patch(&bound, &key("Service/slam"), json!({ "spec": { "description": "x" } }), Precondition::Any);
-    assert_eq!(code(service.await), Code::PermissionDenied);
-    let away = w.service.patch(&bound, &key("Node/robot-1"), json!({ "spec": { "layer": "fog" } }), Precondition::Any);
-    assert_eq!(code(away.await), Code::PermissionDenied);
-    let own = w.service.patch(&bound, &key("Node/robot-1"), json!({ "spec": { "type": "mobile" } }), Precondition::Any);
-    assert!(own.await.is_ok());
+    let patch = async |name: &str, spec: Value| {
+        let patch = json!({ "spec": spec });
+        w.service.patch(&bound, &key(name), patch, Precondition::Any).await
+    };
+    assert_eq!(code(patch("Service/slam", json!({ "description": "x" })).await), Code::PermissionDenied);
+    assert_eq!(code(patch("Node/robot-1", json!({ "layer": "fog" })).await), Code::PermissionDenied);
+    assert!(patch("Node/robot-1", json!({ "type": "mobile" })).await.is_ok());
     assert!(w.service.authorize(&caller(&["viewer"], None).claims, Right::Write).is_err());
     assert!(w.service.authorize(&caller(&["admin", "wizard"], None).claims, Right::Read).is_err());
 }

@@ -35,6 +35,10 @@ impl Held {
     fn is_big(&self) -> bool {
         self.bytes > BIG_BYTES
     }
+
+    fn has_schema(&self) -> bool {
+        self.document.key.kind() == Kind::Service && self.document.spec_member("schema").is_some()
+    }
 }
 
 /// The document as users see it.
@@ -60,6 +64,8 @@ pub(crate) struct State {
     on_node: OrdSet<(DocumentName, Key)>,
     /// Documents that are large enough to matter for the size of effective configurations.
     big: usize,
+    /// Services with a schema.
+    schemas: usize,
 }
 
 /// What one commit did to one document, as far as watchers care.
@@ -144,6 +150,11 @@ impl State {
         self.big > 0
     }
 
+    /// Whether any service has a schema.
+    pub(crate) fn has_schemas(&self) -> bool {
+        self.schemas > 0
+    }
+
     /// Puts a document, in place of the one of the same key.
     pub(crate) fn put(&mut self, document: Arc<Document>) {
         let held = Arc::new(Held::new(document));
@@ -152,6 +163,7 @@ impl State {
             self.index(index).insert(entry);
         }
         self.big += usize::from(held.is_big());
+        self.schemas += usize::from(held.has_schema());
         self.documents.insert(held.document.key.clone(), held);
     }
 
@@ -162,6 +174,7 @@ impl State {
             self.index(index).remove(&entry);
         }
         self.big -= usize::from(held.is_big());
+        self.schemas -= usize::from(held.has_schema());
         Some(held)
     }
 

@@ -187,7 +187,9 @@ async fn a_file_of_schema_1_is_read_and_migrated() {
         assert_eq!(history.iter().map(|version| version.change.op).collect::<Vec<_>>(), [Op::Delete, Op::Create]);
         assert_eq!(store.commits_after(2, 10).await.unwrap().commits.len(), 3);
         let before = store.documents_at(2, 5).await.unwrap();
-        assert_eq!(before.iter().filter(|(_, document)| document.is_some()).count(), 2);
+        assert_eq!(before.len(), 3);
+        let held: Vec<String> = before.iter().filter(|(_, document)| document.is_some()).map(|(key, _)| key.to_string()).collect();
+        assert_eq!(held, ["Node/robot-1"]);
         let query = AuditQuery {
             limit: 10,
             ..AuditQuery::default()

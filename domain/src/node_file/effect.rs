@@ -14,7 +14,6 @@ const SECTIONS: &[&str] = &[
     "database",
     "monitor",
     "worker",
-    "control_plane",
 ];
 
 /// Keys without effect in sections that have one: one warning per section.

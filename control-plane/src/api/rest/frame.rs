@@ -50,7 +50,7 @@ pub(super) fn note(response: &mut Response, change: impl FnOnce(&mut Served)) {
 }
 
 /// Answers a request, whatever happens to it.
-pub(super) async fn serve(rest: Arc<Rest>, api: Router, pages: Router, mut incoming: Request) -> Response {
+pub(super) async fn serve(rest: &Rest, api: Router, pages: Router, mut incoming: Request) -> Response {
     let started = Instant::now();
     let visit = Visit {
         request_id: request::request_id(incoming.headers()).into(),
@@ -61,13 +61,13 @@ pub(super) async fn serve(rest: Arc<Rest>, api: Router, pages: Router, mut incom
     let method = incoming.method().clone();
     let trace = request::traceparent(incoming.headers()).cloned();
     incoming.extensions_mut().insert(visit.clone());
-    let answer = AssertUnwindSafe(gate::pass(&rest, api, pages, &visit, incoming)).catch_unwind();
+    let answer = AssertUnwindSafe(gate::pass(rest, api, pages, &visit, incoming)).catch_unwind();
     let mut response = match answer.await {
         Ok(response) => response,
         Err(_) => reply::problem(&panicked(&method), &visit.path, &visit.request_id),
     };
     finish(&mut response, &visit, trace);
-    record(&rest, &response, &visit, &method, started);
+    record(rest, &response, &visit, &method, started);
     response
 }
 

@@ -84,6 +84,6 @@ pub fn router(service: ConfigService, options: RestOptions) -> Router {
     let pages = pages::router(&rest, &document);
     Router::new().fallback(move |request: Request| {
         let (rest, api, pages) = (Arc::clone(&rest), api.clone(), pages.clone());
-        async move { frame::serve(rest, api, pages, request).await }
+        async move { frame::serve(&rest, api, pages, request).await }
     })
 }

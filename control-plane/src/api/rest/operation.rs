@@ -137,7 +137,7 @@ impl Call {
 }
 
 /// Answers a request whose path and method are those of a route.
-pub(super) async fn run(rest: Arc<Rest>, route: &'static Route, request: Request) -> Response {
+pub(super) async fn run(rest: &Arc<Rest>, route: &'static Route, request: Request) -> Response {
     let extensions = request.extensions();
     let (Some(visit), Some(Known(claims))) = (extensions.get::<Visit>().cloned(), extensions.get::<Known>().cloned())
     else {
@@ -156,7 +156,7 @@ pub(super) async fn run(rest: Arc<Rest>, route: &'static Route, request: Request
         request_id: visit.request_id.to_string(),
         address: visit.address,
     };
-    let answer = answer(&rest, route, &visit, &names, &caller, request).await;
+    let answer = answer(rest, route, &visit, &names, &caller, request).await;
     let mut response = answer.unwrap_or_else(|problem| {
         if matches!(problem.code, Code::PermissionDenied | Code::Unauthenticated) {
             let key = route.action.kind().and_then(|kind| names.key(kind));

@@ -1,5 +1,6 @@
 //! Answers: JSON with the revision that they reflect, problems, and what the log is to say of them.
 
+use std::convert::Infallible;
 use std::sync::Arc;
 
 use axum::body::Body;
@@ -7,6 +8,8 @@ use axum::http::header::{CONTENT_TYPE, ETAG, HeaderName, LOCATION, RETRY_AFTER};
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::Response;
 use blaze_domain::config::{Code, Document, Key, Problem};
+use bytes::Bytes;
+use futures::stream;
 use serde_json::Value;
 
 use super::headers::{BLAZE_REVISION, IDEMPOTENT_REPLAYED, etag};
@@ -40,9 +43,10 @@ pub(super) fn json(status: StatusCode, revision: u64, value: &Value) -> Response
     response
 }
 
-/// No body.
+/// No body, and no length either: that of a 304 would be the document's.
 pub(super) fn empty(status: StatusCode, revision: u64) -> Response {
-    let mut response = Response::new(Body::empty());
+    let nothing = stream::empty::<Result<Bytes, Infallible>>();
+    let mut response = Response::new(Body::from_stream(nothing));
     *response.status_mut() = status;
     set(&mut response, BLAZE_REVISION, &revision.to_string());
     response

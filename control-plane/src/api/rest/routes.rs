@@ -29,17 +29,6 @@ pub(super) enum Verb {
 }
 
 impl Verb {
-    #[cfg(test)]
-    pub(super) fn method(self) -> axum::http::Method {
-        match self {
-            Self::Get => axum::http::Method::GET,
-            Self::Post => axum::http::Method::POST,
-            Self::Put => axum::http::Method::PUT,
-            Self::Patch => axum::http::Method::PATCH,
-            Self::Delete => axum::http::Method::DELETE,
-        }
-    }
-
     fn filter(self) -> MethodFilter {
         match self {
             Self::Get => MethodFilter::GET,
@@ -325,7 +314,7 @@ pub(super) fn mount(rest: &Arc<Rest>) -> OpenApiRouter {
         let rest = Arc::clone(rest);
         let handler = move |request: Request| {
             let rest = Arc::clone(&rest);
-            async move { operation::run(rest, route, request).await }
+            async move { operation::run(&rest, route, request).await }
         };
         router.routes((Vec::new(), openapi::paths(route), on(route.verb.filter(), handler)))
     })

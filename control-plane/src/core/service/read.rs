@@ -60,7 +60,8 @@ fn page_size(limit: Option<u32>) -> Result<usize, Problem> {
 impl ConfigService {
     /// The state that a read shows: as new as every write acknowledged before it, unless older data is allowed.
     pub(super) async fn read_state(&self, read: &ReadOptions) -> Result<State, Problem> {
-        if !read.cached {
+        // Where nobody else writes, a write is acknowledged after it can be read here.
+        if !read.cached && self.inner.store.is_shared() {
             self.inner.barrier.revision().await?;
         }
         if let Some(wanted) = read.min_revision {
