@@ -69,7 +69,7 @@ pub fn generate_key(algorithm: Algorithm) -> Result<GeneratedKey, String> {
 pub fn generate_encryption_key() -> Result<Zeroizing<String>, String> {
     let mut bytes = Zeroizing::new([0_u8; ENCRYPTION_KEY_BYTES]);
     rand::fill(&mut *bytes).map_err(|_| "the key could not be made".to_owned())?;
-    let text = Zeroizing::new(STANDARD.encode(&*bytes));
+    let text = Zeroizing::new(STANDARD.encode(bytes.as_slice()));
     Ok(Zeroizing::new(format!("{}\n", *text)))
 }
 

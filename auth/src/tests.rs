@@ -419,10 +419,10 @@ fn useless_tokens_are_not_signed() {
 fn only_fit_keys_of_a_jwk_set_are_used() {
     let pair = RsaKeyPair::from_pkcs8(&der_of(files(Algorithm::Rs256).0)).unwrap();
     let (modulus, exponent) = rsa_numbers(pair.public_key().as_ref());
-    let rsa = |more: Value| jwk(json!({ "kty": "RSA", "n": modulus, "e": exponent }), more);
+    let rsa = |more: Value| jwk(json!({ "kty": "RSA", "n": modulus, "e": exponent }), &more);
     let ed_bytes = der_of(files(Algorithm::EdDsa).1);
     let x = to_base64url(&ed_bytes[ed_bytes.len() - 32..]);
-    let ed = |more: Value| jwk(json!({ "kty": "OKP", "crv": "Ed25519", "x": x }), more);
+    let ed = |more: Value| jwk(json!({ "kty": "OKP", "crv": "Ed25519", "x": x }), &more);
     let small = to_base64url(&[0xb5; 128]);
     let text = json!({ "keys": [
         rsa(json!({ "kid": "r1", "alg": "RS256", "use": "sig", "x5c": ["…"] })),
@@ -460,7 +460,7 @@ fn only_fit_keys_of_a_jwk_set_are_used() {
     assert!(read_jwks(b"{\"keys\":[]}").unwrap().keys.is_empty());
 }
 
-fn jwk(mut base: Value, more: Value) -> Value {
+fn jwk(mut base: Value, more: &Value) -> Value {
     for (name, value) in more.as_object().unwrap() {
         base[name] = value.clone();
     }

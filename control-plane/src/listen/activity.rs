@@ -80,27 +80,30 @@ impl Activity {
         }
     }
 
-    /// When to look again, unless there is a reason now. Nothing that begins later can be due before that time.
+    /// When to look again, unless there is a reason now. What begins later is not due before that time.
     fn look(&self, limits: &ListenLimits, now: Instant) -> Result<Instant, Trouble> {
         let state = self.state.lock();
-        let mut next = now + limits.stream_stall;
+        let mut next = now + limits.stream_stall.min(limits.idle_timeout);
         if let Some(oldest) = state.offered.values().min() {
-            next = *oldest + limits.stream_stall;
-            if next <= now {
+            let end = *oldest + limits.stream_stall;
+            if end <= now {
                 return Err(Trouble::Stalled);
             }
+            next = next.min(end);
         }
-        let (quiet, trouble) = if state.has_served {
-            (limits.idle_timeout, Trouble::Idle)
-        } else {
-            (limits.head_timeout, Trouble::NoRequest)
-        };
-        let quiet_end = state.since + quiet;
-        match (state.running, quiet_end <= now) {
-            (0, true) => Err(trouble),
-            (0, false) => Ok(next.min(quiet_end)),
-            _ => Ok(next.min(now + quiet)),
+        if state.running == 0 {
+            let (quiet, trouble) = if state.has_served {
+                (limits.idle_timeout, Trouble::Idle)
+            } else {
+                (limits.head_timeout, Trouble::NoRequest)
+            };
+            let end = state.since + quiet;
+            if end <= now {
+                return Err(trouble);
+            }
+            next = next.min(end);
         }
+        Ok(next)
     }
 
     /// Waits until no request has run for a while.

@@ -15,9 +15,9 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::mpsc;
 
+use super::StoreError;
 use super::migrate::hex;
 use super::upkeep::{BackupHead, BackupRow, Counts, Piece, Restored, Upkeep};
-use super::StoreError;
 
 /// Pieces between the store and the file.
 const QUEUE: usize = 256;

@@ -13,7 +13,10 @@ async fn store() -> SqliteStore {
 
 async fn filled() -> SqliteStore {
     let store = store().await;
-    store.commit(&[record(commit(1, &["a", "b"])), record(commit(2, &["a"]))]).await.unwrap();
+    store
+        .commit(&[record(commit(1, &["a", "b"])), record(commit(2, &["a"]))])
+        .await
+        .unwrap();
     store.append_audit(&[audit("x", None)]).await.unwrap();
     store.add_token(&token("t"), &audit("y", None)).await.unwrap();
     store
@@ -41,7 +44,9 @@ async fn what_was_backed_up_is_restored() {
         documents
     };
     assert_eq!(sorted(after.documents), sorted(before.documents));
-    new.commit(&[record(commit(restored.revision + 1, &["c"]))]).await.unwrap();
+    new.commit(&[record(commit(restored.revision + 1, &["c"]))])
+        .await
+        .unwrap();
 }
 
 #[tokio::test]
@@ -49,7 +54,12 @@ async fn a_file_that_was_cut_or_changed_restores_nothing() {
     let file = backup_of(&filled().await).await;
     let new = store().await;
     let text = String::from_utf8(file.clone()).unwrap();
-    let without_a_line: String = text.split_inclusive('\n').enumerate().filter(|(at, _)| *at != 2).map(|(_, line)| line).collect();
+    let without_a_line: String = text
+        .split_inclusive('\n')
+        .enumerate()
+        .filter(|(at, _)| *at != 2)
+        .map(|(_, line)| line)
+        .collect();
     let mut broken = vec![
         Vec::new(),
         b"{}\n".to_vec(),

@@ -188,7 +188,10 @@ pub(crate) fn decode_commits(
     let mut commits = Vec::with_capacity(events.len());
     for event in events {
         if event.revision != expected {
-            return Err(corrupt(format_args!("commit {expected} is missing before {}", event.revision)));
+            return Err(corrupt(format_args!(
+                "commit {expected} is missing before {}",
+                event.revision
+            )));
         }
         expected += 1;
         let mut changes = Vec::new();
@@ -222,7 +225,10 @@ impl VersionRow {
     }
 
     pub(crate) fn into_version(self) -> Result<Version, StoreError> {
-        let key: Key = self.key.parse().map_err(|error| corrupt(format_args!("a version: {error}")))?;
+        let key: Key = self
+            .key
+            .parse()
+            .map_err(|error| corrupt(format_args!("a version: {error}")))?;
         Ok(Version {
             revision: unsigned(self.revision)?,
             time: Timestamp::from_millis(self.time),
@@ -240,7 +246,10 @@ impl VersionRow {
 
 impl DocumentRow {
     pub(crate) fn into_document(self) -> Result<Document, StoreError> {
-        let key: Key = self.key.parse().map_err(|error| corrupt(format_args!("a document: {error}")))?;
+        let key: Key = self
+            .key
+            .parse()
+            .map_err(|error| corrupt(format_args!("a document: {error}")))?;
         document(key, &self.document)
     }
 }
@@ -295,7 +304,8 @@ fn audit_key(kind: &str, service: Option<&str>, name: &str) -> Result<Key, Store
         Some(service) => format!("{kind}/{service}/{name}"),
         None => format!("{kind}/{name}"),
     };
-    text.parse().map_err(|error| corrupt(format_args!("an audit entry: {error}")))
+    text.parse()
+        .map_err(|error| corrupt(format_args!("an audit entry: {error}")))
 }
 
 impl IdempotencyRow {

@@ -10,14 +10,22 @@ fn value() -> impl Strategy<Value = Value> {
         Just(Value::Null),
         any::<bool>().prop_map(Value::from),
         any::<i64>().prop_map(Value::from),
-        any::<f64>().prop_filter("JSON has no others", |float| float.is_finite()).prop_map(Value::from),
+        any::<f64>()
+            .prop_filter("JSON has no others", |float| float.is_finite())
+            .prop_map(Value::from),
         ".{0,12}".prop_map(Value::from),
     ];
-    let key = prop_oneof![Just("$secret".to_owned()), Just("a.b".to_owned()), Just("_id".to_owned()), ".{0,6}"];
+    let key = prop_oneof![
+        Just("$secret".to_owned()),
+        Just("a.b".to_owned()),
+        Just("_id".to_owned()),
+        ".{0,6}"
+    ];
     leaf.prop_recursive(4, 40, 6, move |inner| {
         prop_oneof![
             prop::collection::vec(inner.clone(), 0..6).prop_map(Value::from),
-            prop::collection::vec((key.clone(), inner), 0..6).prop_map(|members| Value::Object(members.into_iter().collect())),
+            prop::collection::vec((key.clone(), inner), 0..6)
+                .prop_map(|members| Value::Object(members.into_iter().collect())),
         ]
     })
 }
@@ -97,7 +105,10 @@ fn commits_that_do_not_follow_one_another_are_refused() {
 fn garbage_is_corrupt_and_no_panic() {
     let key: Key = "Node/a".parse().unwrap();
     for text in ["", "{}", "null", "{\"uid\":1}", "[1", "\u{0}"] {
-        assert!(matches!(document(key.clone(), text), Err(StoreError::Corrupt(_))), "{text}");
+        assert!(
+            matches!(document(key.clone(), text), Err(StoreError::Corrupt(_))),
+            "{text}"
+        );
     }
     let row = DocumentRow {
         key: "nonsense".to_owned(),

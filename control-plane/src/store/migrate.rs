@@ -154,7 +154,12 @@ pub(crate) async fn plan(target: &dyn Target, migrations: &Migrations) -> Result
     let (done, min_version) = target.state().await?;
     let pending = pending(target.kind(), migrations, &done, min_version)?;
     let complete = |migration: &&Migration| !pending.iter().any(|step| step.done.number == migration.number);
-    let version = migrations.all.iter().take_while(complete).map(|migration| migration.number).max();
+    let version = migrations
+        .all
+        .iter()
+        .take_while(complete)
+        .map(|migration| migration.number)
+        .max();
     Ok(Plan {
         version: version.unwrap_or(0),
         target: migrations.version(),
@@ -274,16 +279,46 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
 fn first() -> Migration {
     const SQL: &str = include_str!("../../migrations/0001_first.sql");
     let commands: [(&'static str, &'static str); 10] = [
-        ("events", include_str!("../../migrations/0001_first.mongodb/01_events.json")),
-        ("versions", include_str!("../../migrations/0001_first.mongodb/02_versions.json")),
-        ("documents", include_str!("../../migrations/0001_first.mongodb/03_documents.json")),
-        ("audit", include_str!("../../migrations/0001_first.mongodb/04_audit.json")),
-        ("idempotency", include_str!("../../migrations/0001_first.mongodb/05_idempotency.json")),
-        ("tokens", include_str!("../../migrations/0001_first.mongodb/06_tokens.json")),
-        ("versions-index", include_str!("../../migrations/0001_first.mongodb/07_versions_index.json")),
-        ("audit-index", include_str!("../../migrations/0001_first.mongodb/08_audit_index.json")),
-        ("idempotency-index", include_str!("../../migrations/0001_first.mongodb/09_idempotency_index.json")),
-        ("tokens-index", include_str!("../../migrations/0001_first.mongodb/10_tokens_index.json")),
+        (
+            "events",
+            include_str!("../../migrations/0001_first.mongodb/01_events.json"),
+        ),
+        (
+            "versions",
+            include_str!("../../migrations/0001_first.mongodb/02_versions.json"),
+        ),
+        (
+            "documents",
+            include_str!("../../migrations/0001_first.mongodb/03_documents.json"),
+        ),
+        (
+            "audit",
+            include_str!("../../migrations/0001_first.mongodb/04_audit.json"),
+        ),
+        (
+            "idempotency",
+            include_str!("../../migrations/0001_first.mongodb/05_idempotency.json"),
+        ),
+        (
+            "tokens",
+            include_str!("../../migrations/0001_first.mongodb/06_tokens.json"),
+        ),
+        (
+            "versions-index",
+            include_str!("../../migrations/0001_first.mongodb/07_versions_index.json"),
+        ),
+        (
+            "audit-index",
+            include_str!("../../migrations/0001_first.mongodb/08_audit_index.json"),
+        ),
+        (
+            "idempotency-index",
+            include_str!("../../migrations/0001_first.mongodb/09_idempotency_index.json"),
+        ),
+        (
+            "tokens-index",
+            include_str!("../../migrations/0001_first.mongodb/10_tokens_index.json"),
+        ),
     ];
     Migration {
         number: 1,

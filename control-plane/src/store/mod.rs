@@ -61,9 +61,9 @@ pub async fn open_with(
     match section {
         StoreSection::Sqlite { path } => Ok(Arc::new(SqliteStore::open_with(path, migrations, supervisor).await?)),
         #[cfg(feature = "mongodb")]
-        StoreSection::MongoDb { uri, database } => {
-            Ok(Arc::new(MongoStore::open_with(uri.reveal(), database, migrations).await?))
-        }
+        StoreSection::MongoDb { uri, database } => Ok(Arc::new(
+            MongoStore::open_with(uri.reveal(), database, migrations).await?,
+        )),
         #[cfg(not(feature = "mongodb"))]
         StoreSection::MongoDb { .. } => Err(without_mongodb()),
     }

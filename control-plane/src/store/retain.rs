@@ -31,7 +31,12 @@ impl Trimmed {
 pub(crate) fn to_spare(revisions: &[i64], floor: i64, keep: u32) -> Vec<i64> {
     let holding = revisions.iter().position(|revision| *revision <= floor);
     let kept = usize::try_from(keep).unwrap_or(usize::MAX);
-    let after = |place: usize| revisions.get(place.saturating_add(1).max(kept)..).unwrap_or_default().to_vec();
+    let after = |place: usize| {
+        revisions
+            .get(place.saturating_add(1).max(kept)..)
+            .unwrap_or_default()
+            .to_vec()
+    };
     holding.map(after).unwrap_or_default()
 }
 
@@ -75,10 +80,28 @@ mod tests {
 
     #[test]
     fn only_documents_that_changed_are_looked_at_again() {
-        let then = Trimmed { floor: 10, head: 50, keep: 3 };
+        let then = Trimmed {
+            floor: 10,
+            head: 50,
+            keep: 3,
+        };
         assert!(then.ranges_until(then).is_empty());
-        assert_eq!(then.ranges_until(Trimmed { floor: 20, head: 60, keep: 3 }), [(10, 20), (50, 60)]);
-        assert_eq!(then.ranges_until(Trimmed { floor: 10, head: 60, keep: 3 }), [(50, 60)]);
+        assert_eq!(
+            then.ranges_until(Trimmed {
+                floor: 20,
+                head: 60,
+                keep: 3
+            }),
+            [(10, 20), (50, 60)]
+        );
+        assert_eq!(
+            then.ranges_until(Trimmed {
+                floor: 10,
+                head: 60,
+                keep: 3
+            }),
+            [(50, 60)]
+        );
         assert_eq!(then.ranges_until(Trimmed { keep: 2, ..then }), [(-1, 50)]);
     }
 }

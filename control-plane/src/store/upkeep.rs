@@ -115,7 +115,9 @@ impl<T: Store + Upkeep> FullStore for T {}
 
 /// The new text of a stored document, if it gets one.
 pub(crate) fn rewritten(key: &str, text: &str, make: Rewriter<'_>) -> Result<Option<String>, StoreError> {
-    let key = key.parse().map_err(|error| super::encode::corrupt(format_args!("{key:?}: {error}")))?;
+    let key = key
+        .parse()
+        .map_err(|error| super::encode::corrupt(format_args!("{key:?}: {error}")))?;
     match make(&document(key, text)?) {
         None => Ok(None),
         Some(new) => Ok(Some(document_text(&new)?).filter(|new| new != text)),

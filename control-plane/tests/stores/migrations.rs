@@ -8,7 +8,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use blaze_config::store::migrate::{Action, Migration, Migrations, Step};
 use blaze_config::store::{
-    Archive as _, AuditQuery, Change, Commit, CommitLog as _, CommitRecord, Op, SqliteStore, TokenStore as _, Upkeep as _,
+    Archive as _, AuditQuery, Change, Commit, CommitLog as _, CommitRecord, Op, SqliteStore, TokenStore as _,
+    Upkeep as _,
 };
 use blaze_domain::config::{Document, Key, Timestamp};
 use blaze_runtime::supervisor::Supervisor;
@@ -25,7 +26,9 @@ const MARK: &str = "migrated";
 fn further() -> Migration {
     let table = |name: &'static str| Step {
         name: Cow::Borrowed(name),
-        action: Action::Sql(Cow::Owned(format!("CREATE TABLE {name} (id INTEGER PRIMARY KEY) STRICT"))),
+        action: Action::Sql(Cow::Owned(format!(
+            "CREATE TABLE {name} (id INTEGER PRIMARY KEY) STRICT"
+        ))),
     };
     Migration {
         number: 2,
@@ -110,25 +113,37 @@ fn migrate_and_die(path: &Path, at: &str) {
         .stdin(Stdio::null())
         .output()
         .unwrap();
-    assert!(!output.status.success(), "{at}: {}", String::from_utf8_lossy(&output.stdout));
+    assert!(
+        !output.status.success(),
+        "{at}: {}",
+        String::from_utf8_lossy(&output.stdout)
+    );
     let text = String::from_utf8_lossy(&output.stdout);
-    assert!(text.contains("migrating"), "{at}: {text}{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        text.contains("migrating"),
+        "{at}: {text}{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "started by a_migration_that_is_killed_goes_on, which needs its death"]
 async fn migrates_and_dies() {
-    let Some(path) = std::env::var_os(VICTIM_FILE) else { return };
+    let Some(path) = std::env::var_os(VICTIM_FILE) else {
+        return;
+    };
     let at = std::env::var_os(VICTIM_DIES).unwrap_or_default().into_string().unwrap();
     println!("\nmigrating");
     if let Ok(documents) = at.parse() {
         LEFT.store(documents, Ordering::Relaxed);
     }
-    let migrations = Migrations::default().and([further()]).after_step(Arc::new(move |label: &str| {
-        if label == at {
-            std::process::abort();
-        }
-    }));
+    let migrations = Migrations::default()
+        .and([further()])
+        .after_step(Arc::new(move |label: &str| {
+            if label == at {
+                std::process::abort();
+            }
+        }));
     let store = SqliteStore::open_with(Path::new(&path), &migrations, &Supervisor::new("victim")).await;
     store.unwrap().close().await;
 }
@@ -144,12 +159,25 @@ async fn a_migration_that_is_killed_goes_on() {
     let mut pending = SqliteStore::plan(&path, &migrations).await.unwrap().pending.len();
     assert_eq!(pending, 3);
     // After each step, and within the rewriting of documents (10,000 and as many versions).
-    for (at, done) in [("0002 test/before", 1), ("1", 0), ("5000", 0), ("11000", 0), ("0002 test/mark", 1), ("0002 test/after", 1)] {
+    for (at, done) in [
+        ("0002 test/before", 1),
+        ("1", 0),
+        ("5000", 0),
+        ("11000", 0),
+        ("0002 test/mark", 1),
+        ("0002 test/after", 1),
+    ] {
         migrate_and_die(&path, at);
         pending -= done;
-        assert_eq!(SqliteStore::plan(&path, &migrations).await.unwrap().pending.len(), pending, "{at}");
+        assert_eq!(
+            SqliteStore::plan(&path, &migrations).await.unwrap().pending.len(),
+            pending,
+            "{at}"
+        );
     }
-    let store = SqliteStore::open_with(&path, &migrations, &Supervisor::new("last")).await.unwrap();
+    let store = SqliteStore::open_with(&path, &migrations, &Supervisor::new("last"))
+        .await
+        .unwrap();
     let snapshot = store.load().await.unwrap();
     assert_eq!((snapshot.revision, snapshot.documents.len()), (1, 10_000));
     for found in &snapshot.documents {
@@ -158,37 +186,70 @@ async fn a_migration_that_is_killed_goes_on() {
         assert_eq!(*found, expected);
     }
     let versions = store.commits_after(0, 10).await.unwrap().commits;
-    assert!(versions[0].changes.iter().all(|change| change.document.annotations.contains_key(MARK)));
+    assert!(
+        versions[0]
+            .changes
+            .iter()
+            .all(|change| change.document.annotations.contains_key(MARK))
+    );
     // A program of before can go on with it, as `min_version` did not rise.
     store.close().await;
-    SqliteStore::open(&path, &Supervisor::new("before")).await.unwrap().close().await;
+    SqliteStore::open(&path, &Supervisor::new("before"))
+        .await
+        .unwrap()
+        .close()
+        .await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_file_of_schema_1_is_read_and_migrated() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("store.db");
-    rusqlite::Connection::open(&path).unwrap().execute_batch(SCHEMA_1).unwrap();
+    rusqlite::Connection::open(&path)
+        .unwrap()
+        .execute_batch(SCHEMA_1)
+        .unwrap();
     let plan = SqliteStore::plan(&path, &Migrations::default()).await.unwrap();
-    assert_eq!((plan.version, plan.pending.len()), (1, plan.target as usize - 1), "its checksum is that of the released one");
+    assert_eq!(
+        (plan.version, plan.pending.len()),
+        (1, plan.target as usize - 1),
+        "its checksum is that of the released one"
+    );
     for migrations in [Migrations::default(), Migrations::default().and([further()])] {
-        let store = SqliteStore::open_with(&path, &migrations, &Supervisor::new("test")).await.unwrap();
+        let store = SqliteStore::open_with(&path, &migrations, &Supervisor::new("test"))
+            .await
+            .unwrap();
         let snapshot = store.load().await.unwrap();
         assert_eq!((snapshot.revision, snapshot.floor), (5, 2));
         assert_eq!(snapshot.store_id, "0197c1d2-7f3a-7b64-9c1e-2f6f0a4e8d11");
-        let mut keys: Vec<String> = snapshot.documents.iter().map(|document| document.key.to_string()).collect();
+        let mut keys: Vec<String> = snapshot
+            .documents
+            .iter()
+            .map(|document| document.key.to_string())
+            .collect();
         keys.sort();
         assert_eq!(keys, ["Instance/slam/0", "Layer/edge", "Service/slam"]);
-        let slam = snapshot.documents.iter().find(|document| document.key.to_string() == "Service/slam").unwrap();
+        let slam = snapshot
+            .documents
+            .iter()
+            .find(|document| document.key.to_string() == "Service/slam")
+            .unwrap();
         assert_eq!(slam.spec["config"]["camera"]["rate_hz"], json!(15));
         assert_eq!(slam.labels["site"], "lab");
         let key: Key = "Node/robot-1".parse().unwrap();
         let history = store.versions(&key, None, 10).await.unwrap();
-        assert_eq!(history.iter().map(|version| version.change.op).collect::<Vec<_>>(), [Op::Delete, Op::Create]);
+        assert_eq!(
+            history.iter().map(|version| version.change.op).collect::<Vec<_>>(),
+            [Op::Delete, Op::Create]
+        );
         assert_eq!(store.commits_after(2, 10).await.unwrap().commits.len(), 3);
         let before = store.documents_at(2, 5).await.unwrap();
         assert_eq!(before.len(), 3);
-        let held: Vec<String> = before.iter().filter(|(_, document)| document.is_some()).map(|(key, _)| key.to_string()).collect();
+        let held: Vec<String> = before
+            .iter()
+            .filter(|(_, document)| document.is_some())
+            .map(|(key, _)| key.to_string())
+            .collect();
         assert_eq!(held, ["Node/robot-1"]);
         let query = AuditQuery {
             limit: 10,
@@ -196,7 +257,13 @@ async fn a_file_of_schema_1_is_read_and_migrated() {
         };
         assert_eq!(store.audit(&query).await.unwrap().len(), 2);
         assert_eq!(store.tokens(Timestamp::from_millis(0)).await.unwrap().len(), 1);
-        assert!(store.idempotency("request", Timestamp::from_millis(0)).await.unwrap().is_some());
+        assert!(
+            store
+                .idempotency("request", Timestamp::from_millis(0))
+                .await
+                .unwrap()
+                .is_some()
+        );
         store.close().await;
     }
 }

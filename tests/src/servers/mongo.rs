@@ -21,7 +21,10 @@ const PORT_ATTEMPTS: usize = 3;
 /// When the server does not answer.
 pub fn drop_mongo_database(uri: &str, database: &str) -> anyhow::Result<()> {
     if let Some(port) = loopback_port(uri) {
-        mongo_wire::command(&Endpoint::loopback(port), &bson::doc! { "dropDatabase": 1, "$db": database })?;
+        mongo_wire::command(
+            &Endpoint::loopback(port),
+            &bson::doc! { "dropDatabase": 1, "$db": database },
+        )?;
     }
     Ok(())
 }
@@ -31,15 +34,38 @@ pub fn drop_mongo_database(uri: &str, database: &str) -> anyhow::Result<()> {
 /// # Errors
 /// When the server does not answer or refuses.
 pub fn mongo_command(uri: &str, database: &str, command: &serde_json::Value) -> anyhow::Result<bson::Document> {
+    let (server, document) = for_wire(uri, database, command)?;
+    let answer = mongo_wire::command(&server, &document)?;
+    anyhow::ensure!(
+        mongo_wire::is_ok(&answer) && !answer.contains_key("writeErrors"),
+        "{command}: {answer}"
+    );
+    Ok(answer)
+}
+
+/// Leaves a transaction open as a process does that is killed within it: begins it as a client called `app_name`, does
+/// one command, and goes.
+///
+/// # Errors
+/// As [`mongo_command`].
+pub fn abandon_mongo_transaction(
+    uri: &str,
+    database: &str,
+    app_name: &str,
+    command: &serde_json::Value,
+) -> anyhow::Result<()> {
+    let (server, document) = for_wire(uri, database, command)?;
+    mongo_wire::abandon(&server, app_name, document)
+}
+
+fn for_wire(uri: &str, database: &str, command: &serde_json::Value) -> anyhow::Result<(Endpoint, bson::Document)> {
     let port = loopback_port(uri).with_context(|| format!("{uri} is no server of this machine"))?;
     let mut document = bson::Document::new();
     for (name, value) in command.as_object().context("a command is an object")? {
         document.insert(name, bson::Bson::try_from(value.clone())?);
     }
     document.insert("$db", database);
-    let answer = mongo_wire::command(&Endpoint::loopback(port), &document)?;
-    anyhow::ensure!(mongo_wire::is_ok(&answer) && !answer.contains_key("writeErrors"), "{command}: {answer}");
-    Ok(answer)
+    Ok((Endpoint::loopback(port), document))
 }
 
 /// Inserts a document, given in extended JSON, on a server of this machine.
@@ -47,7 +73,11 @@ pub fn mongo_command(uri: &str, database: &str, command: &serde_json::Value) -> 
 /// # Errors
 /// As [`mongo_command`].
 pub fn mongo_insert(uri: &str, database: &str, table: &str, document: &serde_json::Value) -> anyhow::Result<()> {
-    mongo_command(uri, database, &serde_json::json!({ "insert": table, "documents": [document] }))?;
+    mongo_command(
+        uri,
+        database,
+        &serde_json::json!({ "insert": table, "documents": [document] }),
+    )?;
     Ok(())
 }
 
@@ -89,7 +119,11 @@ impl MongoServer {
     pub fn start(options: MongoOptions) -> anyhow::Result<Self> {
         let mut attempt = 1;
         loop {
-            let port = if options.port == 0 { ports::free()? } else { options.port };
+            let port = if options.port == 0 {
+                ports::free()?
+            } else {
+                options.port
+            };
             let process = ServerProcess::new("mongo")?;
             std::fs::create_dir(process.folder().join("data"))?;
             let server = Self {

@@ -21,7 +21,10 @@ const ALREADY_INITIALIZED: i32 = 23;
 /// # Errors
 /// When there is no answer within two seconds, or one that is not MongoDB's.
 pub(super) fn pid(server: &Endpoint) -> anyhow::Result<i64> {
-    let answer = command(server, &doc! { "serverStatus": 1, "repl": 0, "metrics": 0, "$db": "admin" })?;
+    let answer = command(
+        server,
+        &doc! { "serverStatus": 1, "repl": 0, "metrics": 0, "$db": "admin" },
+    )?;
     match answer.get("pid") {
         Some(bson::Bson::Int64(pid)) => Ok(*pid),
         Some(bson::Bson::Int32(pid)) => Ok(i64::from(*pid)),
@@ -58,10 +61,40 @@ pub(super) fn is_ok(answer: &Document) -> bool {
 /// # Errors
 /// As [`pid`].
 pub(super) fn command(server: &Endpoint, command: &Document) -> anyhow::Result<Document> {
-    let mut stream = server.connect(TIMEOUT)?;
+    exchange(&mut connect(server)?, command)
+}
+
+/// Begins a transaction as the client that the driver calls by a name, does one command in it, and goes without a word:
+/// what a process leaves that is killed.
+///
+/// # Errors
+/// As [`pid`], and when the server refuses.
+pub(super) fn abandon(server: &Endpoint, app_name: &str, mut command: Document) -> anyhow::Result<()> {
+    let mut stream = connect(server)?;
+    let parts = doc! { "name": "blaze-tests", "version": "1" };
+    let client = doc! { "application": { "name": app_name }, "driver": parts, "os": { "type": "any" } };
+    exchange(&mut stream, &doc! { "hello": 1, "client": client, "$db": "admin" })?;
+    command.insert("lsid", doc! { "id": bson::Uuid::new() });
+    command.insert("txnNumber", 1_i64);
+    command.insert("startTransaction", true);
+    command.insert("autocommit", false);
+    let answer = exchange(&mut stream, &command)?;
+    anyhow::ensure!(
+        is_ok(&answer) && !answer.contains_key("writeErrors"),
+        "{command}: {answer}"
+    );
+    Ok(())
+}
+
+fn connect(server: &Endpoint) -> anyhow::Result<TcpStream> {
+    let stream = server.connect(TIMEOUT)?;
     stream.set_read_timeout(Some(TIMEOUT))?;
+    Ok(stream)
+}
+
+fn exchange(stream: &mut TcpStream, command: &Document) -> anyhow::Result<Document> {
     stream.write_all(&request(command)?)?;
-    let length = usize::try_from(number(&mut stream)?)?;
+    let length = usize::try_from(number(stream)?)?;
     anyhow::ensure!((16 + 5..=MAX_ANSWER).contains(&length), "an answer of {length} bytes");
     let mut answer = vec![0; length - 4];
     stream.read_exact(&mut answer)?;
@@ -98,6 +131,9 @@ mod tests {
         assert_eq!(request[..4], i32::try_from(request.len()).unwrap().to_le_bytes());
         assert_eq!(request[12..16], OP_MSG.to_le_bytes());
         assert_eq!(request[16..21], [0; 5]);
-        assert_eq!(Document::from_reader(&request[21..]).unwrap().get_str("$db").unwrap(), "admin");
+        assert_eq!(
+            Document::from_reader(&request[21..]).unwrap().get_str("$db").unwrap(),
+            "admin"
+        );
     }
 }

@@ -4,7 +4,9 @@ use std::io::{BufRead as _, BufReader};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use blaze_config::store::MongoStore;
+use blaze_config::store::{CommitLog as _, MongoStore};
+use blaze_tests::servers::abandon_mongo_transaction;
+use serde_json::json;
 
 use super::support::{Ledger, Told, check, server, store, write_one, write_through};
 
@@ -20,7 +22,9 @@ async fn a_killed_writer_holds_up_nobody_and_lost_nothing() {
     let mut longest = Duration::ZERO;
     for round in 0..rounds {
         let uri = server.uri();
-        let written = tokio::task::spawn_blocking(move || write_until_killed(&uri, 40 + round * 7)).await.unwrap();
+        let written = tokio::task::spawn_blocking(move || write_until_killed(&uri, 40 + round * 7))
+            .await
+            .unwrap();
         println!("round {round}: {} lines", written.len());
         ledger.extend(written);
         longest = longest.max(write_through(&store, &mut ledger).await);
@@ -30,11 +34,44 @@ async fn a_killed_writer_holds_up_nobody_and_lost_nothing() {
     check(&store, &ledger).await;
 }
 
+/// The server would end such a transaction only after a minute.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_transaction_that_nobody_works_on_is_ended() {
+    let server = server();
+    let (store, other) = (store(&server).await, store(&server).await);
+    let mut ledger = Ledger::new();
+    write_through(&store, &mut ledger).await;
+    for _ in 0..3 {
+        let next = store.head().await.unwrap() + 1;
+        let event = json!({ "_id": { "$numberLong": next.to_string() }, "batch": "abandoned" });
+        let insert = json!({ "insert": "events", "documents": [event] });
+        abandon_mongo_transaction(&server.uri(), "blaze_test", "blaze-config/blaze_test", &insert).unwrap();
+        // Both are held up, and one of them ends it.
+        let mut of_other = Ledger::new();
+        let (one, two) = tokio::join!(write_through(&store, &mut ledger), write_through(&other, &mut of_other));
+        ledger.extend(of_other);
+        println!("written after {one:?} and {two:?}");
+        assert!(one.max(two) < Duration::from_secs(5), "{one:?} {two:?}");
+        assert!(one.max(two) > Duration::from_millis(300), "nobody was held up");
+    }
+    // That of another program is left alone.
+    let next = store.head().await.unwrap() + 1;
+    let insert = json!({ "insert": "events", "documents": [{ "_id": { "$numberLong": next.to_string() } }] });
+    abandon_mongo_transaction(&server.uri(), "blaze_test", "somebody else", &insert).unwrap();
+    let held = tokio::time::timeout(Duration::from_secs(2), write_through(&store, &mut Ledger::new())).await;
+    assert!(held.is_err(), "{held:?}");
+}
+
 /// Runs a writer until it has told of so many commits, and kills it. The last one may be told of in part, or not at all:
 /// so what it began counts as unknown until it says more.
 fn write_until_killed(uri: &str, count: usize) -> Ledger {
     let mut child = Command::new(std::env::current_exe().unwrap())
-        .args(["--ignored", "--exact", "--nocapture", "killed::writes_until_it_is_killed"])
+        .args([
+            "--ignored",
+            "--exact",
+            "--nocapture",
+            "killed::writes_until_it_is_killed",
+        ])
         .env(VICTIM, uri)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
@@ -46,6 +83,8 @@ fn write_until_killed(uri: &str, count: usize) -> Ledger {
         let line = lines.next().unwrap().unwrap();
         note(&line, &mut ledger);
     }
+    // Not on a condition: it is to hit any point of a commit.
+    std::thread::sleep(Duration::from_micros(u64::try_from(count % 13).unwrap() * 400));
     child.kill().unwrap();
     child.wait().unwrap();
     // What was in the pipe.

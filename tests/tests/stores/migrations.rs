@@ -39,7 +39,10 @@ impl Database {
     }
 
     async fn pending(&self, migrations: &Migrations) -> Vec<String> {
-        MongoStore::plan(&self.uri, &self.name, migrations).await.unwrap().pending
+        MongoStore::plan(&self.uri, &self.name, migrations)
+            .await
+            .unwrap()
+            .pending
     }
 }
 
@@ -70,7 +73,10 @@ fn further() -> Migration {
                     function: mark,
                 },
             },
-            command("after", r#"{"createIndexes":"further","indexes":[{"key":{"a":1},"name":"a"}]}"#),
+            command(
+                "after",
+                r#"{"createIndexes":"further","indexes":[{"key":{"a":1},"name":"a"}]}"#,
+            ),
         ],
     }
 }
@@ -101,26 +107,38 @@ fn migrate_and_die(database: &Database, at: &str) {
         .output()
         .unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
-    assert!(text.contains("migrating"), "{at}: {text}{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        text.contains("migrating"),
+        "{at}: {text}{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     assert!(!output.status.success(), "{at}: {text}");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "started by a_migration_that_is_killed_goes_on, which needs its death"]
 async fn migrates_and_dies() {
-    let Some(database) = std::env::var_os(VICTIM_DATABASE) else { return };
+    let Some(database) = std::env::var_os(VICTIM_DATABASE) else {
+        return;
+    };
     let at = std::env::var_os(VICTIM_DIES).unwrap_or_default().into_string().unwrap();
     println!("\nmigrating");
     if let Ok(documents) = at.parse() {
         LEFT.store(documents, Ordering::Relaxed);
     }
-    let migrations = Migrations::default().and([further()]).after_step(Arc::new(move |label: &str| {
-        if label == at {
-            std::process::abort();
-        }
-    }));
+    let migrations = Migrations::default()
+        .and([further()])
+        .after_step(Arc::new(move |label: &str| {
+            if label == at {
+                std::process::abort();
+            }
+        }));
     let uri = shared_mongo().unwrap();
-    MongoStore::open_with(&uri, &database.to_string_lossy(), &migrations).await.unwrap().close().await;
+    MongoStore::open_with(&uri, &database.to_string_lossy(), &migrations)
+        .await
+        .unwrap()
+        .close()
+        .await;
 }
 
 /// A lease whose holder was killed runs out; tests do not wait for that.
@@ -149,7 +167,13 @@ async fn a_migration_that_is_killed_goes_on() {
     }
     let migrations = Migrations::default().and([further()]);
     let mut pending = 3;
-    for (at, done) in [("0002 test/before", 1), ("1", 0), ("350", 0), ("0002 test/mark", 1), ("0002 test/after", 1)] {
+    for (at, done) in [
+        ("0002 test/before", 1),
+        ("1", 0),
+        ("350", 0),
+        ("0002 test/mark", 1),
+        ("0002 test/after", 1),
+    ] {
         migrate_and_die(&database, at);
         end_lease(&database).await;
         pending -= done;
@@ -159,15 +183,27 @@ async fn a_migration_that_is_killed_goes_on() {
     write_through(&store, &mut ledger).await;
     check(&store, &ledger).await;
     let snapshot = database.open(&migrations).await.unwrap().load().await.unwrap();
-    let marked = snapshot.documents.iter().filter(|document| document.annotations.contains_key(MARK)).count();
-    assert_eq!(marked, usize::try_from(COMMITS).unwrap(), "all but the two of the last commit");
+    let marked = snapshot
+        .documents
+        .iter()
+        .filter(|document| document.annotations.contains_key(MARK))
+        .count();
+    assert_eq!(
+        marked,
+        usize::try_from(COMMITS).unwrap(),
+        "all but the two of the last commit"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn several_that_start_at_once_migrate_once() {
     let database = Database::new();
     let migrations = Migrations::default().and([further()]);
-    let (a, b, c) = tokio::join!(database.open(&migrations), database.open(&migrations), database.open(&migrations));
+    let (a, b, c) = tokio::join!(
+        database.open(&migrations),
+        database.open(&migrations),
+        database.open(&migrations)
+    );
     let stores = [a.unwrap(), b.unwrap(), c.unwrap()];
     let mut ids = Vec::new();
     for store in &stores {
@@ -186,9 +222,17 @@ async fn a_program_that_is_too_old_refuses_to_start() {
     let database = Database::new();
     let mut newer = further();
     newer.min_version = 2;
-    database.open(&Migrations::default().and([newer])).await.unwrap().close().await;
+    database
+        .open(&Migrations::default().and([newer]))
+        .await
+        .unwrap()
+        .close()
+        .await;
     let error = database.open(&Migrations::default()).await.err().unwrap();
-    assert!(matches!(&error, StoreError::Refused(text) if text.contains("newer blaze-config")), "{error}");
+    assert!(
+        matches!(&error, StoreError::Refused(text) if text.contains("newer blaze-config")),
+        "{error}"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -199,22 +243,39 @@ async fn a_database_of_schema_1_is_read_and_migrated() {
         let table = line["collection"].as_str().unwrap();
         mongo_insert(&database.uri, &database.name, table, &line["document"]).unwrap();
     }
-    assert_eq!(database.pending(&Migrations::default()).await, Vec::<String>::new(), "its checksum is the released one");
+    assert_eq!(
+        database.pending(&Migrations::default()).await,
+        Vec::<String>::new(),
+        "its checksum is the released one"
+    );
     for migrations in [Migrations::default(), Migrations::default().and([further()])] {
         let store = database.open(&migrations).await.unwrap();
         let snapshot = store.load().await.unwrap();
         assert_eq!((snapshot.revision, snapshot.floor), (5, 2));
         assert_eq!(snapshot.store_id, "0197c1d2-7f3a-7b64-9c1e-2f6f0a4e8d11");
-        let mut keys: Vec<String> = snapshot.documents.iter().map(|document| document.key.to_string()).collect();
+        let mut keys: Vec<String> = snapshot
+            .documents
+            .iter()
+            .map(|document| document.key.to_string())
+            .collect();
         keys.sort();
         assert_eq!(keys, ["Instance/slam/0", "Layer/edge", "Service/slam"]);
         let key: Key = "Node/robot-1".parse().unwrap();
         let history = store.versions(&key, None, 10).await.unwrap();
-        assert_eq!(history.iter().map(|version| version.change.op).collect::<Vec<_>>(), [Op::Delete, Op::Create]);
+        assert_eq!(
+            history.iter().map(|version| version.change.op).collect::<Vec<_>>(),
+            [Op::Delete, Op::Create]
+        );
         assert_eq!(store.commits_after(2, 10).await.unwrap().commits.len(), 3);
         assert_eq!(store.documents_at(2, 5).await.unwrap().len(), 3);
         assert_eq!(store.tokens(Timestamp::from_millis(0)).await.unwrap().len(), 1);
-        assert!(store.idempotency("request", Timestamp::from_millis(0)).await.unwrap().is_some());
+        assert!(
+            store
+                .idempotency("request", Timestamp::from_millis(0))
+                .await
+                .unwrap()
+                .is_some()
+        );
         store.close().await;
     }
 }

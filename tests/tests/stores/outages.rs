@@ -29,11 +29,20 @@ async fn a_killed_server_shows_at_once_and_comes_back() {
         server.kill().unwrap();
         head_is_unavailable(&store).await;
         let begin = Instant::now();
-        let error = store.commit(&[record(store_head(&ledger) + 1, "lost")]).await.unwrap_err();
-        assert!(matches!(error, CommitError::NotWritten(StoreError::Unavailable(_))), "{error}");
+        let error = store
+            .commit(&[record(store_head(&ledger) + 1, "lost")])
+            .await
+            .unwrap_err();
+        assert!(
+            matches!(error, CommitError::NotWritten(StoreError::Unavailable(_))),
+            "{error}"
+        );
         assert!(begin.elapsed() < Duration::from_secs(11), "{:?}", begin.elapsed());
         server.restart().unwrap();
-        println!("written {:?} after the restart", write_through(&store, &mut ledger).await);
+        println!(
+            "written {:?} after the restart",
+            write_through(&store, &mut ledger).await
+        );
         // Who follows hears of it again.
         let head = store.head().await.unwrap();
         let begin = Instant::now();
@@ -66,12 +75,17 @@ async fn a_server_that_stands_still_is_unavailable_and_goes_on() {
         server.freeze().unwrap();
         head_is_unavailable(&store).await;
         let begin = Instant::now();
-        let told = store.commit(&[record(store_head(&ledger) + 1, &format!("frozen-{}", ledger.len()))]).await;
+        let told = store
+            .commit(&[record(store_head(&ledger) + 1, &format!("frozen-{}", ledger.len()))])
+            .await;
         println!("{told:?} after {:?}", begin.elapsed());
         assert!(told.is_err());
         assert!(begin.elapsed() < Duration::from_secs(20), "{:?}", begin.elapsed());
         server.thaw().unwrap();
-        println!("written {:?} after it goes on", write_through(&store, &mut ledger).await);
+        println!(
+            "written {:?} after it goes on",
+            write_through(&store, &mut ledger).await
+        );
     }
     check(&store, &ledger).await;
 }
@@ -102,7 +116,12 @@ async fn what_a_writer_is_told_is_true_while_the_server_is_killed() {
     ledger.extend(other);
     write_through(&stores[0], &mut ledger).await;
     let count = |told: Told| ledger.values().filter(|found| **found == told).count();
-    println!("yes {} no {} unknown {}", count(Told::Yes), count(Told::No), count(Told::Unknown));
+    println!(
+        "yes {} no {} unknown {}",
+        count(Told::Yes),
+        count(Told::No),
+        count(Told::Unknown)
+    );
     check(&stores[1], &ledger).await;
     assert!(count(Told::Yes) > 20);
 }

@@ -17,7 +17,10 @@ async fn a_server_without_transactions_is_refused() {
     };
     let server = MongoServer::start(options).unwrap();
     let error = refusal(&server.uri(), "blaze").await;
-    assert!(matches!(&error, StoreError::Refused(text) if text.contains("--replSet")), "{error}");
+    assert!(
+        matches!(&error, StoreError::Refused(text) if text.contains("--replSet")),
+        "{error}"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -116,11 +116,17 @@ pub(crate) async fn check(store: &MongoStore, ledger: &Ledger) {
         }
         commits.extend(batch.commits);
     }
-    let there: BTreeMap<&str, u64> = commits.iter().map(|commit| (commit.batch.as_str(), commit.revision)).collect();
+    let there: BTreeMap<&str, u64> = commits
+        .iter()
+        .map(|commit| (commit.batch.as_str(), commit.revision))
+        .collect();
     assert_eq!(there.len(), commits.len(), "a batch is there twice");
     for (batch, told) in ledger {
         match told {
-            Told::Yes => assert!(there.contains_key(batch.as_str()), "{batch} was acknowledged and is lost"),
+            Told::Yes => assert!(
+                there.contains_key(batch.as_str()),
+                "{batch} was acknowledged and is lost"
+            ),
             Told::No => assert!(!there.contains_key(batch.as_str()), "{batch} was refused and is there"),
             Told::Unknown => {}
         }

@@ -16,7 +16,7 @@ use crate::api::json as answers;
 use crate::core::{Answer, ApplyItem, ApplyReport, ApplyRequest};
 
 /// Documents of one request, at most.
-pub(super) const MAX_ITEMS: usize = 1000;
+const MAX_ITEMS: usize = 1000;
 /// Faults that are told, at most.
 const MAX_FAULTS: usize = 100;
 

@@ -5,13 +5,12 @@ use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
 use blaze_domain::config::{Code, FieldFault, Key, Problem, Timestamp};
-use blaze_domain::LayerName;
 
 use super::super::committer::{now, unavailable};
 use super::super::page::Position;
 use super::super::types::{Answer, Caller, Page, ReadOptions, TokenRequest};
 use super::ConfigService;
-use crate::auth::{Claims, NewToken, Right, Role};
+use crate::auth::{Claims, NewToken, Right};
 use crate::store::{AuditEntry, AuditQuery, StoreError, TokenRecord};
 
 /// Refusals per address and second that are written to the audit; the rest is counted.
@@ -20,8 +19,6 @@ const DENIALS_PER_S: u32 = 10;
 const MAX_ADDRESSES: usize = 4096;
 /// Longest life of a token, in seconds: a year.
 const MAX_EXPIRES_S: u32 = 31_536_000;
-/// Longest subject, in bytes.
-const MAX_SUBJECT: usize = 256;
 /// Entries of a page of the audit.
 const PAGE: usize = 100;
 /// The same, at most.
@@ -248,38 +245,28 @@ impl ConfigService {
 }
 
 fn check_token(request: &TokenRequest) -> Result<(), Problem> {
-    let mut faults = Vec::new();
-    let mut fault = |pointer: &str, detail: String| {
-        faults.push(FieldFault {
+    let invalid = |pointer: &str, detail: String| {
+        Problem::faults(vec![FieldFault {
             pointer: pointer.to_owned(),
             code: Code::ValidationFailed,
             detail,
             document: None,
-        });
+        }])
     };
-    if request.subject.is_empty() || request.subject.len() > MAX_SUBJECT {
-        fault("/subject", format!("1 to {MAX_SUBJECT} bytes"));
+    if !(1..=MAX_EXPIRES_S).contains(&request.expires_in_s) {
+        return Err(invalid("/expires_in_s", format!("1 to {MAX_EXPIRES_S} are allowed")));
     }
-    if request.roles.is_empty() {
-        fault("/roles", "at least one role".to_owned());
-    }
-    for (index, role) in request.roles.iter().enumerate() {
-        if let Err(error) = role.parse::<Role>() {
-            fault(&format!("/roles/{index}"), error);
-        }
-    }
-    let is_worker = request.roles.iter().any(|role| role == Role::Worker.as_str());
-    match &request.layer {
-        None if is_worker => fault("/layer", "a worker's token is bound to a layer".to_owned()),
-        Some(layer) => {
-            if let Err(error) = layer.parse::<LayerName>() {
-                fault("/layer", format!("the name {error}"));
-            }
-        }
-        None => {}
-    }
-    if request.expires_in_s == 0 || request.expires_in_s > MAX_EXPIRES_S {
-        fault("/expires_in_s", format!("1 to {MAX_EXPIRES_S}"));
-    }
-    if faults.is_empty() { Ok(()) } else { Err(Problem::faults(faults)) }
+    // The rules of a token are those of who signs it, here and on the command line.
+    let token = NewToken {
+        subject: &request.subject,
+        roles: &request.roles,
+        layer: request.layer.as_deref(),
+        issued_s: 0,
+        expires_s: i64::from(request.expires_in_s),
+        id: "0",
+    };
+    token.check().map_err(|detail| {
+        let pointer = ["subject", "layer"].into_iter().find(|member| detail.starts_with(member));
+        invalid(&format!("/{}", pointer.unwrap_or("roles")), detail)
+    })
 }

@@ -15,11 +15,15 @@ use crate::store::{AuditEntry, AuditQuery, Op, TokenRecord};
 pub async fn versions_come_newest_first(fixture: &dyn Fixture) -> Outcome {
     let mut model = Model::new(fixture, "versions").await?;
     // Names that begin alike must not be mixed up.
-    model.write(&[&["a", "a-b", "ab"], &["a"], &["-a", "ab"], &["a"], &["a-b"]]).await?;
+    model
+        .write(&[&["a", "a-b", "ab"], &["a"], &["-a", "ab"], &["a"], &["a-b"]])
+        .await?;
     let key = samples::key("a");
     let all = told("versions", model.store.versions(&key, None, 10).await)?;
-    let seen: Vec<(u64, Op, Option<u64>)> =
-        all.iter().map(|version| (version.revision, version.change.op, version.change.previous)).collect();
+    let seen: Vec<(u64, Op, Option<u64>)> = all
+        .iter()
+        .map(|version| (version.revision, version.change.op, version.change.previous))
+        .collect();
     let expected = vec![
         (4, Op::Create, None),
         (3, Op::Delete, Some(2)),
@@ -28,7 +32,9 @@ pub async fn versions_come_newest_first(fixture: &dyn Fixture) -> Outcome {
     ];
     same("revision, change and version before", &seen, &expected)?;
     for version in &all {
-        let commit = usize::try_from(version.revision - 1).ok().and_then(|place| model.commits.get(place));
+        let commit = usize::try_from(version.revision - 1)
+            .ok()
+            .and_then(|place| model.commits.get(place));
         let change = commit.and_then(|commit| commit.changes.iter().find(|change| change.document.key == key));
         same("the change of a version", &Some(&version.change), &change)?;
         same(
@@ -39,7 +45,11 @@ pub async fn versions_come_newest_first(fixture: &dyn Fixture) -> Outcome {
     }
     let page = told("versions", model.store.versions(&key, Some(4), 2).await)?;
     same("a page below 4", &page.as_slice(), &all.get(1..3).unwrap_or_default())?;
-    same("below 1", &told("versions", model.store.versions(&key, Some(1), 9).await)?.len(), &0)?;
+    same(
+        "below 1",
+        &told("versions", model.store.versions(&key, Some(1), 9).await)?.len(),
+        &0,
+    )?;
     let unknown = told("versions", model.store.versions(&samples::key("z"), None, 9).await)?;
     same("versions of an unknown document", &unknown.len(), &0)
 }
@@ -50,18 +60,33 @@ pub async fn versions_come_newest_first(fixture: &dyn Fixture) -> Outcome {
 /// How the store breaks the rule.
 pub async fn revisions_before_a_time_are_found(fixture: &dyn Fixture) -> Outcome {
     let mut model = Model::new(fixture, "before").await?;
-    same("in an empty store", &told("revision_before", model.store.revision_before(now()).await)?, &0)?;
+    same(
+        "in an empty store",
+        &told("revision_before", model.store.revision_before(now()).await)?,
+        &0,
+    )?;
     for _ in 0..9 {
         model.write(&[&["a"]]).await?;
     }
-    for (before, expected) in [(time(0), 0), (time(1), 0), (time(2), 1), (time(9), 8), (time(10), 9), (time(99), 9)] {
+    for (before, expected) in [
+        (time(0), 0),
+        (time(1), 0),
+        (time(2), 1),
+        (time(9), 8),
+        (time(10), 9),
+        (time(99), 9),
+    ] {
         let found = told("revision_before", model.store.revision_before(before).await)?;
         same(&format!("the revision before {before}"), &found, &expected)?;
     }
     told("trim", model.store.trim(4, 1).await)?;
     for (before, expected) in [(time(3), 0), (time(6), 5), (time(99), 9)] {
         let found = told("revision_before", model.store.revision_before(before).await)?;
-        same(&format!("the revision before {before}, trimmed to 4"), &found, &expected)?;
+        same(
+            &format!("the revision before {before}, trimmed to 4"),
+            &found,
+            &expected,
+        )?;
     }
     Ok(())
 }
@@ -81,18 +106,49 @@ pub async fn audit_is_filtered_and_paged(fixture: &dyn Fixture) -> Outcome {
     };
     let queries: Vec<(AuditQuery, fn(&AuditEntry) -> bool)> = vec![
         (none.clone(), |_| true),
-        (AuditQuery { subject: Some("eve".to_owned()), ..none.clone() }, |entry| entry.subject == "eve"),
-        (AuditQuery { action: Some("reveal".to_owned()), ..none.clone() }, |entry| entry.action == "reveal"),
-        (AuditQuery { allowed: Some(false), ..none.clone() }, |entry| !entry.allowed),
-        (AuditQuery { kind: Some("Node".to_owned()), ..none.clone() }, |entry| {
-            entry.key.as_ref().is_some_and(|key| key.kind().as_str() == "Node")
-        }),
-        (AuditQuery { name: Some("n3".to_owned()), ..none.clone() }, |entry| {
-            entry.key.as_ref().is_some_and(|key| key.name().as_str() == "n3")
-        }),
-        (AuditQuery { since: Some(audit_time(5)), until: Some(audit_time(9)), ..none.clone() }, |entry| {
-            entry.time >= audit_time(5) && entry.time < audit_time(9)
-        }),
+        (
+            AuditQuery {
+                subject: Some("eve".to_owned()),
+                ..none.clone()
+            },
+            |entry| entry.subject == "eve",
+        ),
+        (
+            AuditQuery {
+                action: Some("reveal".to_owned()),
+                ..none.clone()
+            },
+            |entry| entry.action == "reveal",
+        ),
+        (
+            AuditQuery {
+                allowed: Some(false),
+                ..none.clone()
+            },
+            |entry| !entry.allowed,
+        ),
+        (
+            AuditQuery {
+                kind: Some("Node".to_owned()),
+                ..none.clone()
+            },
+            |entry| entry.key.as_ref().is_some_and(|key| key.kind().as_str() == "Node"),
+        ),
+        (
+            AuditQuery {
+                name: Some("n3".to_owned()),
+                ..none.clone()
+            },
+            |entry| entry.key.as_ref().is_some_and(|key| key.name().as_str() == "n3"),
+        ),
+        (
+            AuditQuery {
+                since: Some(audit_time(5)),
+                until: Some(audit_time(9)),
+                ..none.clone()
+            },
+            |entry| entry.time >= audit_time(5) && entry.time < audit_time(9),
+        ),
     ];
     for (query, holds) in queries {
         let found = told("audit", store.audit(&query).await)?;
@@ -124,7 +180,10 @@ fn audit_time(number: u64) -> Timestamp {
 
 fn entry(number: u64) -> AuditEntry {
     let done = number.is_multiple_of(2);
-    let mut entry = audit(if number.is_multiple_of(3) { "reveal" } else { "update" }, done.then_some(number + 1));
+    let mut entry = audit(
+        if number.is_multiple_of(3) { "reveal" } else { "update" },
+        done.then_some(number + 1),
+    );
     entry.time = audit_time(number);
     entry.id = format!("{number:08}-{}", entry.id);
     entry.subject = if number < 4 { "eve" } else { "" }.to_owned();
@@ -165,9 +224,21 @@ pub async fn answers_are_kept_until_they_expire(fixture: &dyn Fixture) -> Outcom
     written.idempotency = Some(kept.clone());
     commit(store.as_ref(), &[written]).await?;
     let before = Timestamp::from_millis(expires.as_millis() - 1);
-    same("just before", &told("idempotency", store.idempotency("one", before).await)?, &Some(kept))?;
-    same("at its end", &told("idempotency", store.idempotency("one", expires).await)?, &None)?;
-    same("another id", &told("idempotency", store.idempotency("two", before).await)?, &None)
+    same(
+        "just before",
+        &told("idempotency", store.idempotency("one", before).await)?,
+        &Some(kept),
+    )?;
+    same(
+        "at its end",
+        &told("idempotency", store.idempotency("one", expires).await)?,
+        &None,
+    )?;
+    same(
+        "another id",
+        &told("idempotency", store.idempotency("two", before).await)?,
+        &None,
+    )
 }
 
 /// Tokens are listed newest first until they expire; the first revocation stays; each has its audit entry.
@@ -177,11 +248,15 @@ pub async fn answers_are_kept_until_they_expire(fixture: &dyn Fixture) -> Outcom
 pub async fn tokens_are_kept_and_revoked(fixture: &dyn Fixture) -> Outcome {
     let store = fresh(fixture, "tokens").await?;
     let start = now().as_millis();
-    let tokens: Vec<TokenRecord> = ["one", "two", "three"].into_iter().zip([0, 1, 2]).map(|(id, later)| {
-        let mut token = token(id);
-        token.create_time = Timestamp::from_millis(start + later);
-        token
-    }).collect();
+    let tokens: Vec<TokenRecord> = ["one", "two", "three"]
+        .into_iter()
+        .zip([0, 1, 2])
+        .map(|(id, later)| {
+            let mut token = token(id);
+            token.create_time = Timestamp::from_millis(start + later);
+            token
+        })
+        .collect();
     for token in &tokens {
         told("add_token", store.add_token(token, &audit("token_create", None)).await)?;
     }
@@ -190,24 +265,38 @@ pub async fn tokens_are_kept_and_revoked(fixture: &dyn Fixture) -> Outcome {
     same("the tokens", &told("tokens", store.tokens(now()).await)?, &expected)?;
     let times = [start + 500, start + 900].map(Timestamp::from_millis);
     for time in times {
-        let found = told("revoke_token", store.revoke_token("two", time, &audit("token_revoke", None)).await)?;
+        let found = told(
+            "revoke_token",
+            store.revoke_token("two", time, &audit("token_revoke", None)).await,
+        )?;
         same("that there is a token of that id", &found, &true)?;
     }
     for token in &mut expected {
         token.revoke_time = (token.id == "two").then_some(Timestamp::from_millis(start + 500));
     }
     same("the tokens", &told("tokens", store.tokens(now()).await)?, &expected)?;
-    let found = told("revoke_token", store.revoke_token("four", now(), &audit("token_revoke", None)).await)?;
+    let found = told(
+        "revoke_token",
+        store.revoke_token("four", now(), &audit("token_revoke", None)).await,
+    )?;
     same("that there is a token that was never made", &found, &false)?;
     let later = Timestamp::from_millis(start + 3_600_000 * 2);
-    same("tokens when all have expired", &told("tokens", store.tokens(later).await)?.len(), &0)?;
+    same(
+        "tokens when all have expired",
+        &told("tokens", store.tokens(later).await)?.len(),
+        &0,
+    )?;
     for (action, count) in [("token_create", 3), ("token_revoke", 2)] {
         let query = AuditQuery {
             action: Some(action.to_owned()),
             limit: 10,
             ..AuditQuery::default()
         };
-        same(&format!("entries of {action}"), &told("audit", store.audit(&query).await)?.len(), &count)?;
+        same(
+            &format!("entries of {action}"),
+            &told("audit", store.audit(&query).await)?.len(),
+            &count,
+        )?;
     }
     Ok(())
 }

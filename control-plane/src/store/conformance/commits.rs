@@ -95,7 +95,10 @@ pub async fn a_taken_revision_is_a_conflict(fixture: &dyn Fixture) -> Outcome {
     let mut model = Model::new(fixture, "taken").await?;
     model.write(&[&["a"], &["a"], &["b"]]).await?;
     for revision in 1..=3 {
-        let mut late = record(commit_of(revision, vec![samples::change(Op::Create, "late", revision, None)]));
+        let mut late = record(commit_of(
+            revision,
+            vec![samples::change(Op::Create, "late", revision, None)],
+        ));
         late.idempotency = Some(answer("late", revision));
         conflict(&format!("revision {revision} again"), model.store.commit(&[late]).await)?;
     }
@@ -105,7 +108,11 @@ pub async fn a_taken_revision_is_a_conflict(fixture: &dyn Fixture) -> Outcome {
         limit: 100,
         ..AuditQuery::default()
     };
-    same("audit entries", &told("audit", model.store.audit(&query).await)?.len(), &3)?;
+    same(
+        "audit entries",
+        &told("audit", model.store.audit(&query).await)?.len(),
+        &3,
+    )?;
     same(
         "the answer of a conflict",
         &told("idempotency", model.store.idempotency("late", now()).await)?,
@@ -179,8 +186,12 @@ pub async fn commits_come_in_order_and_in_parts(fixture: &dyn Fixture) -> Outcom
     }
     let batch = told("commits_after", store.commits_after(0, 1_000).await)?;
     match batch.commits.len() {
-        count @ 1..40 => same("commits after the first part", &log(store.as_ref(), 0).await?.len(), &40)
-            .map_err(|error| format!("{error} ({count} in the first part)")),
+        count @ 1..40 => same(
+            "commits after the first part",
+            &log(store.as_ref(), 0).await?.len(),
+            &40,
+        )
+        .map_err(|error| format!("{error} ({count} in the first part)")),
         count => Err(format!("{count} commits of 250 KiB in one read")),
     }
 }

@@ -29,7 +29,11 @@ pub async fn a_store_that_is_reopened_is_the_same(fixture: &dyn Fixture) -> Outc
         model.check_now().await?;
         let snapshot = told("load", model.store.load().await)?;
         same("the identity of the store", &snapshot.store_id, &first)?;
-        same("the log", &log(model.store.as_ref(), snapshot.floor).await?.len(), &model.commits_above(snapshot.floor))?;
+        same(
+            "the log",
+            &log(model.store.as_ref(), snapshot.floor).await?.len(),
+            &model.commits_above(snapshot.floor),
+        )?;
     }
     Ok(())
 }
@@ -61,11 +65,18 @@ pub async fn one_of_two_writers_has_each_revision(fixture: &dyn Fixture) -> Outc
     let found: BTreeSet<String> = commits.iter().map(|commit| commit.request_id.clone()).collect();
     let acknowledged: BTreeSet<String> = one.union(&other).cloned().collect();
     same("the commits", &found, &acknowledged)?;
-    same("the log through the other", &log(stores[1].as_ref(), 0).await?, &commits)?;
+    same(
+        "the log through the other",
+        &log(stores[1].as_ref(), 0).await?,
+        &commits,
+    )?;
     let snapshot = told("load", stores[1].load().await)?;
     let last = |name: &str| {
         let changes = commits.iter().flat_map(|commit| &commit.changes);
-        changes.rev().find(|change| change.document.key == samples::key(name)).map(|change| (*change.document).clone())
+        changes
+            .rev()
+            .find(|change| change.document.key == samples::key(name))
+            .map(|change| (*change.document).clone())
     };
     for document in snapshot.documents {
         let name = document.key.name().to_string();
@@ -80,22 +91,34 @@ async fn write_many(store: &Arc<dyn FullStore>, name: &str, count: u64) -> Outco
     let mut written = 0;
     while written < count {
         let head = told("head", store.head().await)?;
-        let size = if written.is_multiple_of(3) { 1 } else { 3.min(count - written) };
-        let group: Vec<_> = (1..=size).map(|step| {
-            let revision = head + step;
-            let previous = (revision > 1).then(|| revision - 1);
-            let mut commit = samples::commit_of(revision, vec![samples::change(Op::Update, "shared", revision, previous)]);
-            commit.request_id = format!("{name}-{}", written + step);
-            commit.batch = format!("{name}-{written}-{head}");
-            record(commit)
-        }).collect();
+        let size = if written.is_multiple_of(3) {
+            1
+        } else {
+            3.min(count - written)
+        };
+        let group: Vec<_> = (1..=size)
+            .map(|step| {
+                let revision = head + step;
+                let previous = (revision > 1).then(|| revision - 1);
+                let mut commit = samples::commit_of(
+                    revision,
+                    vec![samples::change(Op::Update, "shared", revision, previous)],
+                );
+                commit.request_id = format!("{name}-{}", written + step);
+                commit.batch = format!("{name}-{written}-{head}");
+                record(commit)
+            })
+            .collect();
         match store.commit(&group).await {
             Ok(()) => {
                 acknowledged.extend(group.iter().map(|record| record.commit.request_id.clone()));
                 written += size;
                 let seen = told("head", store.head().await)?;
                 if seen < head + size {
-                    return Err(format!("the head is {seen} after revision {} was acknowledged", head + size));
+                    return Err(format!(
+                        "the head is {seen} after revision {} was acknowledged",
+                        head + size
+                    ));
                 }
             }
             Err(CommitError::Conflict) => tokio::task::yield_now().await,
@@ -123,7 +146,10 @@ pub async fn a_foreign_commit_is_noticed(fixture: &dyn Fixture) -> Outcome {
             Ok::<_, String>(())
         };
         let writes = async {
-            told("commit", stores[0].commit(&[record(samples::commit(revision, &["a"]))]).await)
+            told(
+                "commit",
+                stores[0].commit(&[record(samples::commit(revision, &["a"]))]).await,
+            )
         };
         let (written, noticed) = tokio::join!(writes, within("a commit of another is noticed", waits));
         written?;

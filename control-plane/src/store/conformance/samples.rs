@@ -55,7 +55,10 @@ pub(crate) fn change(op: Op, name: &str, revision: u64, previous: Option<u64>) -
 
 /// A commit that creates nodes.
 pub(crate) fn commit(revision: u64, names: &[&str]) -> Commit {
-    let changes = names.iter().map(|name| change(Op::Create, name, revision, None)).collect();
+    let changes = names
+        .iter()
+        .map(|name| change(Op::Create, name, revision, None))
+        .collect();
     commit_of(revision, changes)
 }
 

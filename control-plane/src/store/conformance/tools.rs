@@ -90,7 +90,10 @@ pub(super) async fn log(store: &dyn FullStore, after: u64) -> Outcome<Vec<Commit
 
 /// Documents by key.
 pub(super) fn by_key(documents: Vec<Document>) -> BTreeMap<Key, Document> {
-    documents.into_iter().map(|document| (document.key.clone(), document)).collect()
+    documents
+        .into_iter()
+        .map(|document| (document.key.clone(), document))
+        .collect()
 }
 
 /// What the store must hold, kept beside it. Writes one commit after another.

@@ -11,7 +11,11 @@ use super::tools::{Dice, Model, Outcome, conflict, log, same, told};
 /// How the store breaks the rule.
 pub async fn the_floor_rises_and_commits_go(fixture: &dyn Fixture) -> Outcome {
     let mut model = Model::new(fixture, "floor").await?;
-    same("the floor of an empty store", &told("trim", model.store.trim(5, 1).await)?, &0)?;
+    same(
+        "the floor of an empty store",
+        &told("trim", model.store.trim(5, 1).await)?,
+        &0,
+    )?;
     for _ in 0..9 {
         model.write(&[&["a", "b"]]).await?;
     }
@@ -19,18 +23,39 @@ pub async fn the_floor_rises_and_commits_go(fixture: &dyn Fixture) -> Outcome {
         let floor = told("trim", model.store.trim(asked, 2).await)?;
         same(&format!("the floor after trim({asked})"), &floor, &expected)?;
         model.check_now().await?;
-        let commits = model.commits.iter().filter(|commit| commit.revision > expected).cloned().collect::<Vec<_>>();
-        same("commits above the floor", &log(model.store.as_ref(), expected).await?, &commits)?;
+        let commits = model
+            .commits
+            .iter()
+            .filter(|commit| commit.revision > expected)
+            .cloned()
+            .collect::<Vec<_>>();
+        same(
+            "commits above the floor",
+            &log(model.store.as_ref(), expected).await?,
+            &commits,
+        )?;
         let below = told("commits_after", model.store.commits_after(expected - 1, 10).await)?;
         same("the floor that a reader below it is told", &below.floor, &expected)?;
-        same("the loaded floor", &told("load", model.store.load().await)?.floor, &expected)?;
+        same(
+            "the loaded floor",
+            &told("load", model.store.load().await)?.floor,
+            &expected,
+        )?;
     }
-    same("the floor at the newest commit", &told("trim", model.store.trim(99, 1).await)?, &9)?;
+    same(
+        "the floor at the newest commit",
+        &told("trim", model.store.trim(99, 1).await)?,
+        &9,
+    )?;
     model.check_now().await?;
     same("commits above it", &log(model.store.as_ref(), 9).await?.len(), &0)?;
     model.write(&[&["a"], &["c"]]).await?;
     model.check_now().await?;
-    same("commits after the floor", &log(model.store.as_ref(), 9).await?.len(), &2)
+    same(
+        "commits after the floor",
+        &log(model.store.as_ref(), 9).await?.len(),
+        &2,
+    )
 }
 
 /// Of each document stay the version that holds at the floor, all above it, and the newest ones that are to be kept.
@@ -40,8 +65,17 @@ pub async fn the_floor_rises_and_commits_go(fixture: &dyn Fixture) -> Outcome {
 pub async fn versions_that_hold_or_are_young_stay(fixture: &dyn Fixture) -> Outcome {
     let mut model = Model::new(fixture, "stay").await?;
     // a: 1 2 3 4 5 9, b: 1 (holds for ever), c: 2 and deleted at 3.
-    let commits: [&[&str]; 9] =
-        [&["a", "b"], &["a", "c"], &["a", "-c"], &["a"], &["a"], &["d"], &["d"], &["d"], &["a"]];
+    let commits: [&[&str]; 9] = [
+        &["a", "b"],
+        &["a", "c"],
+        &["a", "-c"],
+        &["a"],
+        &["a"],
+        &["d"],
+        &["d"],
+        &["d"],
+        &["a"],
+    ];
     for names in commits {
         model.write(&[names]).await?;
     }
@@ -83,9 +117,22 @@ pub async fn every_revision_from_the_floor_on_can_be_told(fixture: &dyn Fixture)
                 // Only the first commit of a group knows what exists, so only it deletes.
                 let delete = group.is_empty() && dice.roll(3) == 0;
                 let names = names.into_iter().map(|number| format!("n{number}"));
-                group.push(names.map(|name| if delete && exists(&name) { format!("-{name}") } else { name }).collect::<Vec<_>>());
+                group.push(
+                    names
+                        .map(|name| {
+                            if delete && exists(&name) {
+                                format!("-{name}")
+                            } else {
+                                name
+                            }
+                        })
+                        .collect::<Vec<_>>(),
+                );
             }
-            let borrowed: Vec<Vec<&str>> = group.iter().map(|names| names.iter().map(String::as_str).collect()).collect();
+            let borrowed: Vec<Vec<&str>> = group
+                .iter()
+                .map(|names| names.iter().map(String::as_str).collect())
+                .collect();
             let group: Vec<&[&str]> = borrowed.iter().map(Vec::as_slice).collect();
             model.write(&group).await?;
             if dice.roll(4) == 0 {
@@ -95,9 +142,21 @@ pub async fn every_revision_from_the_floor_on_can_be_told(fixture: &dyn Fixture)
             }
         }
         model.check_now().await?;
-        model.check_past(floor).await.map_err(|error| format!("seed {seed}, floor {floor}: {error}"))?;
-        let expected: Vec<_> = model.commits.iter().filter(|commit| commit.revision > floor).cloned().collect();
-        same("the log above the floor", &log(model.store.as_ref(), floor).await?, &expected)?;
+        model
+            .check_past(floor)
+            .await
+            .map_err(|error| format!("seed {seed}, floor {floor}: {error}"))?;
+        let expected: Vec<_> = model
+            .commits
+            .iter()
+            .filter(|commit| commit.revision > floor)
+            .cloned()
+            .collect();
+        same(
+            "the log above the floor",
+            &log(model.store.as_ref(), floor).await?,
+            &expected,
+        )?;
     }
     Ok(())
 }
@@ -115,7 +174,10 @@ pub async fn a_writer_that_slept_through_a_trim_is_refused(fixture: &dyn Fixture
         told("trim", model.store.trim(floor, 1).await)?;
         for revision in [1, 3, floor] {
             let late = record(samples::commit(revision, &["late"]));
-            conflict(&format!("revision {revision} below the floor {floor}"), model.store.commit(&[late]).await)?;
+            conflict(
+                &format!("revision {revision} below the floor {floor}"),
+                model.store.commit(&[late]).await,
+            )?;
             let gone = record(samples::commit_of(
                 revision,
                 vec![samples::change(crate::store::Op::Delete, "a", revision, Some(10))],

@@ -32,7 +32,11 @@ pub async fn documents_are_rewritten_in_place(fixture: &dyn Fixture) -> Outcome 
     };
     let rewritten = told("rewrite", model.store.rewrite(&make).await)?;
     same("how many were rewritten", &rewritten, &(449 + 450 + 10 + 1))?;
-    same("how many a second time", &told("rewrite", model.store.rewrite(&make).await)?, &0)?;
+    same(
+        "how many a second time",
+        &told("rewrite", model.store.rewrite(&make).await)?,
+        &0,
+    )?;
     for documents in model.states.iter_mut().chain([&mut model.documents]) {
         for document in documents.values_mut() {
             if let Some(new) = make(document) {
@@ -56,7 +60,10 @@ pub async fn a_backup_is_restored_elsewhere(fixture: &dyn Fixture) -> Outcome {
     let mut repeated = model.record(&["a"]);
     repeated.idempotency = Some(answer("kept", 5));
     commit(model.store.as_ref(), &[repeated.clone()]).await?;
-    told("add_token", model.store.add_token(&token("t"), &audit("token_create", None)).await)?;
+    told(
+        "add_token",
+        model.store.add_token(&token("t"), &audit("token_create", None)).await,
+    )?;
     told("trim", model.store.trim(2, 20).await)?;
     let mut file = Vec::new();
     let saving = backup::write(|pieces| model.store.export(pieces), &mut file);
@@ -67,7 +74,11 @@ pub async fn a_backup_is_restored_elsewhere(fixture: &dyn Fixture) -> Outcome {
     let restored = told("restore", backup::restore(new.as_ref(), &mut Cursor::new(&file)).await)?;
     let expected = 5 + RESTORE_RAISES_BY;
     let snapshot = told("load", new.load().await)?;
-    same("revision and floor", &(snapshot.revision, snapshot.floor), &(expected, expected))?;
+    same(
+        "revision and floor",
+        &(snapshot.revision, snapshot.floor),
+        &(expected, expected),
+    )?;
     same("the identity", &snapshot.store_id, &restored.store_id)?;
     if snapshot.store_id == summary.head.store_id {
         return Err("the restored store has the identity of the old one".to_owned());
@@ -80,29 +91,54 @@ pub async fn a_backup_is_restored_elsewhere(fixture: &dyn Fixture) -> Outcome {
             async move { store.versions(&key, None, 20).await }
         });
         let [old, new] = versions;
-        same(&format!("history of {name}"), &told("versions", new.await)?, &told("versions", old.await)?)?;
+        same(
+            &format!("history of {name}"),
+            &told("versions", new.await)?,
+            &told("versions", old.await)?,
+        )?;
     }
     let query = AuditQuery {
         limit: 100,
         ..AuditQuery::default()
     };
-    same("the audit", &told("audit", new.audit(&query).await)?, &told("audit", model.store.audit(&query).await)?)?;
-    same("the tokens", &told("tokens", new.tokens(now()).await)?, &told("tokens", model.store.tokens(now()).await)?)?;
+    same(
+        "the audit",
+        &told("audit", new.audit(&query).await)?,
+        &told("audit", model.store.audit(&query).await)?,
+    )?;
+    same(
+        "the tokens",
+        &told("tokens", new.tokens(now()).await)?,
+        &told("tokens", model.store.tokens(now()).await)?,
+    )?;
     same(
         "the answer to repeat",
         &told("idempotency", new.idempotency("kept", now()).await)?,
         &repeated.idempotency,
     )?;
     let below = told("commits_after", new.commits_after(5, 10).await)?;
-    same("the floor that a follower of the old store is told", &below.floor, &expected)?;
+    same(
+        "the floor that a follower of the old store is told",
+        &below.floor,
+        &expected,
+    )?;
     // Revisions go on above, and what was at the new floor can be told.
     let mut change = samples::change(Op::Update, "a", expected + 1, Some(5));
     change.paths.clear();
-    commit(new.as_ref(), &[samples::record(samples::commit_of(expected + 1, vec![change]))]).await?;
-    let before: BTreeMap<_, _> =
-        told("documents_at", new.documents_at(expected, expected + 1).await)?.into_iter().collect();
+    commit(
+        new.as_ref(),
+        &[samples::record(samples::commit_of(expected + 1, vec![change]))],
+    )
+    .await?;
+    let before: BTreeMap<_, _> = told("documents_at", new.documents_at(expected, expected + 1).await)?
+        .into_iter()
+        .collect();
     let of_a = before.get(&samples::key("a")).cloned().flatten();
-    same("a at the floor", &of_a.as_ref(), &model.documents.get(&samples::key("a")))?;
+    same(
+        "a at the floor",
+        &of_a.as_ref(),
+        &model.documents.get(&samples::key("a")),
+    )?;
     new.close().await;
     let again = told("load", fixture.open(&name).await?.load().await)?;
     same("the revision after reopening", &again.revision, &(expected + 1))?;
@@ -130,7 +166,11 @@ pub async fn a_closed_store_is_unavailable(fixture: &dyn Fixture) -> Outcome {
     unavailable("trim", store.trim(1, 1).await)?;
     match store.commit(&[samples::record(samples::commit(2, &["a"]))]).await {
         Err(CommitError::NotWritten(StoreError::Unavailable(_))) => {}
-        other => return Err(format!("a commit to a closed store must not be written, but was {other:?}")),
+        other => {
+            return Err(format!(
+                "a commit to a closed store must not be written, but was {other:?}"
+            ));
+        }
     }
     let again = fixture.open(&name).await?;
     same("the head afterwards", &told("head", again.head().await)?, &1)

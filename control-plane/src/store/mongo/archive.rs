@@ -28,7 +28,12 @@ impl MongoStore {
             return Ok(Vec::new());
         }
         let filter = rows::versions_below(&key.to_string(), below.map_or(i64::MAX, signed));
-        let find = self.tables.versions.find(filter).sort(doc! { "_id": -1 }).limit(limit_of(limit));
+        let find = self
+            .tables
+            .versions
+            .find(filter)
+            .sort(doc! { "_id": -1 })
+            .limit(limit_of(limit));
         collect(find, |found| rows::read_version(found)?.into_version()).await
     }
 
@@ -40,7 +45,12 @@ impl MongoStore {
         // The first change after the revision says which version was there before it.
         let range = doc! { "revision": { "$gt": signed(revision), "$lte": signed(until) } };
         let fields = doc! { "_id": 1, "previous": 1 };
-        let find = self.tables.versions.find(range).sort(doc! { "revision": 1 }).projection(fields);
+        let find = self
+            .tables
+            .versions
+            .find(range)
+            .sort(doc! { "revision": 1 })
+            .projection(fields);
         let changes = collect(find, |found| {
             let id = rows::text(found, "_id")?;
             let key = rows::split_version_id(&id)?.0.to_owned();
@@ -51,15 +61,21 @@ impl MongoStore {
         for (key, previous) in changes {
             first.entry(key).or_insert(previous);
         }
-        let wanted = first.iter().filter_map(|(key, previous)| Some(rows::version_id(key, (*previous)?)));
+        let wanted = first
+            .iter()
+            .filter_map(|(key, previous)| Some(rows::version_id(key, (*previous)?)));
         let before = self.read_texts(wanted.collect()).await?;
         let floor = self.read_floor().await?;
         let mut documents = Vec::new();
         for (text, previous) in first {
-            let key: Key = text.parse().map_err(|error| corrupt(format_args!("a version: {error}")))?;
+            let key: Key = text
+                .parse()
+                .map_err(|error| corrupt(format_args!("a version: {error}")))?;
             let found = previous.and_then(|previous| before.get(&rows::version_id(&text, previous)));
             if previous.is_some() && found.is_none() && revision >= floor {
-                return Err(corrupt(format_args!("{key} of revision {previous:?} is missing from its history")));
+                return Err(corrupt(format_args!(
+                    "{key} of revision {previous:?} is missing from its history"
+                )));
             }
             let before = found.map(|found| document(key.clone(), found)).transpose()?;
             documents.push((key, before));
@@ -70,8 +86,14 @@ impl MongoStore {
     async fn read_texts(&self, ids: Vec<String>) -> Result<BTreeMap<String, String>, StoreError> {
         let mut texts = BTreeMap::new();
         for some in ids.chunks(NAMED) {
-            let find = self.tables.versions.find(doc! { "_id": { "$in": some } }).projection(doc! { "document": 1 });
-            let found = collect(find, |found| Ok((rows::text(found, "_id")?, rows::text(found, "document")?)));
+            let find = self
+                .tables
+                .versions
+                .find(doc! { "_id": { "$in": some } })
+                .projection(doc! { "document": 1 });
+            let found = collect(find, |found| {
+                Ok((rows::text(found, "_id")?, rows::text(found, "document")?))
+            });
             texts.extend(found.await?);
         }
         Ok(texts)
@@ -83,7 +105,11 @@ impl MongoStore {
         let (mut before, mut after) = (floor, signed(self.read_head().await?) + 1);
         while after - before > 1 {
             let middle = before + (after - before) / 2;
-            let find = self.tables.events.find_one(doc! { "_id": middle }).projection(doc! { "time": 1 });
+            let find = self
+                .tables
+                .events
+                .find_one(doc! { "_id": middle })
+                .projection(doc! { "time": 1 });
             let found = limited(QUICK, find).await?;
             // What was trimmed away meanwhile is old.
             let old = match found {
@@ -111,8 +137,10 @@ impl MongoStore {
     }
 
     pub(super) async fn write_audit(&self, entries: &[AuditEntry]) -> Result<(), StoreError> {
-        let entries: Vec<Document> =
-            entries.iter().map(|entry| Ok(rows::audit(&AuditRow::encode(entry)?))).collect::<Result<_, StoreError>>()?;
+        let entries: Vec<Document> = entries
+            .iter()
+            .map(|entry| Ok(rows::audit(&AuditRow::encode(entry)?)))
+            .collect::<Result<_, StoreError>>()?;
         if entries.is_empty() {
             return Ok(());
         }
@@ -130,7 +158,12 @@ impl MongoStore {
         if query.limit == 0 {
             return Ok(Vec::new());
         }
-        let find = self.tables.audit.find(audit_filter(query)).sort(doc! { "_id": -1 }).limit(limit_of(query.limit));
+        let find = self
+            .tables
+            .audit
+            .find(audit_filter(query))
+            .sort(doc! { "_id": -1 })
+            .limit(limit_of(query.limit));
         collect(find, |found| rows::read_audit(found)?.decode()).await
     }
 
@@ -182,7 +215,11 @@ impl MongoStore {
 
     pub(super) async fn read_tokens(&self, now: Timestamp) -> Result<Vec<TokenRecord>, StoreError> {
         let filter = doc! { "expire_time": { "$gt": DateTime::from_millis(now.as_millis()) } };
-        let find = self.tables.tokens.find(filter).sort(doc! { "create_time": -1, "_id": -1 });
+        let find = self
+            .tables
+            .tokens
+            .find(filter)
+            .sort(doc! { "create_time": -1, "_id": -1 });
         collect(find, |found| rows::read_token(found)?.decode()).await
     }
 }

@@ -4,9 +4,7 @@ use std::future::IntoFuture;
 use std::time::Duration;
 
 use mongodb::bson::{Document, doc};
-use mongodb::options::{
-    ClientOptions, DatabaseOptions, ReadConcern, ReadPreference, SelectionCriteria, WriteConcern,
-};
+use mongodb::options::{ClientOptions, DatabaseOptions, ReadConcern, ReadPreference, SelectionCriteria, WriteConcern};
 use mongodb::{Client, Collection, Database};
 
 use super::errors::store_error;
@@ -150,7 +148,9 @@ pub(super) async fn limited_steps<T>(
     limit: Duration,
     work: impl Future<Output = Result<T, StoreError>>,
 ) -> Result<T, StoreError> {
-    tokio::time::timeout(limit, work).await.unwrap_or_else(|_| Err(too_slow(limit)))
+    tokio::time::timeout(limit, work)
+        .await
+        .unwrap_or_else(|_| Err(too_slow(limit)))
 }
 
 fn too_slow(limit: Duration) -> StoreError {

@@ -79,7 +79,11 @@ impl Statements {
     fn of(group: &[EncodedCommit], writer: &str) -> Self {
         Self {
             events: group.iter().map(|commit| rows::event(&commit.event, writer)).collect(),
-            versions: group.iter().flat_map(|commit| &commit.versions).map(rows::version).collect(),
+            versions: group
+                .iter()
+                .flat_map(|commit| &commit.versions)
+                .map(rows::version)
+                .collect(),
             documents: document_updates(group),
             deleted: deleted_keys(group),
             audit: group.iter().flat_map(|commit| &commit.audit).map(rows::audit).collect(),
@@ -143,7 +147,11 @@ impl MongoStore {
     async fn statements(&self, session: &mut ClientSession, group: Statements) -> Result<(), Fault> {
         let tables = &self.tables;
         tables.events.insert_many(group.events).session(&mut *session).await?;
-        tables.versions.insert_many(group.versions).session(&mut *session).await?;
+        tables
+            .versions
+            .insert_many(group.versions)
+            .session(&mut *session)
+            .await?;
         for (command, count) in group.documents {
             let answer = tables.database.run_command(command).session(&mut *session).await?;
             if let Some(error) = write_errors(&answer) {
@@ -222,10 +230,23 @@ impl MongoStore {
     async fn seal(&self, session: &mut ClientSession, revision: i64) -> mongodb::error::Result<Seen> {
         let tables = &self.tables;
         begin(session).await?;
-        let event = tables.events.find_one(doc! { "_id": revision }).session(&mut *session).await?;
-        let floor = tables.documents.find_one(doc! { "_id": FLOOR }).session(&mut *session).await?;
+        let event = tables
+            .events
+            .find_one(doc! { "_id": revision })
+            .session(&mut *session)
+            .await?;
+        let floor = tables
+            .documents
+            .find_one(doc! { "_id": FLOOR })
+            .session(&mut *session)
+            .await?;
         let count = doc! { "$inc": { "count": 1_i64 } };
-        tables.meta.update_one(doc! { "_id": "settled" }, count).upsert(true).session(&mut *session).await?;
+        tables
+            .meta
+            .update_one(doc! { "_id": "settled" }, count)
+            .upsert(true)
+            .session(&mut *session)
+            .await?;
         session.commit_transaction().await?;
         let floor = floor.and_then(|floor| rows::integer(&floor, FLOOR).ok()).unwrap_or(0);
         let batch = event.and_then(|event| rows::text(&event, "batch").ok());
@@ -318,7 +339,10 @@ fn answer_updates(group: &[EncodedCommit]) -> Vec<Document> {
     let mut updates = Vec::new();
     let mut commands = Vec::new();
     let mut bytes = 0;
-    for (row, now) in group.iter().filter_map(|commit| Some((commit.idempotency.as_ref()?, commit.event.time))) {
+    for (row, now) in group
+        .iter()
+        .filter_map(|commit| Some((commit.idempotency.as_ref()?, commit.event.time)))
+    {
         if bytes + row.answer.len() > COMMAND_BYTES {
             commands.push(update_command("idempotency", std::mem::take(&mut updates)).0);
             bytes = 0;
@@ -346,8 +370,8 @@ fn update_command(table: &str, updates: Vec<Document>) -> (Document, i64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::conformance::samples::{answer, change, commit, commit_of, record};
     use crate::store::Op;
+    use crate::store::conformance::samples::{answer, change, commit, commit_of, record};
     use crate::store::encode::encode_group;
 
     #[test]
@@ -358,7 +382,10 @@ mod tests {
         assert_eq!(commands.len(), 1);
         assert_eq!(commands[0].1, 1);
         let updates = commands[0].0.get_array("updates").unwrap();
-        assert_eq!(updates[0].as_document().unwrap().get_document("q").unwrap(), &doc! { "_id": FLOOR, "floor": { "$lt": 9_i64 } });
+        assert_eq!(
+            updates[0].as_document().unwrap().get_document("q").unwrap(),
+            &doc! { "_id": FLOOR, "floor": { "$lt": 9_i64 } }
+        );
         assert_eq!(deleted_keys(&group), ["Node/a"]);
     }
 
@@ -366,7 +393,10 @@ mod tests {
     fn only_the_last_state_of_a_document_is_written() {
         let group = encode_group(&[
             record(commit(1, &["a", "b"])),
-            record(commit_of(2, vec![change(Op::Update, "a", 2, Some(1)), change(Op::Delete, "b", 2, Some(1))])),
+            record(commit_of(
+                2,
+                vec![change(Op::Update, "a", 2, Some(1)), change(Op::Delete, "b", 2, Some(1))],
+            )),
             record(commit(3, &["b"])),
         ])
         .unwrap();

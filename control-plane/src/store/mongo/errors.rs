@@ -79,7 +79,9 @@ fn codes(error: &Error) -> Vec<i32> {
         ErrorKind::Write(WriteFailure::WriteConcernError(concern)) => vec![concern.code],
         ErrorKind::InsertMany(many) => {
             let writes = many.write_errors.iter().flatten().map(|write| write.code);
-            writes.chain(many.write_concern_error.as_ref().map(|concern| concern.code)).collect()
+            writes
+                .chain(many.write_concern_error.as_ref().map(|concern| concern.code))
+                .collect()
         }
         _ => Vec::new(),
     }
@@ -87,7 +89,10 @@ fn codes(error: &Error) -> Vec<i32> {
 
 /// A command that the server accepted may still have failed for some of its documents.
 pub(super) fn write_errors(answer: &Document) -> Option<CommitError> {
-    let errors = answer.get_array("writeErrors").ok().filter(|errors| !errors.is_empty())?;
+    let errors = answer
+        .get_array("writeErrors")
+        .ok()
+        .filter(|errors| !errors.is_empty())?;
     let first = errors.first().and_then(|error| error.as_document());
     let code = first.and_then(|error| error.get_i32("code").ok());
     let text = first.and_then(|error| error.get_str("errmsg").ok()).unwrap_or_default();
@@ -117,6 +122,9 @@ mod tests {
     fn what_never_gets_better_is_refused() {
         let io = Error::from(std::io::Error::from(std::io::ErrorKind::ConnectionReset));
         assert!(store_error(io.clone()).is_transient());
-        assert!(matches!(not_written(io), CommitError::NotWritten(StoreError::Unavailable(_))));
+        assert!(matches!(
+            not_written(io),
+            CommitError::NotWritten(StoreError::Unavailable(_))
+        ));
     }
 }

@@ -61,7 +61,9 @@ impl MongoStore {
                 lease.give_back().await;
                 done?;
             } else if Instant::now() > until {
-                return Err(StoreError::Unavailable("another process is migrating the store".to_owned()));
+                return Err(StoreError::Unavailable(
+                    "another process is migrating the store".to_owned(),
+                ));
             } else {
                 tokio::time::sleep(PAUSE).await;
             }
@@ -71,13 +73,21 @@ impl MongoStore {
 
     async fn insert_floor(&self) -> Result<(), StoreError> {
         let floor = doc! { "$setOnInsert": { FLOOR: 0_i64 } };
-        let insert = self.tables.documents.update_one(doc! { "_id": FLOOR }, floor).upsert(true);
+        let insert = self
+            .tables
+            .documents
+            .update_one(doc! { "_id": FLOOR }, floor)
+            .upsert(true);
         limited(USUAL, insert).await?;
         Ok(())
     }
 
     async fn insert_if_absent(&self, id: &str, value: Document) -> Result<(), StoreError> {
-        let insert = self.tables.meta.update_one(doc! { "_id": id }, doc! { "$setOnInsert": value }).upsert(true);
+        let insert = self
+            .tables
+            .meta
+            .update_one(doc! { "_id": id }, doc! { "$setOnInsert": value })
+            .upsert(true);
         let insert = async {
             match insert.await {
                 Err(error) if !is_duplicate(&error) => Err(error),
@@ -160,7 +170,11 @@ impl Lease<'_> {
         let recorded = self.store.in_transaction(|tables, session| {
             let (mine, record) = (mine.clone(), record.clone());
             async move {
-                let renewed = tables.meta.update_one(mine, Self::renewal()).session(&mut *session).await?;
+                let renewed = tables
+                    .meta
+                    .update_one(mine, Self::renewal())
+                    .session(&mut *session)
+                    .await?;
                 if renewed.matched_count == 0 {
                     return Ok(false);
                 }
@@ -209,14 +223,19 @@ impl Target for Lease<'_> {
             Action::Command(text) => {
                 let command: serde_json::Value = serde_json::from_str(text).map_err(corrupt)?;
                 let command = mongodb::bson::serialize_to_document(&command);
-                self.store.command(command.map_err(|error| store_error(error.into()))?).await?;
+                self.store
+                    .command(command.map_err(|error| store_error(error.into()))?)
+                    .await?;
             }
             Action::Rewrite { function, .. } => {
                 let renew = || self.renew().boxed();
                 self.store.rewrite_all(function, &renew).await?;
             }
             Action::Sql(_) => {
-                return Err(StoreError::Refused(format!("step {} is SQL, which MongoDB has none of", done.name)));
+                return Err(StoreError::Refused(format!(
+                    "step {} is SQL, which MongoDB has none of",
+                    done.name
+                )));
             }
         }
         self.record(done).await

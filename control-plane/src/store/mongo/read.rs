@@ -20,7 +20,12 @@ const NO_SNAPSHOT: Duration = Duration::from_secs(5);
 impl MongoStore {
     /// The newest revision that a majority has.
     pub(super) async fn read_head(&self) -> Result<u64, StoreError> {
-        let newest = self.tables.events.find_one(doc! {}).sort(doc! { "_id": -1 }).projection(doc! { "_id": 1 });
+        let newest = self
+            .tables
+            .events
+            .find_one(doc! {})
+            .sort(doc! { "_id": -1 })
+            .projection(doc! { "_id": 1 });
         match limited(QUICK, newest).await? {
             Some(found) => unsigned(rows::integer(&found, "_id")?),
             // All commits up to the floor are gone, and none came after it.
@@ -53,7 +58,10 @@ impl MongoStore {
         let plain = self.tables.client.database(self.tables.database.name());
         let mut session = self.tables.client.start_session().snapshot(true).await?;
         let events = plain.collection::<Document>("events");
-        let newest = events.find_one(doc! {}).sort(doc! { "_id": -1 }).projection(doc! { "_id": 1 });
+        let newest = events
+            .find_one(doc! {})
+            .sort(doc! { "_id": -1 })
+            .projection(doc! { "_id": 1 });
         let newest = newest.session(&mut session).await?;
         let meta = plain.collection::<Document>("meta");
         let meta = meta.find_one(doc! { "_id": "store" }).session(&mut session).await?;
@@ -76,7 +84,11 @@ impl MongoStore {
             });
         };
         let range = doc! { "revision": { "$gt": signed(after), "$lte": last } };
-        let versions = self.tables.versions.find(range).sort(doc! { "revision": 1, "position": 1 });
+        let versions = self
+            .tables
+            .versions
+            .find(range)
+            .sort(doc! { "revision": 1, "position": 1 });
         let versions = super::collect(versions, rows::read_version).await?;
         let floor = self.read_floor().await?;
         if floor > after {
@@ -95,7 +107,12 @@ impl MongoStore {
     /// As many as `limit` and [`READ_BYTES`] allow, at least one.
     async fn read_events(&self, after: i64, limit: usize) -> Result<Vec<EventRow>, StoreError> {
         let limit = i64::try_from(limit.max(1)).unwrap_or(i64::MAX);
-        let find = self.tables.events.find(doc! { "_id": { "$gt": after } }).sort(doc! { "_id": 1 }).limit(limit);
+        let find = self
+            .tables
+            .events
+            .find(doc! { "_id": { "$gt": after } })
+            .sort(doc! { "_id": 1 })
+            .limit(limit);
         limited_steps(USUAL, async {
             let mut cursor = find.await.map_err(store_error)?;
             let mut events: Vec<EventRow> = Vec::new();
@@ -125,7 +142,9 @@ fn snapshot(newest: Option<&Document>, meta: Option<&Document>, found: &[Documen
         }
     }
     let floor = floor.ok_or_else(|| corrupt("the floor is missing"))?;
-    let newest = newest.map(|newest| unsigned(rows::integer(newest, "_id")?)).transpose()?;
+    let newest = newest
+        .map(|newest| unsigned(rows::integer(newest, "_id")?))
+        .transpose()?;
     Ok(Snapshot {
         store_id: rows::text(meta, "store_id")?,
         floor,

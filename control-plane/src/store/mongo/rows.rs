@@ -184,7 +184,10 @@ fn optional_integer(found: &Document, name: &str) -> Result<Option<i64>, StoreEr
 }
 
 fn date(found: &Document, name: &str) -> Result<i64, StoreError> {
-    found.get_datetime(name).map(|date| date.timestamp_millis()).map_err(corrupt)
+    found
+        .get_datetime(name)
+        .map(|date| date.timestamp_millis())
+        .map_err(corrupt)
 }
 
 #[cfg(test)]

@@ -73,7 +73,10 @@ mod tests {
         let ours = doc! { "appName": "blaze-config/x", "lsid": { "id": 7, "uid": 8 } };
         assert!(is_ours(&ours, "blaze-config/x"));
         assert!(!is_ours(&ours, "blaze-config/y"));
-        assert!(is_ours(&doc! { "clientMetadata": { "application": { "name": "a" } } }, "a"));
+        assert!(is_ours(
+            &doc! { "clientMetadata": { "application": { "name": "a" } } },
+            "a"
+        ));
         assert!(!is_ours(&doc! {}, "a"));
         assert_eq!(session_id(&ours), Some(Bson::Document(doc! { "id": 7 })));
     }

@@ -24,7 +24,11 @@ impl MongoStore {
         self.remove_events(floor).await?;
         self.remove_versions(now).await?;
         let note = doc! { "$set": { "floor": now.floor, "head": now.head, "keep": i64::from(now.keep) } };
-        let note = self.tables.meta.update_one(doc! { "_id": "trimmed" }, note).upsert(true);
+        let note = self
+            .tables
+            .meta
+            .update_one(doc! { "_id": "trimmed" }, note)
+            .upsert(true);
         limited(USUAL, note).await?;
         unsigned(floor)
     }
@@ -32,7 +36,10 @@ impl MongoStore {
     async fn remove_events(&self, floor: i64) -> Result<(), StoreError> {
         let events = &self.tables.events;
         loop {
-            let oldest = events.find_one(doc! {}).sort(doc! { "_id": 1 }).projection(doc! { "_id": 1 });
+            let oldest = events
+                .find_one(doc! {})
+                .sort(doc! { "_id": 1 })
+                .projection(doc! { "_id": 1 });
             let Some(oldest) = limited(USUAL, oldest).await? else {
                 return Ok(());
             };
@@ -50,7 +57,12 @@ impl MongoStore {
         let mut doomed = Vec::new();
         for key in self.changed_keys(before, now).await? {
             let mine = rows::versions_below(&key, i64::MAX);
-            let find = self.tables.versions.find(mine).sort(doc! { "_id": -1 }).projection(doc! { "_id": 1 });
+            let find = self
+                .tables
+                .versions
+                .find(mine)
+                .sort(doc! { "_id": -1 })
+                .projection(doc! { "_id": 1 });
             let revisions = collect(find, |found| Ok(rows::split_version_id(&rows::text(found, "_id")?)?.1)).await?;
             let gone = to_spare(&revisions, now.floor, now.keep);
             doomed.extend(gone.into_iter().map(|revision| rows::version_id(&key, revision)));

@@ -13,7 +13,8 @@ use super::rows::{self, FLOOR};
 use super::{MongoStore, collect};
 use crate::store::encode::{corrupt, signed};
 use crate::store::upkeep::{
-    BackupHead, BackupRow, Piece, RESTORE_RAISES_BY, Restored, Rewriter, Row, not_empty, not_whole, now, rewritten, send,
+    BackupHead, BackupRow, Piece, RESTORE_RAISES_BY, Restored, Rewriter, Row, not_empty, not_whole, now, rewritten,
+    send,
 };
 use crate::store::{CommitError, StoreError};
 
@@ -38,7 +39,9 @@ impl MongoStore {
             ("versions", |found| rows::read_version(found).map(Row::Version)),
             ("audit", |found| rows::read_audit(found).map(Row::Audit)),
             ("tokens", |found| rows::read_token(found).map(Row::Token)),
-            ("idempotency", |found| rows::read_idempotency(found).map(Row::Idempotency)),
+            ("idempotency", |found| {
+                rows::read_idempotency(found).map(Row::Idempotency)
+            }),
         ];
         // A snapshot session brings its read concern; one of the collections would stand in its way.
         let plain = self.tables.client.database(self.tables.database.name());
@@ -81,7 +84,8 @@ impl MongoStore {
             revision: head.revision + RESTORE_RAISES_BY,
         };
         self.raise_floor(signed(restored.revision)).await?;
-        self.mark(doc! { "$set": { "store_id": &restored.store_id }, "$unset": { "restoring": "" } }).await?;
+        self.mark(doc! { "$set": { "store_id": &restored.store_id }, "$unset": { "restoring": "" } })
+            .await?;
         Ok(restored)
     }
 
@@ -96,7 +100,9 @@ impl MongoStore {
         }
         let tables = &self.tables;
         for table in [&tables.documents, &tables.versions, &tables.tokens] {
-            let any = table.find_one(doc! { "_id": { "$ne": FLOOR } }).projection(doc! { "_id": 1 });
+            let any = table
+                .find_one(doc! { "_id": { "$ne": FLOOR } })
+                .projection(doc! { "_id": 1 });
             if limited(USUAL, any).await?.is_some() {
                 return Ok(false);
             }
@@ -122,7 +128,10 @@ impl MongoStore {
             let behind = doc! { "_id": { "$gt": &place, "$ne": FLOOR } };
             let find = table.find(behind).sort(doc! { "_id": 1 }).limit(STEP);
             let find = find.projection(doc! { "_id": 1, "document": 1 });
-            let texts = collect(find, |found| Ok((rows::text(found, "_id")?, rows::text(found, "document")?))).await?;
+            let texts = collect(find, |found| {
+                Ok((rows::text(found, "_id")?, rows::text(found, "document")?))
+            })
+            .await?;
             let Some((last, _)) = texts.last() else {
                 return Ok(replaced);
             };
@@ -183,7 +192,10 @@ fn text_bytes(found: &Document) -> usize {
 
 async fn read_head(plain: &Database, session: &mut ClientSession) -> Result<BackupHead, StoreError> {
     let events = plain.collection::<Document>("events");
-    let newest = events.find_one(doc! {}).sort(doc! { "_id": -1 }).projection(doc! { "_id": 1 });
+    let newest = events
+        .find_one(doc! {})
+        .sort(doc! { "_id": -1 })
+        .projection(doc! { "_id": 1 });
     let newest = limited(USUAL, newest.session(&mut *session)).await?;
     let floor = plain.collection::<Document>("documents");
     let floor = limited(USUAL, floor.find_one(doc! { "_id": FLOOR }).session(&mut *session)).await?;

@@ -43,15 +43,23 @@ pub(super) fn documents_at(
     let mut statement = transaction.prepare(SQL).map_err(store_error)?;
     let found = statement
         .query_map([signed(revision), signed(until)], |row| {
-            Ok((row.get::<_, String>(0)?, row.get::<_, Option<i64>>(1)?, row.get::<_, Option<String>>(2)?))
+            Ok((
+                row.get::<_, String>(0)?,
+                row.get::<_, Option<i64>>(1)?,
+                row.get::<_, Option<String>>(2)?,
+            ))
         })
         .map_err(store_error)?;
     let mut documents = Vec::new();
     for row in found {
         let (key, previous, text) = row.map_err(store_error)?;
-        let key: Key = key.parse().map_err(|error| corrupt(format_args!("a version: {error}")))?;
+        let key: Key = key
+            .parse()
+            .map_err(|error| corrupt(format_args!("a version: {error}")))?;
         if previous.is_some() && text.is_none() && revision >= floor {
-            return Err(corrupt(format_args!("{key} of revision {previous:?} is missing from its history")));
+            return Err(corrupt(format_args!(
+                "{key} of revision {previous:?} is missing from its history"
+            )));
         }
         let before = text.map(|text| document(key.clone(), &text)).transpose()?;
         documents.push((key, before));
@@ -90,7 +98,10 @@ fn insert_audit(connection: &Connection, entries: &[AuditRow]) -> Result<(), Sto
 pub(super) fn audit(connection: &Connection, query: &AuditQuery) -> Result<Vec<AuditEntry>, StoreError> {
     let mut conditions = vec!["1"];
     let mut values: Vec<&dyn ToSql> = Vec::new();
-    let (since, until) = (query.since.map(Timestamp::as_millis), query.until.map(Timestamp::as_millis));
+    let (since, until) = (
+        query.since.map(Timestamp::as_millis),
+        query.until.map(Timestamp::as_millis),
+    );
     for (condition, value) in [
         ("subject = ?", query.subject.as_ref().map(|value| value as &dyn ToSql)),
         ("kind = ?", query.kind.as_ref().map(|value| value as &dyn ToSql)),
@@ -114,7 +125,9 @@ pub(super) fn audit(connection: &Connection, query: &AuditQuery) -> Result<Vec<A
         conditions.join(" AND ")
     );
     let mut statement = connection.prepare(&sql).map_err(store_error)?;
-    let found = statement.query_map(params_from_iter(values), rows::audit).map_err(store_error)?;
+    let found = statement
+        .query_map(params_from_iter(values), rows::audit)
+        .map_err(store_error)?;
     found.map(|row| row.map_err(store_error)?.decode()).collect()
 }
 
@@ -175,7 +188,9 @@ pub(super) fn tokens(connection: &Connection, now: Timestamp) -> Result<Vec<Toke
         rows::TOKEN
     );
     let mut statement = connection.prepare(&sql).map_err(store_error)?;
-    let found = statement.query_map([now.as_millis()], rows::token).map_err(store_error)?;
+    let found = statement
+        .query_map([now.as_millis()], rows::token)
+        .map_err(store_error)?;
     found.map(|row| row.map_err(store_error)?.decode()).collect()
 }
 

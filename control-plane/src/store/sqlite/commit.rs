@@ -50,7 +50,9 @@ fn insert(transaction: &Transaction<'_>, group: &[EncodedCommit]) -> Result<(), 
         }
     }
     let mut put = transaction.prepare(rows::PUT_DOCUMENT).map_err(not_written)?;
-    let mut delete = transaction.prepare("DELETE FROM documents WHERE key = ?1").map_err(not_written)?;
+    let mut delete = transaction
+        .prepare("DELETE FROM documents WHERE key = ?1")
+        .map_err(not_written)?;
     for (key, row) in last_versions(group) {
         let done = match row.is_deletion() {
             true => delete.execute([key]),
@@ -76,7 +78,9 @@ fn batch_for_certain(connection: &mut Connection, revision: i64) -> rusqlite::Re
     let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
     transaction.execute("UPDATE meta SET value = value + 1 WHERE name = 'settled'", [])?;
     let batch = transaction
-        .query_row("SELECT batch FROM events WHERE revision = ?1", [revision], |row| row.get(0))
+        .query_row("SELECT batch FROM events WHERE revision = ?1", [revision], |row| {
+            row.get(0)
+        })
         .optional()?;
     transaction.commit()?;
     Ok(batch)
@@ -122,7 +126,9 @@ pub(super) fn commits_after(
         rows::VERSION
     );
     let mut statement = transaction.prepare(&sql).map_err(store_error)?;
-    let found = statement.query_map([signed(revision), last], rows::version).map_err(store_error)?;
+    let found = statement
+        .query_map([signed(revision), last], rows::version)
+        .map_err(store_error)?;
     let versions = found.collect::<Result<_, _>>().map_err(store_error)?;
     Ok(CommitBatch {
         commits: decode_commits(revision, events, versions)?,

@@ -27,7 +27,10 @@ pub(super) fn real_path(path: &Path) -> Result<PathBuf, StoreError> {
     match path.canonicalize() {
         Ok(real) => Ok(real),
         Err(error) if error.kind() == ErrorKind::NotFound => {
-            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+            let folder = path
+                .parent()
+                .filter(|folder| !folder.as_os_str().is_empty())
+                .unwrap_or(Path::new("."));
             let name = path.file_name().ok_or_else(|| failed(error))?;
             Ok(folder.canonicalize().map_err(failed)?.join(name))
         }
@@ -40,7 +43,8 @@ pub(super) fn real_path(path: &Path) -> Result<PathBuf, StoreError> {
 /// # Errors
 /// [`StoreError::Refused`] for a file of another program, [`StoreError::Unavailable`], [`StoreError::Corrupt`].
 pub(super) fn open_writer(path: &Path) -> Result<Connection, StoreError> {
-    let failed = |error: std::io::Error| StoreError::Unavailable(format!("{} cannot be written: {error}", path.display()));
+    let failed =
+        |error: std::io::Error| StoreError::Unavailable(format!("{} cannot be written: {error}", path.display()));
     let mut options = OpenOptions::new();
     options.read(true).write(true).create(true).truncate(false).mode(0o600);
     drop(options.open(path).map_err(failed)?);
@@ -90,7 +94,9 @@ fn open(path: &Path, access: OpenFlags) -> Result<Connection, StoreError> {
 
 /// Never writes into a database that somebody made for something else.
 fn check_owner(connection: &Connection, path: &Path) -> Result<(), StoreError> {
-    let id: i64 = connection.pragma_query_value(None, "application_id", |row| row.get(0)).map_err(store_error)?;
+    let id: i64 = connection
+        .pragma_query_value(None, "application_id", |row| row.get(0))
+        .map_err(store_error)?;
     if id == APPLICATION_ID {
         return Ok(());
     }
@@ -107,7 +113,8 @@ fn check_owner(connection: &Connection, path: &Path) -> Result<(), StoreError> {
 }
 
 fn prepare(connection: &Connection) -> Result<(), StoreError> {
-    let set = |name: &str, value: &dyn rusqlite::ToSql| connection.pragma_update(None, name, value).map_err(store_error);
+    let set =
+        |name: &str, value: &dyn rusqlite::ToSql| connection.pragma_update(None, name, value).map_err(store_error);
     set("synchronous", &"FULL")?;
     set("temp_store", &"MEMORY")?;
     set("trusted_schema", &"OFF")?;
@@ -131,10 +138,15 @@ pub(super) fn bootstrap(connection: &mut Connection) -> Result<(), StoreError> {
         .transaction_with_behavior(TransactionBehavior::Immediate)
         .map_err(store_error)?;
     transaction.execute_batch(TABLES).map_err(store_error)?;
-    transaction.pragma_update(None, "application_id", APPLICATION_ID).map_err(store_error)?;
+    transaction
+        .pragma_update(None, "application_id", APPLICATION_ID)
+        .map_err(store_error)?;
     for (name, value) in [("floor", 0), ("min_version", 0), ("settled", 0)] {
         transaction
-            .execute("INSERT OR IGNORE INTO meta (name, value) VALUES (?1, ?2)", (name, value))
+            .execute(
+                "INSERT OR IGNORE INTO meta (name, value) VALUES (?1, ?2)",
+                (name, value),
+            )
             .map_err(store_error)?;
     }
     transaction

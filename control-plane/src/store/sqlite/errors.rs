@@ -12,9 +12,9 @@ pub(super) fn store_error(error: rusqlite::Error) -> StoreError {
         E::SqliteFailure(failure, _) => match failure.code {
             ErrorCode::DatabaseCorrupt | ErrorCode::NotADatabase => StoreError::Corrupt(error.to_string()),
             ErrorCode::DiskFull => StoreError::Unavailable(format!("{error}: free space on the disk of the store")),
-            ErrorCode::ReadOnly => {
-                StoreError::Unavailable(format!("{error}: the file and its folder must be writable by this user"))
-            }
+            ErrorCode::ReadOnly => StoreError::Unavailable(format!(
+                "{error}: the file and its folder must be writable by this user"
+            )),
             _ => StoreError::Unavailable(error.to_string()),
         },
         E::FromSqlConversionFailure(..)

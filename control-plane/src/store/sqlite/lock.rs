@@ -73,7 +73,9 @@ mod tests {
         let first = FileLock::take(&path).unwrap();
         // A lock belongs to the open file, so the same process is refused as another would be.
         let error = FileLock::take(&path).unwrap_err();
-        let StoreError::Refused(text) = error else { panic!("{error}") };
+        let StoreError::Refused(text) = error else {
+            panic!("{error}")
+        };
         assert!(text.contains(&format!("process {}", std::process::id())), "{text}");
         assert!(text.contains("mongodb"), "{text}");
         drop(first);
@@ -83,6 +85,9 @@ mod tests {
     #[test]
     fn a_folder_that_is_not_there_is_named() {
         let error = FileLock::take(Path::new("/nonexistent/blaze/store.db")).unwrap_err();
-        assert!(error.to_string().contains("/nonexistent/blaze/store.db.lock"), "{error}");
+        assert!(
+            error.to_string().contains("/nonexistent/blaze/store.db.lock"),
+            "{error}"
+        );
     }
 }

@@ -47,14 +47,17 @@ impl Target for SqliteStore {
     }
 
     async fn raise_min_version(&self, version: u32) -> Result<(), StoreError> {
-        self.write(move |connection| set_number(connection, "min_version", i64::from(version))).await
+        self.write(move |connection| set_number(connection, "min_version", i64::from(version)))
+            .await
     }
 }
 
 /// What was done; nothing in a file that is new.
 fn state(connection: &Connection) -> Result<(Vec<Done>, u32), StoreError> {
     let there: Option<i64> = connection
-        .query_row("SELECT 1 FROM sqlite_schema WHERE name = 'migrations'", [], |row| row.get(0))
+        .query_row("SELECT 1 FROM sqlite_schema WHERE name = 'migrations'", [], |row| {
+            row.get(0)
+        })
         .optional()
         .map_err(store_error)?;
     if there.is_none() {

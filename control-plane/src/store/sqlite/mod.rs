@@ -152,7 +152,9 @@ impl SqliteStore {
         let limit = i64::try_from(STEP).unwrap_or(i64::MAX);
         let (mut place, mut replaced) = (0, 0);
         loop {
-            let found = self.read(move |connection| texts.after(connection, place, limit)).await?;
+            let found = self
+                .read(move |connection| texts.after(connection, place, limit))
+                .await?;
             let Some(last) = found.last() else {
                 return Ok(replaced);
             };
@@ -184,7 +186,9 @@ async fn export_apart(
     supervisor
         .spawn_thread("sqlite-export", TaskPolicy::MayEnd, run)
         .map_err(|error| StoreError::Unavailable(format!("no thread for the export: {error}")))?;
-    answered.await.map_err(|_| StoreError::Unavailable("the export ended".to_owned()))?
+    answered
+        .await
+        .map_err(|_| StoreError::Unavailable("the export ended".to_owned()))?
 }
 
 #[async_trait]
@@ -203,13 +207,17 @@ impl CommitLog for SqliteStore {
     }
 
     async fn commits_after(&self, revision: u64, limit: usize) -> Result<CommitBatch, StoreError> {
-        self.read(move |connection| commit::commits_after(connection, revision, limit)).await
+        self.read(move |connection| commit::commits_after(connection, revision, limit))
+            .await
     }
 
     async fn commit(&self, records: &[CommitRecord]) -> Result<(), CommitError> {
         let group = encode_group(records).map_err(CommitError::NotWritten)?;
         // A job that was not taken was not done; one that was taken answers.
-        let done = self.writer.run(move |connection| commit::commit(connection, &group)).await;
+        let done = self
+            .writer
+            .run(move |connection| commit::commit(connection, &group))
+            .await;
         done.map_err(CommitError::NotWritten)?
     }
 
@@ -222,34 +230,48 @@ impl CommitLog for SqliteStore {
 impl Archive for SqliteStore {
     async fn versions(&self, key: &Key, below: Option<u64>, limit: usize) -> Result<Vec<Version>, StoreError> {
         let key = key.clone();
-        self.read(move |connection| archive::versions(connection, &key, below, limit)).await
+        self.read(move |connection| archive::versions(connection, &key, below, limit))
+            .await
     }
 
     async fn documents_at(&self, revision: u64, until: u64) -> Result<Vec<(Key, Option<Document>)>, StoreError> {
-        self.read(move |connection| archive::documents_at(connection, revision, until)).await
+        self.read(move |connection| archive::documents_at(connection, revision, until))
+            .await
     }
 
     async fn trim(&self, floor: u64, keep_versions: u32) -> Result<u64, StoreError> {
-        let work = self.write(move |connection| trim::raise_floor(connection, floor, keep_versions)).await?;
+        let work = self
+            .write(move |connection| trim::raise_floor(connection, floor, keep_versions))
+            .await?;
         let now_trimmed = work.now;
-        while self.write(move |connection| trim::remove_events(connection, now_trimmed.floor)).await? {}
+        while self
+            .write(move |connection| trim::remove_events(connection, now_trimmed.floor))
+            .await?
+        {}
         for keys in work.keys.chunks(STEP) {
             let keys = keys.to_vec();
-            self.write(move |connection| trim::remove_versions(connection, now_trimmed, &keys)).await?;
+            self.write(move |connection| trim::remove_versions(connection, now_trimmed, &keys))
+                .await?;
         }
-        self.write(move |connection| trim::note(connection, now_trimmed)).await?;
+        self.write(move |connection| trim::note(connection, now_trimmed))
+            .await?;
         let time = now().as_millis();
-        while self.write(move |connection| trim::remove_expired(connection, time)).await? {}
+        while self
+            .write(move |connection| trim::remove_expired(connection, time))
+            .await?
+        {}
         super::encode::unsigned(now_trimmed.floor)
     }
 
     async fn revision_before(&self, time: Timestamp) -> Result<u64, StoreError> {
-        self.read(move |connection| archive::revision_before(connection, time)).await
+        self.read(move |connection| archive::revision_before(connection, time))
+            .await
     }
 
     async fn append_audit(&self, entries: &[AuditEntry]) -> Result<(), StoreError> {
         let entries: Vec<AuditRow> = entries.iter().map(AuditRow::encode).collect::<Result<_, _>>()?;
-        self.write(move |connection| archive::append_audit(connection, &entries)).await
+        self.write(move |connection| archive::append_audit(connection, &entries))
+            .await
     }
 
     async fn audit(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, StoreError> {
@@ -259,7 +281,8 @@ impl Archive for SqliteStore {
 
     async fn idempotency(&self, id: &str, now: Timestamp) -> Result<Option<IdempotencyRecord>, StoreError> {
         let id = id.to_owned();
-        self.read(move |connection| archive::idempotency(connection, &id, now)).await
+        self.read(move |connection| archive::idempotency(connection, &id, now))
+            .await
     }
 }
 
@@ -267,12 +290,14 @@ impl Archive for SqliteStore {
 impl TokenStore for SqliteStore {
     async fn add_token(&self, token: &TokenRecord, audit: &AuditEntry) -> Result<(), StoreError> {
         let (token, audit) = (TokenRow::encode(token)?, AuditRow::encode(audit)?);
-        self.write(move |connection| archive::add_token(connection, &token, &audit)).await
+        self.write(move |connection| archive::add_token(connection, &token, &audit))
+            .await
     }
 
     async fn revoke_token(&self, id: &str, time: Timestamp, audit: &AuditEntry) -> Result<bool, StoreError> {
         let (id, audit) = (id.to_owned(), AuditRow::encode(audit)?);
-        self.write(move |connection| archive::revoke_token(connection, &id, time, &audit)).await
+        self.write(move |connection| archive::revoke_token(connection, &id, time, &audit))
+            .await
     }
 
     async fn tokens(&self, now: Timestamp) -> Result<Vec<TokenRecord>, StoreError> {

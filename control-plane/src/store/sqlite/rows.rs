@@ -7,8 +7,7 @@ use crate::store::encode::{AuditRow, DocumentRow, EventRow, IdempotencyRow, Toke
 type Result<T> = rusqlite::Result<T>;
 
 pub(super) const EVENT: &str = "revision, batch, time, subject, request_id, changes, bytes";
-pub(super) const VERSION: &str =
-    "key, revision, position, op, previous, time, subject, request_id, paths, document";
+pub(super) const VERSION: &str = "key, revision, position, op, previous, time, subject, request_id, paths, document";
 pub(super) const AUDIT: &str = "id, time, revision, subject, roles, action, kind, service, name, allowed, code, \
                                 paths, request_id, address, detail";
 pub(super) const IDEMPOTENCY: &str = "id, body, expires, revision, answer";

@@ -5,8 +5,8 @@ use blaze_runtime::supervisor::Supervisor;
 use tempfile::TempDir;
 
 use super::*;
-use crate::store::conformance::samples::{commit, commit_of, record};
 use crate::store::backup;
+use crate::store::conformance::samples::{commit, commit_of, record};
 
 /// Files in a folder.
 struct Files {
@@ -35,8 +35,14 @@ impl Files {
 async fn a_second_opening_is_refused_until_the_first_is_closed() {
     let files = Files::new();
     let first = files.store().await;
-    let refused = SqliteStore::open(&files.path("store"), &files.supervisor).await.err().unwrap();
-    assert!(matches!(&refused, StoreError::Refused(text) if text.contains("one process per SQLite file")), "{refused}");
+    let refused = SqliteStore::open(&files.path("store"), &files.supervisor)
+        .await
+        .err()
+        .unwrap();
+    assert!(
+        matches!(&refused, StoreError::Refused(text) if text.contains("one process per SQLite file")),
+        "{refused}"
+    );
     // By another path to the same file, too.
     let link = files.path("link");
     std::os::unix::fs::symlink(files.path("store"), &link).unwrap();
@@ -49,7 +55,9 @@ async fn a_second_opening_is_refused_until_the_first_is_closed() {
             tokio::task::yield_now().await;
         }
     };
-    tokio::time::timeout(std::time::Duration::from_secs(10), ended).await.expect("threads and tasks end");
+    tokio::time::timeout(std::time::Duration::from_secs(10), ended)
+        .await
+        .expect("threads and tasks end");
 }
 
 #[tokio::test]
@@ -60,7 +68,9 @@ async fn a_shutdown_ends_its_threads() {
     let report = files.supervisor.shutdown(std::time::Duration::from_secs(10)).await;
     assert!(report.is_clean(), "{report:?}");
     assert!(matches!(store.head().await, Err(StoreError::Unavailable(_))));
-    let again = SqliteStore::open(&files.path("store"), &Supervisor::new("again")).await.unwrap();
+    let again = SqliteStore::open(&files.path("store"), &Supervisor::new("again"))
+        .await
+        .unwrap();
     assert_eq!(again.head().await.unwrap(), 1);
 }
 
@@ -81,7 +91,9 @@ async fn a_full_disk_is_an_error_and_goes_on_when_there_is_room() {
     document.spec = Arc::new(serde_json::json!({ "config": { "text": "x".repeat(200_000) } }));
     large.changes[0].document = Arc::new(document);
     let error = store.commit(&[record(large.clone())]).await.unwrap_err();
-    let CommitError::NotWritten(StoreError::Unavailable(text)) = &error else { panic!("{error}") };
+    let CommitError::NotWritten(StoreError::Unavailable(text)) = &error else {
+        panic!("{error}")
+    };
     assert!(text.contains("free space"), "{text}");
     assert_eq!(store.load().await.unwrap().revision, 1);
     pages(now + 10_000).await.unwrap();
@@ -95,11 +107,18 @@ async fn a_file_that_may_not_be_written_is_an_error() {
     let store = files.store().await;
     store.commit(&[record(commit(1, &["a"]))]).await.unwrap();
     store
-        .write(|connection| connection.pragma_update(None, "query_only", "ON").map_err(errors::store_error))
+        .write(|connection| {
+            connection
+                .pragma_update(None, "query_only", "ON")
+                .map_err(errors::store_error)
+        })
         .await
         .unwrap();
     let error = store.commit(&[record(commit(2, &["a"]))]).await.unwrap_err();
-    assert!(matches!(&error, CommitError::NotWritten(StoreError::Unavailable(_))), "{error}");
+    assert!(
+        matches!(&error, CommitError::NotWritten(StoreError::Unavailable(_))),
+        "{error}"
+    );
     assert_eq!(store.head().await.unwrap(), 1);
 }
 
@@ -107,12 +126,22 @@ async fn a_file_that_may_not_be_written_is_an_error() {
 async fn a_file_of_another_program_is_left_alone() {
     let files = Files::new();
     let path = files.path("store");
-    Connection::open(&path).unwrap().execute_batch("CREATE TABLE addresses (name TEXT)").unwrap();
+    Connection::open(&path)
+        .unwrap()
+        .execute_batch("CREATE TABLE addresses (name TEXT)")
+        .unwrap();
     let before = std::fs::read(&path).unwrap();
     let error = SqliteStore::open(&path, &files.supervisor).await.err().unwrap();
-    assert!(matches!(&error, StoreError::Refused(text) if text.contains("another program")), "{error}");
+    assert!(
+        matches!(&error, StoreError::Refused(text) if text.contains("another program")),
+        "{error}"
+    );
     assert_eq!(std::fs::read(&path).unwrap(), before);
-    std::fs::write(&path, "no database at all, but long enough to be looked at as one".repeat(20)).unwrap();
+    std::fs::write(
+        &path,
+        "no database at all, but long enough to be looked at as one".repeat(20),
+    )
+    .unwrap();
     let error = SqliteStore::open(&path, &files.supervisor).await.err().unwrap();
     assert!(matches!(error, StoreError::Corrupt(_)), "{error}");
 }
@@ -145,14 +174,28 @@ async fn a_plan_changes_nothing() {
 async fn a_backup_is_made_beside_a_running_process() {
     let files = Files::new();
     let store = files.store().await;
-    store.commit(&[record(commit(1, &["a"])), record(commit(2, &["b"]))]).await.unwrap();
+    store
+        .commit(&[record(commit(1, &["a"])), record(commit(2, &["b"]))])
+        .await
+        .unwrap();
     let mut file = Vec::new();
     let path = files.path("store");
-    let summary = backup::write(|pieces| SqliteStore::export_beside(&path, &files.supervisor, pieces), &mut file).await;
+    let summary = backup::write(
+        |pieces| SqliteStore::export_beside(&path, &files.supervisor, pieces),
+        &mut file,
+    )
+    .await;
     assert_eq!(summary.unwrap().head.revision, 2);
     let missing = files.path("missing");
-    let refused = backup::write(|pieces| SqliteStore::export_beside(&missing, &files.supervisor, pieces), &mut file).await;
-    assert!(matches!(refused, Err(backup::BackupError::Store(StoreError::Refused(_)))));
+    let refused = backup::write(
+        |pieces| SqliteStore::export_beside(&missing, &files.supervisor, pieces),
+        &mut file,
+    )
+    .await;
+    assert!(matches!(
+        refused,
+        Err(backup::BackupError::Store(StoreError::Refused(_)))
+    ));
     assert!(!missing.exists());
 }
 
@@ -161,11 +204,17 @@ async fn in_memory_it_is_a_store_as_well() {
     let supervisor = Supervisor::new("test");
     let store = SqliteStore::in_memory(&supervisor).await.unwrap();
     assert!(!store.is_shared());
-    store.commit(&[record(commit(1, &["a"])), record(commit(2, &["b"]))]).await.unwrap();
+    store
+        .commit(&[record(commit(1, &["a"])), record(commit(2, &["b"]))])
+        .await
+        .unwrap();
     assert_eq!(store.load().await.unwrap().documents.len(), 2);
     assert_eq!(store.trim(1, 1).await.unwrap(), 1);
     assert_eq!(store.commits_after(1, 10).await.unwrap().commits.len(), 1);
-    assert!(matches!(store.commit(&[record(commit_of(9, Vec::new()))]).await, Err(CommitError::NotWritten(_))));
+    assert!(matches!(
+        store.commit(&[record(commit_of(9, Vec::new()))]).await,
+        Err(CommitError::NotWritten(_))
+    ));
     drop(store);
     let other = SqliteStore::in_memory(&supervisor).await.unwrap();
     assert_eq!(other.head().await.unwrap(), 0);

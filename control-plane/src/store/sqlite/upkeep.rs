@@ -43,9 +43,10 @@ pub(super) fn export(connection: &mut Connection, pieces: &mpsc::Sender<Piece>) 
     each(&format!("SELECT {} FROM tokens ORDER BY id", rows::TOKEN), |row| {
         rows::token(row).map(Row::Token)
     })?;
-    each(&format!("SELECT {} FROM idempotency ORDER BY id", rows::IDEMPOTENCY), |row| {
-        rows::idempotency(row).map(Row::Idempotency)
-    })?;
+    each(
+        &format!("SELECT {} FROM idempotency ORDER BY id", rows::IDEMPOTENCY),
+        |row| rows::idempotency(row).map(Row::Idempotency),
+    )?;
     send(Piece::End)
 }
 
@@ -88,7 +89,10 @@ pub(super) fn import(connection: &mut Connection, mut pieces: mpsc::Receiver<Pie
     };
     set_number(&transaction, "floor", signed(restored.revision))?;
     transaction
-        .execute("UPDATE meta SET value = ?1 WHERE name = 'store_id'", [&restored.store_id])
+        .execute(
+            "UPDATE meta SET value = ?1 WHERE name = 'store_id'",
+            [&restored.store_id],
+        )
         .map_err(store_error)?;
     transaction.commit().map_err(store_error)?;
     Ok(restored)
@@ -147,13 +151,20 @@ impl Texts {
     }
 
     /// Replaces texts (place, old, new) that are still what they were.
-    pub(super) fn replace(self, connection: &mut Connection, texts: &[(i64, String, String)]) -> Result<u64, StoreError> {
+    pub(super) fn replace(
+        self,
+        connection: &mut Connection,
+        texts: &[(i64, String, String)],
+    ) -> Result<u64, StoreError> {
         let transaction = connection
             .transaction_with_behavior(TransactionBehavior::Immediate)
             .map_err(store_error)?;
         let mut replaced = 0;
         {
-            let sql = format!("UPDATE {} SET document = ?3 WHERE rowid = ?1 AND document = ?2", self.table());
+            let sql = format!(
+                "UPDATE {} SET document = ?3 WHERE rowid = ?1 AND document = ?2",
+                self.table()
+            );
             let mut statement = transaction.prepare(&sql).map_err(store_error)?;
             for (rowid, old, new) in texts {
                 replaced += statement.execute((rowid, old, new)).map_err(store_error)?;

@@ -129,10 +129,8 @@ fn headers(route: &Route) -> Vec<Parameter> {
         add("If-Match", patterns::IF_MATCH, 4096, said, "*");
     }
     match route.action {
-        Action::Get(_) => {
-            let said = "ETags that the client has: 304 if the document is one of them.";
-            add("If-None-Match", patterns::IF_MATCH, 4096, said, "\"412\"");
-        }
+        // GET takes `If-None-Match` too; it is told in words only, as a generated client that sent it by itself would get
+        // an answer without a document.
         Action::Replace(_) => {
             let said = "`*`: the document must be new. Not together with `If-Match`.";
             add("If-None-Match", patterns::STAR, 1, said, "*");
