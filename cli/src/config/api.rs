@@ -196,7 +196,8 @@ impl Client {
     }
 
     async fn with_suggestion(&self, refusal: Refusal, key: &Key) -> CliError {
-        let meant = if refusal.code() == "not_found" {
+        let told = refusal.problem.get("detail").and_then(Value::as_str);
+        let meant = if refusal.code() == "not_found" && !told.is_some_and(|detail| detail.contains("did you mean")) {
             self.meant(key).await
         } else {
             None

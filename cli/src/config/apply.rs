@@ -233,19 +233,20 @@ async fn wait(
     let mut pause = FIRST_PAUSE;
     loop {
         let behind = match client.workers().await {
-            Ok(workers) => behind(&workers, layers.as_ref(), revision),
+            Ok(workers) => {
+                let concerned = concerned(&workers, layers.as_ref());
+                let behind = behind(&concerned, revision);
+                if behind.is_empty() {
+                    note(format, &everywhere(concerned.len(), revision));
+                    return Ok(());
+                }
+                behind
+            }
             // The revision is written; whether the workers have it may show again in a moment.
             Err(error @ (CliError::NoServer { .. } | CliError::Foreign { .. })) => vec![error.to_string()],
             Err(CliError::Problem(refusal)) if refusal.status >= 500 => vec![refusal.to_string()],
             Err(error) => return Err(error),
         };
-        if behind.is_empty() {
-            note(
-                format,
-                &format!("every connected worker concerned has revision {revision}"),
-            );
-            return Ok(());
-        }
         let now = Instant::now();
         if now >= until {
             return Err(CliError::Failed(format!(
@@ -259,18 +260,28 @@ async fn wait(
     }
 }
 
-/// Connected workers of some layers that have not yet reached a revision, in words.
-fn behind(workers: &Value, layers: Option<&BTreeSet<String>>, revision: u64) -> Vec<String> {
+fn everywhere(workers: usize, revision: u64) -> String {
+    match workers {
+        0 => format!("revision {revision} is written; no worker concerned is connected"),
+        workers => format!("{} concerned: all have revision {revision}", count(workers, "worker")),
+    }
+}
+
+/// Connected workers of some layers.
+fn concerned<'w>(workers: &'w Value, layers: Option<&BTreeSet<String>>) -> Vec<&'w Value> {
     let items = workers.get("items").and_then(Value::as_array);
-    let concerned = |worker: &&Value| {
+    let is_concerned = |worker: &&Value| {
         let connected = worker.get("connected").and_then(Value::as_bool).unwrap_or(false);
         let layer = worker.get("layer").and_then(Value::as_str).unwrap_or_default();
         connected && layers.is_none_or(|layers| layers.contains(layer))
     };
-    items
-        .into_iter()
-        .flatten()
-        .filter(concerned)
+    items.into_iter().flatten().filter(is_concerned).collect()
+}
+
+/// Those that have not yet reached a revision, in words.
+fn behind(workers: &[&Value], revision: u64) -> Vec<String> {
+    workers
+        .iter()
         .filter(|worker| worker.get("revision").and_then(Value::as_u64).unwrap_or(0) < revision)
         .map(|worker| {
             let place = format!("{}/{}", member(worker, "layer"), cell(worker.get("node")));

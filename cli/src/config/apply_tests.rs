@@ -115,14 +115,16 @@ fn workers(edge: u64, cloud: u64) -> Value {
 #[test]
 fn only_connected_workers_of_the_layers_count() {
     let edge = BTreeSet::from(["edge".to_owned()]);
-    assert!(behind(&workers(420, 1), Some(&edge), 420).is_empty());
+    let late = |workers: &Value, layers| behind(&concerned(workers, layers), 420);
+    assert!(late(&workers(420, 1), Some(&edge)).is_empty());
     assert_eq!(
-        behind(&workers(419, 420), Some(&edge), 420),
+        late(&workers(419, 420), Some(&edge)),
         ["the worker of edge/robot-1 is at revision 419"]
     );
+    assert_eq!(late(&workers(420, 1), None), ["the worker of cloud/- is at revision 1"]);
     assert_eq!(
-        behind(&workers(420, 1), None, 420),
-        ["the worker of cloud/- is at revision 1"]
+        everywhere(0, 7),
+        "revision 7 is written; no worker concerned is connected"
     );
 }
 

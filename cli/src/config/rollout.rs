@@ -101,8 +101,9 @@ pub(super) async fn run(command: &RolloutCommand, format: Format) -> Result<Exit
                 Some(key) => show(&client.document(key, None).await?.body, format),
                 None => {
                     let listing = client.list(Kind::Rollout, &Filter::default()).await?;
-                    if listing.items.is_empty() {
+                    if listing.items.is_empty() && format == Format::Table {
                         note(format, "there are no roll-outs");
+                        return Ok(Exit::Done);
                     }
                     let layout = Layout {
                         wide: false,

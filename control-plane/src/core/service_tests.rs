@@ -477,6 +477,19 @@ async fn a_bound_token_sees_and_changes_its_own_layer_alone() {
     assert_eq!(code(patch("Service/slam", json!({ "description": "x" })).await), Code::PermissionDenied);
     assert_eq!(code(patch("Node/robot-1", json!({ "layer": "fog" })).await), Code::PermissionDenied);
     assert!(patch("Node/robot-1", json!({ "type": "mobile" })).await.is_ok());
+    // Who may make tokens could make one that is bound to nothing.
+    let admin = caller(&["admin"], Some("edge"));
+    let token = TokenRequest {
+        subject: "x".to_owned(),
+        roles: vec!["admin".to_owned()],
+        layer: None,
+        expires_in_s: 60,
+    };
+    assert_eq!(code(w.service.create_token(&admin, token).await), Code::PermissionDenied);
+    assert_eq!(code(w.service.revoke_token(&admin, "x").await), Code::PermissionDenied);
+    assert_eq!(code(w.service.tokens(&admin, &read).await), Code::PermissionDenied);
+    assert_eq!(code(w.service.audit(&admin, AuditQuery::default(), "", &read).await), Code::PermissionDenied);
+    assert_eq!(code(w.service.trim(&admin, 1, None).await), Code::PermissionDenied);
     assert!(w.service.authorize(&caller(&["viewer"], None).claims, Right::Write).is_err());
     assert!(w.service.authorize(&caller(&["admin", "wizard"], None).claims, Right::Read).is_err());
 }

@@ -5,7 +5,7 @@ use blaze_domain::LayerName;
 
 use super::placement::{Placement, placement};
 use super::state::State;
-use crate::auth::{Claims, Right, Role, allowed};
+use crate::auth::{Claims, Right, Role, allowed, unbound};
 
 /// What one token sees.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -30,6 +30,16 @@ pub(crate) fn authorize(claims: &Claims, right: Right) -> Result<(), Problem> {
             Right::Sync => "worker",
         };
         let detail = format!("the token has no role for this; it needs {needed}");
+        Problem::new(Code::PermissionDenied, detail).because(reason)
+    })
+}
+
+/// Refuses what concerns the whole system to all but administrators who are bound to no layer: who may make tokens could
+/// make one that is bound to nothing.
+pub(crate) fn authorize_whole(claims: &Claims) -> Result<(), Problem> {
+    authorize(claims, Right::Admin)?;
+    unbound(claims).map_err(|reason| {
+        let detail = "this concerns the whole system; the token is bound to a layer";
         Problem::new(Code::PermissionDenied, detail).because(reason)
     })
 }

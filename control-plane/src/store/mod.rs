@@ -3,7 +3,7 @@
 //! ```text
 //! core ──[port]──▶ sqlite   a file, one process
 //!             └──▶ mongo    a replica set, any number of processes (feature `mongodb`)
-//! both: encode (rows), retain (what history keeps), migrate (schemas), backup (files), conformance (the rules for both)
+//! both: rows and encode (how it is stored), retain (what history keeps), migrate (schemas), backup (files), conformance (the rules for both)
 //! ```
 //!
 //! One commit is one revision, and revisions have no holes. A commit with its history, audit and answer to repeat is in
@@ -18,6 +18,7 @@ pub mod migrate;
 pub mod mongo;
 mod port;
 pub(crate) mod retain;
+pub(crate) mod rows;
 pub mod sqlite;
 pub mod upkeep;
 

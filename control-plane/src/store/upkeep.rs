@@ -7,7 +7,8 @@ use blaze_domain::config::{Document, Timestamp};
 use serde::{Deserialize, Serialize};
 use tokio::sync::mpsc;
 
-use super::encode::{AuditRow, DocumentRow, IdempotencyRow, TokenRow, VersionRow, document, document_text};
+use super::encode::{document, document_text};
+use super::rows::{AuditRow, DocumentRow, IdempotencyRow, TokenRow, VersionRow};
 use super::{Store, StoreError};
 
 /// What `restore` adds to the revision, so that no client takes the restored store for the one it knew.
@@ -38,7 +39,7 @@ pub struct BackupRow(pub(crate) Row);
 pub(crate) enum Row {
     Document(DocumentRow),
     Version(VersionRow),
-    Audit(AuditRow),
+    Audit(Box<AuditRow>),
     Idempotency(IdempotencyRow),
     Token(TokenRow),
 }

@@ -6,5 +6,6 @@
 
 #[cfg(feature = "kafka")]
 mod kafka;
+mod mongo;
 mod redis;
 mod shared;

@@ -7,6 +7,7 @@
 mod killed;
 mod migrations;
 mod outages;
+mod rates;
 mod refused;
 mod rules;
 mod support;

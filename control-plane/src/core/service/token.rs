@@ -9,8 +9,9 @@ use blaze_domain::config::{Code, FieldFault, Key, Problem, Timestamp};
 use super::super::committer::{now, unavailable};
 use super::super::page::Position;
 use super::super::types::{Answer, Caller, Page, ReadOptions, TokenRequest};
+use super::super::view::authorize_whole;
 use super::ConfigService;
-use crate::auth::{Claims, NewToken, Right};
+use crate::auth::{Claims, NewToken};
 use crate::store::{AuditEntry, AuditQuery, StoreError, TokenRecord};
 
 /// Refusals per address and second that are written to the audit; the rest is counted.
@@ -121,7 +122,7 @@ impl ConfigService {
         page_token: &str,
         read: &ReadOptions,
     ) -> Result<Answer<Page<AuditEntry>>, Problem> {
-        self.authorize(&caller.claims, Right::Admin)?;
+        authorize_whole(&caller.claims)?;
         let state = self.read_state(read).await?;
         let bound = format!("audit {query:?}");
         if !page_token.is_empty() {
@@ -159,7 +160,7 @@ impl ConfigService {
         caller: &Caller,
         request: TokenRequest,
     ) -> Result<Answer<(TokenRecord, String)>, Problem> {
-        self.authorize(&caller.claims, Right::Admin)?;
+        authorize_whole(&caller.claims)?;
         check_token(&request)?;
         let disabled = || {
             let detail = "no key with sign: true is configured (control_plane.auth.keys)";
@@ -205,7 +206,7 @@ impl ConfigService {
     /// # Errors
     /// [`Problem`].
     pub async fn tokens(&self, caller: &Caller, read: &ReadOptions) -> Result<Answer<Vec<TokenRecord>>, Problem> {
-        self.authorize(&caller.claims, Right::Admin)?;
+        authorize_whole(&caller.claims)?;
         let state = self.read_state(read).await?;
         let tokens = self.inner.store.tokens(now()).await.map_err(|error| unavailable(&error))?;
         Ok(Answer {
@@ -220,7 +221,7 @@ impl ConfigService {
     /// # Errors
     /// [`Code::NotFound`] for an id that was not given out here, or other [`Problem`]s.
     pub async fn revoke_token(&self, caller: &Caller, id: &str) -> Result<Answer<()>, Problem> {
-        self.authorize(&caller.claims, Right::Admin)?;
+        authorize_whole(&caller.claims)?;
         let entry = Self::entry(caller, "token_revoke", None);
         let revoked = self.inner.store.revoke_token(id, now(), &entry).await;
         if !revoked.map_err(|error| unavailable(&error))? {

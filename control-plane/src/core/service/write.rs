@@ -14,7 +14,7 @@ use super::super::report::{AnswerKind, Done, report_from, written_from};
 use super::super::types::{
     Answer, ApplyReport, ApplyRequest, Caller, DocumentInput, Idempotency, Precondition, ReadOptions, Written,
 };
-use super::super::view::view;
+use super::super::view::{authorize_whole, view};
 use super::super::watch::trimmed;
 use super::{ConfigService, selector};
 use crate::auth::Right;
@@ -419,7 +419,7 @@ impl ConfigService {
         before: u64,
         _idempotency: Option<Idempotency>,
     ) -> Result<Answer<u64>, Problem> {
-        self.authorize(&caller.claims, Right::Admin)?;
+        authorize_whole(&caller.claims)?;
         let state = self.read_state(&ReadOptions::default()).await?;
         if before == 0 || before > state.revision() + 1 {
             let fault = FieldFault {

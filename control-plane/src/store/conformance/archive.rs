@@ -91,20 +91,23 @@ pub async fn revisions_before_a_time_are_found(fixture: &dyn Fixture) -> Outcome
     Ok(())
 }
 
+/// What a query asks for.
+type Holds = fn(&AuditEntry) -> bool;
+
 /// Each filter of the audit holds, entries come newest first, and pages neither overlap nor leave one out.
 ///
 /// # Errors
 /// How the store breaks the rule.
 pub async fn audit_is_filtered_and_paged(fixture: &dyn Fixture) -> Outcome {
     let store = fresh(fixture, "audit").await?;
-    let mut entries: Vec<AuditEntry> = (0..20_u64).map(|number| entry(number)).collect();
+    let mut entries: Vec<AuditEntry> = (0..20).map(entry).collect();
     told("append_audit", store.append_audit(&entries).await)?;
     entries.reverse();
     let none = AuditQuery {
         limit: 100,
         ..AuditQuery::default()
     };
-    let queries: Vec<(AuditQuery, fn(&AuditEntry) -> bool)> = vec![
+    let queries: Vec<(AuditQuery, Holds)> = vec![
         (none.clone(), |_| true),
         (
             AuditQuery {

@@ -11,7 +11,8 @@ use super::client::{QUICK, USUAL, limited};
 use super::errors::is_duplicate;
 use super::rows::{self, FLOOR};
 use super::{MongoStore, collect};
-use crate::store::encode::{AuditRow, TokenRow, corrupt, document, signed, unsigned};
+use crate::store::encode::{corrupt, document, signed, unsigned};
+use crate::store::rows::{AuditRow, TokenRow};
 use crate::store::{AuditEntry, AuditQuery, IdempotencyRecord, StoreError, TokenRecord, Version};
 
 /// Documents that one query names.

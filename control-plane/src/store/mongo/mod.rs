@@ -21,6 +21,7 @@ mod migrate;
 mod read;
 mod rows;
 mod stale;
+mod statements;
 mod transaction;
 mod trim;
 mod upkeep;

@@ -11,7 +11,8 @@ use super::MongoStore;
 use super::client::{LONG, QUICK, USUAL, limited, limited_steps};
 use super::errors::{is_snapshot_unavailable, store_error};
 use super::rows::{self, FLOOR};
-use crate::store::encode::{EventRow, corrupt, decode_commits, signed, unsigned};
+use crate::store::encode::{corrupt, decode_commits, signed, unsigned};
+use crate::store::rows::EventRow;
 use crate::store::{CommitBatch, READ_BYTES, Snapshot, StoreError};
 
 /// Just after collections were made there is no snapshot of them for a moment.

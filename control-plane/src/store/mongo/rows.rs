@@ -5,7 +5,8 @@
 use mongodb::bson::{Bson, DateTime, Document, doc};
 
 use crate::store::StoreError;
-use crate::store::encode::{AuditRow, DocumentRow, EventRow, IdempotencyRow, TokenRow, VersionRow, corrupt};
+use crate::store::encode::corrupt;
+use crate::store::rows::{AuditRow, DocumentRow, EventRow, IdempotencyRow, TokenRow, VersionRow};
 
 /// `_id` of the record in `documents` that holds the floor. Keys of documents begin with a capital letter.
 pub(super) const FLOOR: &str = "floor";

@@ -37,7 +37,7 @@ impl MongoStore {
         let tables: [(&str, ReadRow); 5] = [
             ("documents", |found| rows::read_document(found).map(Row::Document)),
             ("versions", |found| rows::read_version(found).map(Row::Version)),
-            ("audit", |found| rows::read_audit(found).map(Row::Audit)),
+            ("audit", |found| rows::read_audit(found).map(Box::new).map(Row::Audit)),
             ("tokens", |found| rows::read_token(found).map(Row::Token)),
             ("idempotency", |found| {
                 rows::read_idempotency(found).map(Row::Idempotency)

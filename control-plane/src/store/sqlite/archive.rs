@@ -6,7 +6,8 @@ use rusqlite::{Connection, OptionalExtension as _, ToSql, TransactionBehavior, p
 use super::connection::number;
 use super::errors::store_error;
 use super::rows;
-use crate::store::encode::{AuditRow, TokenRow, corrupt, document, signed, unsigned};
+use crate::store::encode::{corrupt, document, signed, unsigned};
+use crate::store::rows::{AuditRow, IdempotencyRow, TokenRow};
 use crate::store::{AuditEntry, AuditQuery, IdempotencyRecord, StoreError, TokenRecord, Version};
 
 pub(super) fn versions(
@@ -144,7 +145,7 @@ pub(super) fn idempotency(
         .query_row(&sql, (id, now.as_millis()), rows::idempotency)
         .optional()
         .map_err(store_error)?;
-    found.map(crate::store::encode::IdempotencyRow::decode).transpose()
+    found.map(IdempotencyRow::decode).transpose()
 }
 
 pub(super) fn add_token(connection: &mut Connection, token: &TokenRow, audit: &AuditRow) -> Result<(), StoreError> {

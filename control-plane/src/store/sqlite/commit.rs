@@ -5,7 +5,8 @@ use rusqlite::{Connection, ErrorCode, OptionalExtension as _, Transaction, Trans
 use super::connection::{head, number, store_id};
 use super::errors::{not_written, store_error};
 use super::rows;
-use crate::store::encode::{EncodedCommit, EventRow, decode_commits, last_versions, signed, unsigned};
+use crate::store::encode::{EncodedCommit, decode_commits, last_versions, signed, unsigned};
+use crate::store::rows::EventRow;
 use crate::store::{CommitBatch, CommitError, READ_BYTES, Snapshot, StoreError};
 
 /// Writes a group in one transaction, synced to the disk before it returns.

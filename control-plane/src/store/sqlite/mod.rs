@@ -33,8 +33,9 @@ use tokio::sync::{mpsc, oneshot};
 use self::lock::FileLock;
 use self::upkeep::Texts;
 use self::worker::Worker;
-use super::encode::{AuditRow, TokenRow, encode_group};
+use super::encode::encode_group;
 use super::migrate::{Migrations, Plan, apply};
+use super::rows::{AuditRow, TokenRow};
 use super::upkeep::{Piece, Restored, Rewriter, Upkeep, now, rewritten};
 use super::{
     Archive, AuditEntry, AuditQuery, CommitBatch, CommitError, CommitLog, CommitRecord, IdempotencyRecord, Snapshot,
@@ -222,7 +223,7 @@ impl CommitLog for SqliteStore {
     }
 
     async fn foreign_commit(&self) {
-        std::future::pending().await
+        std::future::pending::<()>().await;
     }
 }
 

@@ -2,7 +2,7 @@
 
 use rusqlite::{Row, Statement, params};
 
-use crate::store::encode::{AuditRow, DocumentRow, EventRow, IdempotencyRow, TokenRow, VersionRow};
+use crate::store::rows::{AuditRow, DocumentRow, EventRow, IdempotencyRow, TokenRow, VersionRow};
 
 type Result<T> = rusqlite::Result<T>;
 

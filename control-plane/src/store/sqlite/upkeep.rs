@@ -38,7 +38,7 @@ pub(super) fn export(connection: &mut Connection, pieces: &mpsc::Sender<Piece>) 
         |row| rows::version(row).map(Row::Version),
     )?;
     each(&format!("SELECT {} FROM audit ORDER BY id", rows::AUDIT), |row| {
-        rows::audit(row).map(Row::Audit)
+        rows::audit(row).map(Box::new).map(Row::Audit)
     })?;
     each(&format!("SELECT {} FROM tokens ORDER BY id", rows::TOKEN), |row| {
         rows::token(row).map(Row::Token)
