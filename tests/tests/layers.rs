@@ -46,6 +46,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "blaze-brokers",
             "blaze-flow",
             "blaze-sdk",
+            "blaze-auth",
         ],
     ),
 ];

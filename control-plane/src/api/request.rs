@@ -3,7 +3,7 @@
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use axum::extract::ConnectInfo;
-use axum::http::header::{AUTHORIZATION, HOST, ORIGIN};
+use axum::http::header::{AUTHORIZATION, AsHeaderName, HOST, ORIGIN};
 use axum::http::{Extensions, HeaderMap, HeaderValue, Uri};
 use blaze_domain::config::{Code, Problem};
 use uuid::Uuid;
@@ -50,7 +50,7 @@ pub fn traceparent(headers: &HeaderMap) -> Option<&HeaderValue> {
 #[must_use]
 pub fn bearer(headers: &HeaderMap) -> Option<&str> {
     headers.get(AUTHORIZATION)?;
-    let credentials = single(headers, AUTHORIZATION.as_str()).and_then(|value| value.to_str().ok());
+    let credentials = single(headers, AUTHORIZATION).and_then(|value| value.to_str().ok());
     match credentials.unwrap_or_default().split_once(' ') {
         Some((scheme, token)) if scheme.eq_ignore_ascii_case("bearer") => Some(token.trim_matches(' ')),
         _ => Some(""),
@@ -58,7 +58,7 @@ pub fn bearer(headers: &HeaderMap) -> Option<&str> {
 }
 
 /// The value of a header that comes exactly once.
-fn single<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a HeaderValue> {
+pub(super) fn single<'a>(headers: &'a HeaderMap, name: impl AsHeaderName) -> Option<&'a HeaderValue> {
     let mut values = headers.get_all(name).iter();
     let first = values.next();
     if values.next().is_some() { None } else { first }
@@ -77,7 +77,7 @@ pub fn client_address(extensions: &Extensions) -> IpAddr {
 /// # Errors
 /// `permission_denied`.
 pub fn check_dev(uri: &Uri, headers: &HeaderMap) -> Result<(), Problem> {
-    let header = || single(headers, HOST.as_str()).and_then(|value| value.to_str().ok());
+    let header = || single(headers, HOST).and_then(|value| value.to_str().ok());
     let host = uri
         .authority()
         .map(axum::http::uri::Authority::as_str)

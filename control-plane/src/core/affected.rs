@@ -118,7 +118,10 @@ fn at_layer(state: &State, service: &ServiceName, layer: &LayerName) -> Vec<At> 
         node.is_some_and(|held| {
             let is_empty = |value: &serde_json::Value| value.as_object().is_some_and(serde_json::Map::is_empty);
             held.document.config().is_some_and(|config| !is_empty(config))
-                || held.document.overrides(service.as_str()).is_some_and(|config| !is_empty(config))
+                || held
+                    .document
+                    .overrides(service.as_str())
+                    .is_some_and(|config| !is_empty(config))
         })
     };
     let nodes = state.in_layer(layer).filter(own_word);
@@ -146,7 +149,10 @@ pub(crate) fn changed(before: &State, after: &State, keys: &[Key]) -> Vec<At> {
 
 /// Whether the service, and the instance if one is named, is there to have a configuration.
 fn exists(state: &State, at: &At) -> bool {
-    let service = at.service.as_ref().is_some_and(|name| state.get(&Key::service(name)).is_some());
+    let service = at
+        .service
+        .as_ref()
+        .is_some_and(|name| state.get(&Key::service(name)).is_some());
     match (&at.service, &at.instance) {
         (Some(service), Some(instance)) => state.get(&Key::instance(service.clone(), instance.clone())).is_some(),
         _ => service,

@@ -22,9 +22,7 @@ use super::evaluate::{Evaluator, Request};
 use super::log::Log;
 use super::report::{AnswerKind, Done};
 use super::state::State;
-use crate::store::{
-    AuditEntry, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError,
-};
+use crate::store::{AuditEntry, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError};
 
 /// Requests that may wait, at most.
 pub(crate) const QUEUE: usize = 4096;
@@ -102,7 +100,11 @@ pub(crate) async fn follow(store: &dyn Store, log: &Log, at_least: Option<u64>) 
         if batch.floor > from && log.revision() == from {
             // What is between was trimmed: this process has slept too long and begins anew.
             let snapshot = store.load().await?;
-            tracing::warn!(from, to = snapshot.revision, "commits were trimmed before they were read; starting from the documents");
+            tracing::warn!(
+                from,
+                to = snapshot.revision,
+                "commits were trimmed before they were read; starting from the documents"
+            );
             log.reset(State::new(snapshot.revision, snapshot.documents), snapshot.floor);
             continue;
         }
@@ -111,7 +113,10 @@ pub(crate) async fn follow(store: &dyn Store, log: &Log, at_least: Option<u64>) 
         for commit in batch.commits {
             let revision = commit.revision;
             if !log.append(Arc::new(commit)) {
-                return Err(StoreError::Corrupt(format!("commit {revision} does not follow {}", log.revision())));
+                return Err(StoreError::Corrupt(format!(
+                    "commit {revision} does not follow {}",
+                    log.revision()
+                )));
             }
         }
         if count == 0 {
@@ -178,7 +183,10 @@ impl Committer {
                 }
             }
             if Instant::now() >= deadline {
-                let problem = Problem::new(Code::Overloaded, "other processes were first again and again; try later");
+                let problem = Problem::new(
+                    Code::Overloaded,
+                    "other processes were first again and again; try later",
+                );
                 return refuse(batch, &problem.retry_after(1));
             }
             let pause = rand::rng().random_range(Duration::ZERO..=JITTER);
@@ -246,7 +254,11 @@ impl Committer {
                 self.doubtful = true;
                 tracing::warn!(%error, "the outcome of a commit is not known");
                 let detail = "the store went away while it wrote: read the documents to see whether it took effect";
-                Err(Again::Refuse(Problem::new(Code::OutcomeUnknown, detail).applied(Applied::Unknown).retry_after(2)))
+                Err(Again::Refuse(
+                    Problem::new(Code::OutcomeUnknown, detail)
+                        .applied(Applied::Unknown)
+                        .retry_after(2),
+                ))
             }
         }
     }

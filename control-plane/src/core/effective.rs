@@ -96,9 +96,7 @@ impl Sources {
             if let Some(config) = document.config() {
                 out.push((&**document, false, config));
             }
-            if with_overrides
-                && let Some(config) = service.and_then(|service| document.overrides(service))
-            {
+            if with_overrides && let Some(config) = service.and_then(|service| document.overrides(service)) {
                 out.push((&**document, true, config));
             }
         }
@@ -125,7 +123,11 @@ impl Sources {
 
     /// Where each key comes from.
     pub(crate) fn explain(&self, form: impl Fn(&Document, &Value) -> Value) -> Value {
-        let values: Vec<Value> = self.parts().iter().map(|(document, _, value)| form(document, value)).collect();
+        let values: Vec<Value> = self
+            .parts()
+            .iter()
+            .map(|(document, _, value)| form(document, value))
+            .collect();
         let parts: Vec<Part<'_>> = self
             .parts()
             .iter()
@@ -157,8 +159,12 @@ impl Sources {
 
 /// Whether a node is one that a roll-out tries its change on.
 pub(crate) fn is_canary(rollout: &Document, node: &Document) -> bool {
-    let selector = rollout.spec_member("canary").and_then(|canary| canary.get("node_selector"));
-    let selector = selector.and_then(Value::as_str).and_then(|text| text.parse::<LabelSelector>().ok());
+    let selector = rollout
+        .spec_member("canary")
+        .and_then(|canary| canary.get("node_selector"));
+    let selector = selector
+        .and_then(Value::as_str)
+        .and_then(|text| text.parse::<LabelSelector>().ok());
     selector.is_some_and(|selector| selector.matches(&node.labels))
 }
 

@@ -7,8 +7,8 @@ use std::sync::Arc;
 use blaze_domain::config::diff::{document_diff, paths};
 use blaze_domain::config::selector::LabelSelector;
 use blaze_domain::config::{
-    Code, Document, FieldFault, Key, Kind, Labels, MAX_DOCUMENT_BYTES, MAX_DOCUMENTS, Problem, Timestamp, merge, secret,
-    spec,
+    Code, Document, FieldFault, Key, Kind, Labels, MAX_DOCUMENT_BYTES, MAX_DOCUMENTS, Problem, Timestamp, merge,
+    secret, spec,
 };
 use serde_json::{Map, Value, json};
 
@@ -148,7 +148,10 @@ impl Evaluator {
             && let Some(exists) = order.iter().find(|key| state.get(key).is_some())
         {
             let held = state.get(exists).map_or(0, |held| held.document.revision);
-            faults.conflict(0, Problem::new(Code::AlreadyExists, format!("{exists} exists")).at(held));
+            faults.conflict(
+                0,
+                Problem::new(Code::AlreadyExists, format!("{exists} exists")).at(held),
+            );
         }
         if let Some(prune) = &request.prune {
             prune_into(state, request, prune, &mut outcomes, &mut order)?;
@@ -177,7 +180,9 @@ impl Evaluator {
             let before = state.get(&key).map(|held| Arc::clone(&held.document));
             let change = match outcome {
                 Outcome::Keep => None,
-                Outcome::Remove => before.as_ref().map(|document| removal(document, revision, time, request)),
+                Outcome::Remove => before
+                    .as_ref()
+                    .map(|document| removal(document, revision, time, request)),
                 Outcome::Put(target) => {
                     match self.document(&key, before.as_deref(), *target, revision, time, request) {
                         Ok(Some(document)) => Some(put(before.as_deref(), document, op)),
@@ -225,7 +230,10 @@ impl Evaluator {
         let uid = before.map_or_else(|| uuid::Uuid::now_v7().to_string(), |document| document.uid.clone());
         let mut spec = target.spec;
         if key.kind() == Kind::Rollout && secret::contains(&spec) {
-            return Err(vec![invalid("/spec/patch", "a roll-out cannot carry secrets: change them in the target itself")]);
+            return Err(vec![invalid(
+                "/spec/patch",
+                "a roll-out cannot carry secrets: change them in the target itself",
+            )]);
         }
         Vault {
             keyring: &self.keyring,
@@ -236,7 +244,10 @@ impl Evaluator {
             revision,
         }
         .store(&mut spec)?;
-        if let Some(schema) = spec.get("schema").filter(|_| key.kind() == Kind::Service && is_set(spec.get("schema"))) {
+        if let Some(schema) = spec
+            .get("schema")
+            .filter(|_| key.kind() == Kind::Service && is_set(spec.get("schema")))
+        {
             self.schemas
                 .check(schema)
                 .map_err(|reason| vec![invalid("/spec/schema", &reason)])?;
@@ -305,7 +316,10 @@ impl Evaluator {
             }
         }
         if after.len() > MAX_DOCUMENTS && after.len() > before.len() {
-            let detail = format!("the store would hold {} documents, at most {MAX_DOCUMENTS} are allowed", after.len());
+            let detail = format!(
+                "the store would hold {} documents, at most {MAX_DOCUMENTS} are allowed",
+                after.len()
+            );
             return Err(Problem::new(Code::LimitExceeded, detail));
         }
         faults.finish_conflicts(before.revision())
@@ -323,7 +337,10 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
         Content::Patch(patch) => {
             let current = current.ok_or_else(|| Box::new(not_found(&item.key)))?;
             let input = patch_input(state, &item.key, patch).map_err(|faults| Box::new(Problem::faults(faults)))?;
-            one(Outcome::Put(Box::new(written(state, &input, Some(current))?)), Op::Update)
+            one(
+                Outcome::Put(Box::new(written(state, &input, Some(current))?)),
+                Op::Update,
+            )
         }
         Content::Delete => match current {
             Some(_) => one(Outcome::Remove, Op::Delete),
@@ -331,7 +348,11 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
             None => Err(Box::new(not_found(&item.key))),
         },
         Content::Restore(None) => one(
-            if current.is_some() { Outcome::Remove } else { Outcome::Keep },
+            if current.is_some() {
+                Outcome::Remove
+            } else {
+                Outcome::Keep
+            },
             Op::Delete,
         ),
         Content::Restore(Some(version)) => {
@@ -339,7 +360,12 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
                 let detail = "a roll-out is not set back; start another one";
                 return Err(Box::new(Problem::new(Code::RolloutState, detail)));
             }
-            let faults = spec::check(&version.key, &version.labels, &version.annotations, &secret::redact(&version.spec));
+            let faults = spec::check(
+                &version.key,
+                &version.labels,
+                &version.annotations,
+                &secret::redact(&version.spec),
+            );
             if !faults.is_empty() {
                 return Err(Box::new(Problem::faults(faults)));
             }
@@ -380,12 +406,20 @@ fn precondition(state: &State, request: &Request, item: &Item, current: Option<&
             fail(Problem::new(Code::PreconditionRequired, detail))
         }
         (Precondition::Revisions(wanted), Some(document)) if !wanted.contains(&document.revision) => {
-            let code = if many { Code::RevisionConflict } else { Code::PreconditionFailed };
+            let code = if many {
+                Code::RevisionConflict
+            } else {
+                Code::PreconditionFailed
+            };
             let detail = format!("{} has revision {} now: read it again", item.key, document.revision);
             fail(Problem::new(code, detail))
         }
         (Precondition::Revisions(_) | Precondition::Any, None) => {
-            let code = if many { Code::RevisionConflict } else { Code::PreconditionFailed };
+            let code = if many {
+                Code::RevisionConflict
+            } else {
+                Code::PreconditionFailed
+            };
             fail(Problem::new(code, format!("{} does not exist", item.key)))
         }
         (Precondition::Absent, Some(_)) if request.form != Form::Create => {
@@ -400,7 +434,10 @@ fn written(state: &State, input: &DocumentInput, current: Option<&Document>) -> 
     let faults = spec::check(&input.key, &input.labels, &input.annotations, &input.spec);
     let bytes = spec::document_size(&input.labels, &input.annotations, &input.spec);
     if bytes > MAX_DOCUMENT_BYTES {
-        let detail = format!("{} has {bytes} bytes, at most {MAX_DOCUMENT_BYTES} are allowed", input.key);
+        let detail = format!(
+            "{} has {bytes} bytes, at most {MAX_DOCUMENT_BYTES} are allowed",
+            input.key
+        );
         return Err(Box::new(Problem::new(Code::PayloadTooLarge, detail)));
     }
     if !faults.is_empty() {
@@ -410,7 +447,10 @@ fn written(state: &State, input: &DocumentInput, current: Option<&Document>) -> 
         (Kind::Rollout, None) => Some(begin_rollout(state, input)?),
         (Kind::Rollout, Some(current)) => {
             if !same_spec(&current.spec, &input.spec) {
-                let detail = format!("{} has begun: its spec stays as it is; abort it and start another one", input.key);
+                let detail = format!(
+                    "{} has begun: its spec stays as it is; abort it and start another one",
+                    input.key
+                );
                 return Err(Box::new(Problem::new(Code::RolloutState, detail)));
             }
             current.status.clone()
@@ -432,7 +472,10 @@ fn patch_input(state: &State, key: &Key, patch: &Value) -> Result<DocumentInput,
         return Err(vec![invalid("", "it does not exist")]);
     };
     let Value::Object(members) = patch else {
-        return Err(vec![invalid("", "a patch is an object with labels, annotations or spec")]);
+        return Err(vec![invalid(
+            "",
+            "a patch is an object with labels, annotations or spec",
+        )]);
     };
     let mut whole = json!({
         "labels": held.document.labels, "annotations": held.document.annotations, "spec": *held.shown.spec,
@@ -473,12 +516,17 @@ fn begin_rollout(state: &State, input: &DocumentInput) -> Result<Value, Box<Prob
         spec: Arc::new(input.spec.clone()),
         status: None,
     };
-    let nodes = state.of_kind(Kind::Node, None).filter(|(_, held)| is_canary(&rollout, &held.document));
+    let nodes = state
+        .of_kind(Kind::Node, None)
+        .filter(|(_, held)| is_canary(&rollout, &held.document));
     let canaries: Vec<Value> = nodes
         .map(|(key, _)| json!({ "node": key.name().as_str(), "phase": "pending", "revision": null, "reason": "" }))
         .collect();
     if canaries.is_empty() {
-        return refuse("/spec/canary/node_selector", "matches no node; at least one must try the change");
+        return refuse(
+            "/spec/canary/node_selector",
+            "matches no node; at least one must try the change",
+        );
     }
     if let Some(target) = rollout_target(&rollout).and_then(|key| state.get(&key).cloned()) {
         let mut patched = (*target.shown.spec).clone();
@@ -488,7 +536,13 @@ fn begin_rollout(state: &State, input: &DocumentInput) -> Result<Value, Box<Prob
         let document = &target.document;
         let faults = spec::check(&document.key, &document.labels, &document.annotations, &patched);
         if let Some(fault) = faults.first() {
-            return refuse("/spec/patch", &format!("makes of {} a document with a fault: {}: {}", document.key, fault.pointer, fault.detail));
+            return refuse(
+                "/spec/patch",
+                &format!(
+                    "makes of {} a document with a fault: {}: {}",
+                    document.key, fault.pointer, fault.detail
+                ),
+            );
         }
     }
     Ok(json!({ "phase": "canary", "canaries": canaries }))
@@ -502,7 +556,10 @@ fn canary_phase(state: &State, key: &Key) -> Result<Arc<Document>, Box<Problem>>
     if is_active(&held.document) {
         return Ok(Arc::clone(&held.document));
     }
-    let detail = format!("{key} is {}; only one in phase canary can be promoted or aborted", phase(&held.document));
+    let detail = format!(
+        "{key} is {}; only one in phase canary can be promoted or aborted",
+        phase(&held.document)
+    );
     Err(Box::new(Problem::new(Code::RolloutState, detail).at(state.revision())))
 }
 
@@ -533,7 +590,12 @@ fn promote(state: &State, key: &Key) -> Result<Vec<(Key, Outcome, Op)>, Box<Prob
     if let Some(patch) = rollout.spec_member("patch") {
         merge::merge_patch(&mut spec, patch);
     }
-    let faults = spec::check(&target, &held.document.labels, &held.document.annotations, &secret::redact(&spec));
+    let faults = spec::check(
+        &target,
+        &held.document.labels,
+        &held.document.annotations,
+        &secret::redact(&spec),
+    );
     if !faults.is_empty() {
         return Err(Box::new(Problem::faults(faults)));
     }
@@ -564,7 +626,10 @@ fn active_elsewhere(after: &State, rollout: &Document) -> Option<Problem> {
         **key != rollout.key && is_active(&held.document) && rollout_target(&held.document).as_ref() == Some(&target)
     });
     other.map(|(other, _)| {
-        let detail = format!("{target} has the roll-out {} already: promote or abort it first", other.name());
+        let detail = format!(
+            "{target} has the roll-out {} already: promote or abort it first",
+            other.name()
+        );
         Problem::new(Code::RolloutActive, detail)
     })
 }
@@ -684,7 +749,10 @@ fn not_found(key: &Key) -> Problem {
 fn in_use(key: &Key, referrers: &[Key]) -> Problem {
     let named: Vec<String> = referrers.iter().take(NAMED).map(ToString::to_string).collect();
     let more = if referrers.len() > NAMED { " and more" } else { "" };
-    let detail = format!("{key} is referred to by {}{more}: delete those first, or use cascade=true", named.join(", "));
+    let detail = format!(
+        "{key} is referred to by {}{more}: delete those first, or use cascade=true",
+        named.join(", ")
+    );
     Problem::new(Code::InUse, detail)
 }
 
@@ -736,7 +804,9 @@ impl Faults {
     }
 
     fn finish_conflicts(&mut self, revision: u64) -> Result<(), Problem> {
-        let Some((_, first)) = self.conflicts.first() else { return Ok(()) };
+        let Some((_, first)) = self.conflicts.first() else {
+            return Ok(());
+        };
         let mut problem = first.clone();
         problem.revision.get_or_insert(revision);
         if self.form == Form::Many {

@@ -145,11 +145,18 @@ impl Log {
             if revision > inner.state.revision() {
                 return None;
             }
-            let first = inner.commits.front().map_or(inner.state.revision() + 1, |applied| applied.commit.revision);
+            let first = inner
+                .commits
+                .front()
+                .map_or(inner.state.revision() + 1, |applied| applied.commit.revision);
             if revision + 1 < first {
                 return None;
             }
-            let newer = inner.commits.iter().rev().take_while(|applied| applied.commit.revision > revision);
+            let newer = inner
+                .commits
+                .iter()
+                .rev()
+                .take_while(|applied| applied.commit.revision > revision);
             (inner.state.clone(), newer.cloned().collect::<Vec<_>>())
         };
         for applied in commits {
@@ -181,7 +188,10 @@ fn change_bytes(change: &crate::store::Change) -> usize {
             Value::String(text) => 24 + text.len(),
             Value::Array(list) => 32 + list.iter().map(value_bytes).sum::<usize>(),
             Value::Object(members) => {
-                64 + members.iter().map(|(name, value)| 48 + name.len() + value_bytes(value)).sum::<usize>()
+                64 + members
+                    .iter()
+                    .map(|(name, value)| 48 + name.len() + value_bytes(value))
+                    .sum::<usize>()
             }
         }
     }

@@ -18,9 +18,9 @@ mod refs;
 mod report;
 mod schema;
 mod secrets;
+pub mod service;
 #[cfg(test)]
 mod service_tests;
-pub mod service;
 mod state;
 pub mod testing;
 pub mod types;

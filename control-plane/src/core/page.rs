@@ -45,7 +45,12 @@ impl Pages {
 
     /// The position of a token.
     pub(crate) fn position(&self, query: &str, token: &str) -> Result<Position, Problem> {
-        let refuse = || Problem::new(Code::InvalidPageToken, "the page token is not one of this query: list again from the start");
+        let refuse = || {
+            Problem::new(
+                Code::InvalidPageToken,
+                "the page token is not one of this query: list again from the start",
+            )
+        };
         if token.len() > MAX_TOKEN {
             return Err(refuse());
         }
@@ -56,7 +61,10 @@ impl Pages {
             return Err(refuse());
         }
         let value: Value = serde_json::from_str(body).map_err(|_| refuse())?;
-        match (value.get(0).and_then(Value::as_u64), value.get(1).and_then(Value::as_str)) {
+        match (
+            value.get(0).and_then(Value::as_u64),
+            value.get(1).and_then(Value::as_str),
+        ) {
             (Some(revision), Some(after)) => Ok(Position {
                 revision,
                 after: after.to_owned(),

@@ -105,7 +105,10 @@ fn instance(state: &State, document: &Document) -> Placement {
         (None, None) => Visible::Everywhere,
         (None, Some(_)) => Visible::In(Vec::new()),
     };
-    let service = document.key.service_name().and_then(|service| state.get(&Key::service(service)));
+    let service = document
+        .key
+        .service_name()
+        .and_then(|service| state.get(&Key::service(service)));
     let seen = service.map_or(Visible::In(Vec::new()), |held| service_layers(&held.document));
     Placement {
         visible: placed.intersect(seen),

@@ -57,8 +57,8 @@ pub(crate) fn referrers(state: &State, key: &Key, limit: usize) -> Vec<Key> {
         Kind::Instance | Kind::Rollout => {}
     }
     let rollouts = state.of_kind(Kind::Rollout, None);
-    let aimed = rollouts
-        .filter(|(_, held)| is_active(&held.document) && rollout_target(&held.document).as_ref() == Some(key));
+    let aimed =
+        rollouts.filter(|(_, held)| is_active(&held.document) && rollout_target(&held.document).as_ref() == Some(key));
     out.extend(aimed.take(limit).map(|(key, _)| key.clone()));
     out.sort();
     out.truncate(limit);

@@ -60,7 +60,13 @@ impl Done {
             ApplyResult {
                 key: key.clone(),
                 action: *action,
-                revision: if dry_run { is.as_ref().or(was.as_ref()).map_or(0, |d| d.revision.min(self.before.revision())) } else { revision },
+                revision: if dry_run {
+                    is.as_ref()
+                        .or(was.as_ref())
+                        .map_or(0, |d| d.revision.min(self.before.revision()))
+                } else {
+                    revision
+                },
                 changes: match action {
                     ApplyAction::Unchanged => Vec::new(),
                     _ => document_diff(was.as_deref(), is.as_deref()),
@@ -68,7 +74,12 @@ impl Done {
             }
         });
         let results = results.collect();
-        let keys: Vec<Key> = self.evaluated.changes.iter().map(|change| change.document.key.clone()).collect();
+        let keys: Vec<Key> = self
+            .evaluated
+            .changes
+            .iter()
+            .map(|change| change.document.key.clone())
+            .collect();
         let affected = affected::changed(&self.before, &self.after, &keys);
         ApplyReport {
             dry_run,
@@ -166,8 +177,18 @@ fn report_text(report: &ApplyReport) -> String {
 /// An answer of `apply` that was kept.
 pub(crate) fn report_from(text: &str) -> Option<ApplyReport> {
     let value: Value = serde_json::from_str(text).ok()?;
-    let results = value.get("results")?.as_array()?.iter().map(result_from).collect::<Option<_>>()?;
-    let affected = value.get("affected")?.as_array()?.iter().map(place_from).collect::<Option<_>>()?;
+    let results = value
+        .get("results")?
+        .as_array()?
+        .iter()
+        .map(result_from)
+        .collect::<Option<_>>()?;
+    let affected = value
+        .get("affected")?
+        .as_array()?
+        .iter()
+        .map(place_from)
+        .collect::<Option<_>>()?;
     Some(ApplyReport {
         dry_run: false,
         revision: value.get("revision")?.as_u64()?,
@@ -190,7 +211,10 @@ fn result_from(value: &Value) -> Option<ApplyResult> {
         key: value.get("key")?.as_str()?.parse().ok()?,
         action: actions.into_iter().find(|known| known.as_str() == action)?,
         revision: value.get("revision")?.as_u64()?,
-        changes: changes.iter().map(blaze_domain::config::diff::Delta::from_json).collect::<Option<_>>()?,
+        changes: changes
+            .iter()
+            .map(blaze_domain::config::diff::Delta::from_json)
+            .collect::<Option<_>>()?,
     })
 }
 

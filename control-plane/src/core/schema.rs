@@ -3,9 +3,9 @@
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
+use blaze_domain::ServiceName;
 use blaze_domain::config::spec::NODE_FILE_SECTIONS;
 use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_EFFECTIVE_BYTES};
-use blaze_domain::ServiceName;
 use jsonschema::{Draft, PatternOptions, Validator};
 use lru::LruCache;
 use parking_lot::Mutex;
@@ -56,10 +56,14 @@ impl Schemas {
             return Ok(Arc::clone(found));
         }
         if let Some(reference) = foreign_reference(schema) {
-            return Err(format!("$ref {reference:?} leads out of the schema; only #… is followed"));
+            return Err(format!(
+                "$ref {reference:?} leads out of the schema; only #… is followed"
+            ));
         }
         let build = |schema: &Value| {
-            let patterns = PatternOptions::regex().size_limit(PATTERN_BYTES).dfa_size_limit(PATTERN_BYTES);
+            let patterns = PatternOptions::regex()
+                .size_limit(PATTERN_BYTES)
+                .dfa_size_limit(PATTERN_BYTES);
             jsonschema::options()
                 .with_draft(Draft::Draft202012)
                 .offline()
@@ -67,12 +71,11 @@ impl Schemas {
                 .build(schema)
                 .map_err(|error| error.to_string().chars().take(500).collect::<String>())
         };
-        jsonschema::draft202012::meta::validate(schema)
-            .map_err(|error| {
-                // A schema holds no secret, so its words may be told.
-                let text: String = error.to_string().chars().take(500).collect();
-                format!("at {:?}: {text}", error.instance_path().as_str())
-            })?;
+        jsonschema::draft202012::meta::validate(schema).map_err(|error| {
+            // A schema holds no secret, so its words may be told.
+            let text: String = error.to_string().chars().take(500).collect();
+            format!("at {:?}: {text}", error.instance_path().as_str())
+        })?;
         let compiled = Arc::new(Compiled {
             full: build(schema)?,
             partial: build(&without_required(schema))?,
@@ -116,8 +119,17 @@ impl Schemas {
         faults
     }
 
-    fn check_one(&self, service: &Document, sources: &Sources, at: &At, keyring: &Keyring, faults: &mut Vec<FieldFault>) {
-        let Some(schema) = service.spec_member("schema") else { return };
+    fn check_one(
+        &self,
+        service: &Document,
+        sources: &Sources,
+        at: &At,
+        keyring: &Keyring,
+        faults: &mut Vec<FieldFault>,
+    ) {
+        let Some(schema) = service.spec_member("schema") else {
+            return;
+        };
         let Ok(compiled) = self.compiled(schema) else {
             // It was sound when it was written; a newer program may see it otherwise, and must not block every write.
             tracing::warn!(service = %service.key, "the stored schema cannot be compiled; it is not checked");
@@ -127,8 +139,15 @@ impl Schemas {
         if let Value::Object(members) = &mut config {
             members.retain(|name, _| !NODE_FILE_SECTIONS.contains(&name.as_str()));
         }
-        let validator = if at.instance.is_some() { &compiled.full } else { &compiled.partial };
-        for error in validator.iter_errors(&config).take(MAX_FAULTS - faults.len().min(MAX_FAULTS)) {
+        let validator = if at.instance.is_some() {
+            &compiled.full
+        } else {
+            &compiled.partial
+        };
+        for error in validator
+            .iter_errors(&config)
+            .take(MAX_FAULTS - faults.len().min(MAX_FAULTS))
+        {
             let found: String = error.masked().to_string().chars().take(300).collect();
             faults.push(FieldFault {
                 pointer: format!("/spec/config{}", error.instance_path().as_str()),
@@ -142,7 +161,10 @@ impl Schemas {
 
 fn schema_of(state: &State, service: &ServiceName) -> Option<Arc<Document>> {
     let held = state.get(&Key::service(service))?;
-    held.document.spec_member("schema").is_some().then(|| Arc::clone(&held.document))
+    held.document
+        .spec_member("schema")
+        .is_some()
+        .then(|| Arc::clone(&held.document))
 }
 
 fn size_fault(sources: &Sources, at: &At) -> Option<FieldFault> {
@@ -188,7 +210,13 @@ const ONE: &[&str] = &[
 /// Keywords whose value is a list of schemas.
 const LIST: &[&str] = &["allOf", "anyOf", "oneOf", "prefixItems"];
 /// Keywords whose value is an object of schemas under free names.
-const NAMED: &[&str] = &["$defs", "definitions", "dependentSchemas", "patternProperties", "properties"];
+const NAMED: &[&str] = &[
+    "$defs",
+    "definitions",
+    "dependentSchemas",
+    "patternProperties",
+    "properties",
+];
 
 /// The same schema with the keyword `required` taken out wherever it is a keyword (a property may be called so).
 pub(crate) fn without_required(schema: &Value) -> Value {
@@ -252,10 +280,16 @@ mod tests {
         assert!(schemas.check(&json!({ "type": "object" })).is_ok());
         assert!(schemas.check(&json!(true)).is_ok());
         for (bad, why) in [
-            (json!({ "properties": { "a": { "type": "objekt" } } }), "/properties/a/type"),
+            (
+                json!({ "properties": { "a": { "type": "objekt" } } }),
+                "/properties/a/type",
+            ),
             (json!({ "pattern": "(" }), ""),
             (json!({ "pattern": "(a)\\1" }), ""),
-            (json!({ "properties": { "a": { "$ref": "http://example.org/s" } } }), "leads out of the schema"),
+            (
+                json!({ "properties": { "a": { "$ref": "http://example.org/s" } } }),
+                "leads out of the schema",
+            ),
             (json!({ "$ref": "#/$defs/missing" }), ""),
         ] {
             let error = schemas.check(&bad).unwrap_err();

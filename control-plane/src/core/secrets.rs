@@ -56,10 +56,12 @@ impl Vault<'_> {
                 return self.keep(kept).map(Some);
             }
             Some(Ok(Secret::Text(text) | Secret::Revealed { text, .. })) => Zeroizing::new(text.to_owned()),
-            Some(Ok(Secret::Stored { .. })) => self
-                .keyring
-                .open(self.key, self.from_uid, value)
-                .map_err(|error| (Code::SecretUnknown, format!("the stored secret cannot be read: {error}")))?,
+            Some(Ok(Secret::Stored { .. })) => self.keyring.open(self.key, self.from_uid, value).map_err(|error| {
+                (
+                    Code::SecretUnknown,
+                    format!("the stored secret cannot be read: {error}"),
+                )
+            })?,
             Some(Err(reason)) => return Err((Code::ValidationFailed, reason)),
             None => return Ok(None),
         };
@@ -70,7 +72,9 @@ impl Vault<'_> {
             return self.keep(stored).map(Some);
         }
         let sealed = self.keyring.seal(self.key, self.uid, &text, self.revision);
-        sealed.map(Some).map_err(|error| (Code::ValidationFailed, error.to_string()))
+        sealed
+            .map(Some)
+            .map_err(|error| (Code::ValidationFailed, error.to_string()))
     }
 
     /// A secret that is there already, under the uid that the document has from now on.
@@ -97,9 +101,12 @@ pub(crate) fn as_text(keyring: &Keyring, document: &Document, value: &Value) -> 
 
 /// A value with its secrets as `{"$secret":{"text","version"}}`.
 pub(crate) fn revealed(keyring: &Keyring, document: &Document, value: &Value) -> Value {
-    replaced(keyring, document, value, |text, version| {
-        serde_json::json!({ "$secret": { "text": text, "version": version } })
-    })
+    replaced(
+        keyring,
+        document,
+        value,
+        |text, version| serde_json::json!({ "$secret": { "text": text, "version": version } }),
+    )
 }
 
 fn replaced(keyring: &Keyring, document: &Document, value: &Value, form: impl Fn(&str, u64) -> Value) -> Value {

@@ -57,7 +57,6 @@ fn input(name: &str, spec: Value) -> DocumentInput {
     }
 }
 
-
 impl World {
     async fn put(&self, name: &str, spec: Value) -> Arc<Document> {
         self.try_put(name, spec, Precondition::Any).await.unwrap().document
@@ -65,8 +64,15 @@ impl World {
 
     async fn try_put(&self, name: &str, spec: Value, precondition: Precondition) -> Result<Written, Problem> {
         let exists = self.get(name).await.is_ok();
-        let precondition = if exists || precondition != Precondition::Any { precondition } else { Precondition::None };
-        let answer = self.service.replace(&self.admin, input(name, spec), precondition).await?;
+        let precondition = if exists || precondition != Precondition::Any {
+            precondition
+        } else {
+            Precondition::None
+        };
+        let answer = self
+            .service
+            .replace(&self.admin, input(name, spec), precondition)
+            .await?;
         Ok(answer.value)
     }
 
@@ -76,7 +82,10 @@ impl World {
     }
 
     async fn patch(&self, name: &str, patch: Value) -> Result<Arc<Document>, Problem> {
-        let answer = self.service.patch(&self.admin, &key(name), patch, Precondition::Any).await?;
+        let answer = self
+            .service
+            .patch(&self.admin, &key(name), patch, Precondition::Any)
+            .await?;
         Ok(answer.value.document)
     }
 
@@ -95,17 +104,30 @@ impl World {
 
     async fn effective(&self, place: Place) -> Effective {
         let read = ReadOptions::default();
-        self.service.effective(&self.admin, &place, true, &read).await.unwrap().value
+        self.service
+            .effective(&self.admin, &place, true, &read)
+            .await
+            .unwrap()
+            .value
     }
 
     /// A robot in an edge layer with a service that has one instance.
     async fn robot(&self) {
         let report = self
             .apply(vec![
-                ("Layer/edge", json!({ "kind": "edge", "config": { "a": 1, "b": 1 }, "overrides": { "slam": { "c": 3 } } })),
+                (
+                    "Layer/edge",
+                    json!({ "kind": "edge", "config": { "a": 1, "b": 1 }, "overrides": { "slam": { "c": 3 } } }),
+                ),
                 ("Node/robot-1", json!({ "layer": "edge", "config": { "b": 2 } })),
-                ("Service/slam", json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } })),
-                ("Instance/slam/0", json!({ "node": "robot-1", "config": { "camera": { "rate_hz": 10 } } })),
+                (
+                    "Service/slam",
+                    json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } }),
+                ),
+                (
+                    "Instance/slam/0",
+                    json!({ "node": "robot-1", "config": { "camera": { "rate_hz": 10 } } }),
+                ),
             ])
             .await
             .unwrap();
@@ -134,10 +156,16 @@ async fn a_document_is_made_read_changed_and_deleted() {
     // The same again changes nothing, also where `{}` is written out.
     let same = w.put("Layer/edge", json!({ "kind": "edge", "config": {} })).await;
     assert_eq!(same.revision, 1);
-    let patched = w.patch("Layer/edge", json!({ "labels": { "site": "lab" } })).await.unwrap();
+    let patched = w
+        .patch("Layer/edge", json!({ "labels": { "site": "lab" } }))
+        .await
+        .unwrap();
     assert_eq!((patched.revision, patched.uid == made.uid), (2, true));
     assert_eq!(w.service.revision(), 2);
-    w.service.delete(&w.admin, &key("Layer/edge"), Precondition::Any, false).await.unwrap();
+    w.service
+        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, false)
+        .await
+        .unwrap();
     assert_eq!(code(w.get("Layer/edge").await), Code::NotFound);
     let again = w.put("Layer/edge", json!({ "kind": "edge" })).await;
     assert_ne!(again.uid, made.uid);
@@ -148,15 +176,40 @@ async fn preconditions_are_insisted_on() {
     let w = world().await;
     let spec = || json!({ "kind": "edge" });
     let other = || json!({ "kind": "fog" });
-    assert_eq!(code(w.try_put("Layer/edge", spec(), Precondition::Revisions(vec![1])).await), Code::PreconditionFailed);
-    assert_eq!(code(w.service.patch(&w.admin, &key("Layer/edge"), json!({}), Precondition::None).await), Code::NotFound);
+    assert_eq!(
+        code(w.try_put("Layer/edge", spec(), Precondition::Revisions(vec![1])).await),
+        Code::PreconditionFailed
+    );
+    assert_eq!(
+        code(
+            w.service
+                .patch(&w.admin, &key("Layer/edge"), json!({}), Precondition::None)
+                .await
+        ),
+        Code::NotFound
+    );
     w.put("Layer/edge", spec()).await;
-    assert_eq!(code(w.try_put("Layer/edge", other(), Precondition::None).await), Code::PreconditionRequired);
-    assert_eq!(code(w.try_put("Layer/edge", other(), Precondition::Absent).await), Code::PreconditionFailed);
-    let stale = w.try_put("Layer/edge", other(), Precondition::Revisions(vec![7])).await.unwrap_err();
+    assert_eq!(
+        code(w.try_put("Layer/edge", other(), Precondition::None).await),
+        Code::PreconditionRequired
+    );
+    assert_eq!(
+        code(w.try_put("Layer/edge", other(), Precondition::Absent).await),
+        Code::PreconditionFailed
+    );
+    let stale = w
+        .try_put("Layer/edge", other(), Precondition::Revisions(vec![7]))
+        .await
+        .unwrap_err();
     assert_eq!((stale.code, stale.revision), (Code::PreconditionFailed, Some(1)));
-    assert_eq!(code(w.service.create(&w.admin, input("Layer/edge", spec()), None).await), Code::AlreadyExists);
-    let written = w.try_put("Layer/edge", other(), Precondition::Revisions(vec![7, 1])).await.unwrap();
+    assert_eq!(
+        code(w.service.create(&w.admin, input("Layer/edge", spec()), None).await),
+        Code::AlreadyExists
+    );
+    let written = w
+        .try_put("Layer/edge", other(), Precondition::Revisions(vec![7, 1]))
+        .await
+        .unwrap();
     assert_eq!((written.created, written.document.revision), (false, 2));
 }
 
@@ -165,15 +218,25 @@ async fn the_effective_configuration_is_merged_in_order_and_explained() {
     let w = world().await;
     w.robot().await;
     let effective = w.effective(slam()).await;
-    assert_eq!(effective.config, json!({ "a": 1, "b": 2, "c": 3, "camera": { "rate_hz": 10 } }));
-    assert_eq!(effective.place.node.as_ref().map(ToString::to_string).as_deref(), Some("robot-1"));
+    assert_eq!(
+        effective.config,
+        json!({ "a": 1, "b": 2, "c": 3, "camera": { "rate_hz": 10 } })
+    );
+    assert_eq!(
+        effective.place.node.as_ref().map(ToString::to_string).as_deref(),
+        Some("robot-1")
+    );
     let explain = effective.explain.unwrap();
     assert_eq!(explain["/camera/rate_hz"]["kind"], "Instance");
     assert_eq!(explain["/camera/rate_hz"]["overridden"][0]["value"], 30);
     assert_eq!(explain["/c"]["override"], true);
     let mut unknown = slam();
     unknown.service = Some("slamm".parse().unwrap());
-    let refused = w.service.effective(&w.admin, &unknown, false, &ReadOptions::default()).await.unwrap_err();
+    let refused = w
+        .service
+        .effective(&w.admin, &unknown, false, &ReadOptions::default())
+        .await
+        .unwrap_err();
     assert_eq!(refused.code, Code::NotFound);
     assert!(refused.detail.contains("did you mean slam?"), "{refused}");
 }
@@ -181,13 +244,22 @@ async fn the_effective_configuration_is_merged_in_order_and_explained() {
 #[tokio::test]
 async fn references_must_exist_and_hold() {
     let w = world().await;
-    let missing = w.try_put("Node/robot-1", json!({ "layer": "edge" }), Precondition::None).await.unwrap_err();
+    let missing = w
+        .try_put("Node/robot-1", json!({ "layer": "edge" }), Precondition::None)
+        .await
+        .unwrap_err();
     assert_eq!(missing.code, Code::ReferenceNotFound);
     assert_eq!(missing.errors[0].pointer, "/spec/layer");
     w.robot().await;
-    let used = w.service.delete(&w.admin, &key("Layer/edge"), Precondition::Any, false).await;
+    let used = w
+        .service
+        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, false)
+        .await;
     assert_eq!(code(used), Code::InUse);
-    w.service.delete(&w.admin, &key("Layer/edge"), Precondition::Any, true).await.unwrap();
+    w.service
+        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, true)
+        .await
+        .unwrap();
     for gone in ["Layer/edge", "Node/robot-1", "Instance/slam/0"] {
         assert_eq!(code(w.get(gone).await), Code::NotFound, "{gone}");
     }
@@ -203,19 +275,39 @@ async fn a_schema_guards_every_write_that_could_break_it() {
         "type": "object", "required": ["camera"],
         "properties": { "camera": { "type": "object", "properties": { "rate_hz": { "type": "integer", "maximum": 30 } } } },
     });
-    w.patch("Service/slam", json!({ "spec": { "schema": schema } })).await.unwrap();
+    w.patch("Service/slam", json!({ "spec": { "schema": schema } }))
+        .await
+        .unwrap();
     for (name, patch) in [
-        ("Instance/slam/0", json!({ "spec": { "config": { "camera": { "rate_hz": 31 } } } })),
-        ("Node/robot-1", json!({ "spec": { "overrides": { "slam": { "camera": { "rate_hz": "fast" } } } } })),
-        ("Layer/edge", json!({ "spec": { "overrides": { "slam": { "camera": 5 } } } })),
-        ("Service/slam", json!({ "spec": { "config": { "camera": { "rate_hz": 99 } } } })),
+        (
+            "Instance/slam/0",
+            json!({ "spec": { "config": { "camera": { "rate_hz": 31 } } } }),
+        ),
+        (
+            "Node/robot-1",
+            json!({ "spec": { "overrides": { "slam": { "camera": { "rate_hz": "fast" } } } } }),
+        ),
+        (
+            "Layer/edge",
+            json!({ "spec": { "overrides": { "slam": { "camera": 5 } } } }),
+        ),
+        (
+            "Service/slam",
+            json!({ "spec": { "config": { "camera": { "rate_hz": 99 } } } }),
+        ),
     ] {
         let refused = w.patch(name, patch).await.unwrap_err();
         assert_eq!(refused.code, Code::SchemaMismatch, "{name}");
         assert!(!refused.detail.contains("99"), "values are not told: {refused}");
     }
-    let bad = w.patch("Service/slam", json!({ "spec": { "schema": { "type": "objekt" } } })).await.unwrap_err();
-    assert_eq!((bad.code, bad.errors[0].pointer.as_str()), (Code::ValidationFailed, "/spec/schema"));
+    let bad = w
+        .patch("Service/slam", json!({ "spec": { "schema": { "type": "objekt" } } }))
+        .await
+        .unwrap_err();
+    assert_eq!(
+        (bad.code, bad.errors[0].pointer.as_str()),
+        (Code::ValidationFailed, "/spec/schema")
+    );
 }
 
 #[tokio::test]
@@ -229,23 +321,40 @@ async fn apply_is_all_or_nothing() {
         ])
         .await
         .unwrap_err();
-    assert_eq!((refused.code, refused.errors[0].document), (Code::ReferenceNotFound, Some(1)));
+    assert_eq!(
+        (refused.code, refused.errors[0].document),
+        (Code::ReferenceNotFound, Some(1))
+    );
     assert!(refused.detail.contains("did you mean Layer/fog?"), "{refused}");
     assert_eq!(code(w.get("Layer/fog").await), Code::NotFound);
-    let twice = w.apply(vec![("Layer/x", json!({ "kind": "fog" })), ("Layer/x", json!({ "kind": "fog" }))]).await;
+    let twice = w
+        .apply(vec![
+            ("Layer/x", json!({ "kind": "fog" })),
+            ("Layer/x", json!({ "kind": "fog" })),
+        ])
+        .await;
     assert_eq!(code(twice), Code::ValidationFailed);
     let report = w
         .apply(vec![
             ("Node/robot-1", json!({ "layer": "edge", "config": { "b": 5 } })),
             ("Layer/fog", json!({ "kind": "fog" })),
-            ("Service/slam", json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } })),
+            (
+                "Service/slam",
+                json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } }),
+            ),
         ])
         .await
         .unwrap();
     let actions: Vec<&str> = report.results.iter().map(|result| result.action.as_str()).collect();
     assert_eq!(actions, ["updated", "created", "unchanged"]);
     assert_eq!(report.results[0].changes[0].path, "/spec/config/b");
-    assert!(report.affected.iter().any(|place| place.instance.is_some() && place.node.is_some()), "{report:?}");
+    assert!(
+        report
+            .affected
+            .iter()
+            .any(|place| place.instance.is_some() && place.node.is_some()),
+        "{report:?}"
+    );
     assert_eq!(report.revision, 2);
 }
 
@@ -280,28 +389,61 @@ async fn secrets_are_kept_encrypted_and_shown_redacted() {
     // What was read may be written back: the text stays.
     let same = w.put("Service/slam", spec(redacted.clone())).await;
     assert_eq!(same.revision, 1);
-    let changed = w.patch("Service/slam", json!({ "spec": { "description": "x" } })).await.unwrap();
+    let changed = w
+        .patch("Service/slam", json!({ "spec": { "description": "x" } }))
+        .await
+        .unwrap();
     assert_eq!(changed.spec.pointer("/config/db/password"), Some(&redacted));
     let reveal = ReadOptions {
         reveal: true,
         ..ReadOptions::default()
     };
-    let clear = w.service.get(&w.admin, &key("Service/slam"), &reveal).await.unwrap().value;
+    let clear = w
+        .service
+        .get(&w.admin, &key("Service/slam"), &reveal)
+        .await
+        .unwrap()
+        .value;
     let shown = json!({ "$secret": { "text": canary, "version": 1 } });
     assert_eq!(clear.spec.pointer("/config/db/password"), Some(&shown));
     let unknown = w.try_put("Service/other", spec(redacted), Precondition::None).await;
     assert_eq!(code(unknown), Code::SecretUnknown);
     let operator = caller(&["operator"], None);
-    assert_eq!(code(w.service.get(&operator, &key("Service/slam"), &reveal).await), Code::PermissionDenied);
+    assert_eq!(
+        code(w.service.get(&operator, &key("Service/slam"), &reveal).await),
+        Code::PermissionDenied
+    );
     // A new text has a new version, and a rollback brings the old one back.
     let newer = w.put("Service/slam", spec(json!({ "$secret": "other" }))).await;
-    assert_eq!(newer.spec.pointer("/config/db/password/$secret/version"), Some(&json!(3)));
-    w.service.rollback(&w.admin, &key("Service/slam"), 1, Precondition::None, None).await.unwrap();
-    let clear = w.service.get(&w.admin, &key("Service/slam"), &reveal).await.unwrap().value;
-    assert_eq!(clear.spec.pointer("/config/db/password/$secret/text"), Some(&json!(canary)));
-    let history = w.service.history(&w.admin, &key("Service/slam"), None, "", true, &ReadOptions::default()).await.unwrap();
+    assert_eq!(
+        newer.spec.pointer("/config/db/password/$secret/version"),
+        Some(&json!(3))
+    );
+    w.service
+        .rollback(&w.admin, &key("Service/slam"), 1, Precondition::None, None)
+        .await
+        .unwrap();
+    let clear = w
+        .service
+        .get(&w.admin, &key("Service/slam"), &reveal)
+        .await
+        .unwrap()
+        .value;
+    assert_eq!(
+        clear.spec.pointer("/config/db/password/$secret/text"),
+        Some(&json!(canary))
+    );
+    let history = w
+        .service
+        .history(&w.admin, &key("Service/slam"), None, "", true, &ReadOptions::default())
+        .await
+        .unwrap();
     assert!(!format!("{history:?}").contains(canary));
-    let audit = w.service.audit(&w.admin, AuditQuery::default(), "", &ReadOptions::default()).await.unwrap();
+    let audit = w
+        .service
+        .audit(&w.admin, AuditQuery::default(), "", &ReadOptions::default())
+        .await
+        .unwrap();
     assert!(!format!("{audit:?}").contains(canary));
     assert!(audit.value.items.iter().any(|entry| entry.action == "reveal"));
 }
@@ -321,7 +463,10 @@ async fn a_commit_is_reverted_unless_its_documents_changed_since() {
     assert_eq!(report.revision, 3);
     assert_eq!(w.get("Node/robot-1").await.unwrap().spec, before.spec);
     assert_eq!(code(w.get("Layer/fog").await), Code::NotFound);
-    assert_eq!(code(w.service.revert(&w.admin, 2, false, None).await), Code::RevisionConflict);
+    assert_eq!(
+        code(w.service.revert(&w.admin, 2, false, None).await),
+        Code::RevisionConflict
+    );
     assert_eq!(code(w.service.revert(&w.admin, 99, false, None).await), Code::NotFound);
 }
 
@@ -340,7 +485,10 @@ async fn the_same_request_twice_is_done_once() {
     let again = w.service.create(&w.admin, layer(), once(1)).await.unwrap();
     assert_eq!((again.replayed, again.revision), (true, first.revision));
     assert_eq!(again.value, first.value);
-    assert_eq!(code(w.service.create(&w.admin, layer(), once(2)).await), Code::IdempotencyKeyReused);
+    assert_eq!(
+        code(w.service.create(&w.admin, layer(), once(2)).await),
+        Code::IdempotencyKeyReused
+    );
     assert_eq!(w.service.revision(), 1);
 }
 
@@ -365,17 +513,78 @@ async fn pages_show_one_revision() {
         }
         query.page_token = page.value.next_page_token;
         // What changes in between is not part of this list.
-        w.service.delete(&w.admin, &key(&format!("Layer/l{}", 5 - names.len() / 2)), Precondition::Any, false).await.unwrap_or(
-            Answer {
+        w.service
+            .delete(
+                &w.admin,
+                &key(&format!("Layer/l{}", 5 - names.len() / 2)),
+                Precondition::Any,
+                false,
+            )
+            .await
+            .unwrap_or(Answer {
                 revision: 0,
                 replayed: false,
                 value: (),
-            },
-        );
+            });
     }
     assert_eq!(names, ["l0", "l1", "l2", "l3", "l4"]);
     query.limit = Some(0);
-    assert_eq!(code(w.service.list(&w.admin, &query, &ReadOptions::default()).await), Code::InvalidRequest);
+    assert_eq!(
+        code(w.service.list(&w.admin, &query, &ReadOptions::default()).await),
+        Code::InvalidRequest
+    );
+}
+
+#[tokio::test]
+async fn a_page_of_large_documents_is_shorter() {
+    let w = world().await;
+    let text = "x".repeat(200 * 1024);
+    let (documents, versions) = (50, 45);
+    for number in 0..documents {
+        let spec = json!({ "config": { "text": text, "number": number } });
+        w.put(&format!("Service/s{number:02}"), spec).await;
+    }
+    let mut query = ListQuery {
+        limit: Some(1000),
+        ..ListQuery::default()
+    };
+    let mut pages = Vec::new();
+    loop {
+        let page = w
+            .service
+            .list(&w.admin, &query, &ReadOptions::default())
+            .await
+            .unwrap()
+            .value;
+        pages.push(page.items.len());
+        query.page_token = page.next_page_token;
+        if query.page_token.is_empty() {
+            break;
+        }
+    }
+    assert_eq!((pages.len(), pages.iter().sum::<usize>()), (2, documents), "{pages:?}");
+
+    for number in 1..versions {
+        w.put("Service/s00", json!({ "config": { "text": text, "number": number } }))
+            .await;
+    }
+    let of = async |full, limit, token: &str| {
+        let (key, read) = (key("Service/s00"), ReadOptions::default());
+        let history = w.service.history(&w.admin, &key, Some(limit), token, full, &read).await;
+        history.unwrap().value
+    };
+    assert_eq!(of(false, 1000, "").await.items.len(), versions);
+    let first = of(true, 1000, "").await;
+    let second = of(true, 1000, &first.next_page_token).await;
+    let seen: Vec<u64> = first
+        .items
+        .iter()
+        .chain(&second.items)
+        .map(|entry| entry.revision)
+        .collect();
+    assert_eq!((seen.len(), second.next_page_token.as_str()), (versions, ""));
+    assert!(seen.is_sorted_by(|a, b| a > b) && first.items.len() < versions);
+    assert_eq!(of(true, 3, "").await.items.len(), 3);
 }
 
 /// Revision and changes of the next commit; bookmarks are passed over.
@@ -384,7 +593,10 @@ async fn next(stream: &mut super::WatchStream) -> (u64, Vec<(&'static str, Strin
         loop {
             match stream.next().await {
                 Some(WatchItem::Commit(commit)) => {
-                    let changes = commit.changes.iter().map(|(op, document)| (op.as_str(), document.key.to_string()));
+                    let changes = commit
+                        .changes
+                        .iter()
+                        .map(|(op, document)| (op.as_str(), document.key.to_string()));
                     return (commit.revision, changes.collect());
                 }
                 Some(WatchItem::Bookmark(_)) => {}
@@ -392,7 +604,9 @@ async fn next(stream: &mut super::WatchStream) -> (u64, Vec<(&'static str, Strin
             }
         }
     };
-    tokio::time::timeout(Duration::from_secs(10), wait).await.expect("a commit within 10 s")
+    tokio::time::timeout(Duration::from_secs(10), wait)
+        .await
+        .expect("a commit within 10 s")
 }
 
 #[tokio::test]
@@ -408,7 +622,10 @@ async fn a_watch_tells_every_commit_from_a_revision_on() {
     let (revision, changes) = next(&mut stream).await;
     assert_eq!((revision, changes.len()), (1, 4));
     assert_eq!(next(&mut stream).await, (2, vec![("create", "Layer/fog".to_owned())]));
-    w.service.delete(&w.admin, &key("Layer/fog"), Precondition::Any, false).await.unwrap();
+    w.service
+        .delete(&w.admin, &key("Layer/fog"), Precondition::Any, false)
+        .await
+        .unwrap();
     assert_eq!(next(&mut stream).await, (3, vec![("delete", "Layer/fog".to_owned())]));
 }
 
@@ -424,7 +641,9 @@ async fn what_leaves_a_filter_is_told_also_when_it_moves_with_its_node() {
     };
     let mut edge = w.service.watch(&w.admin, &query("edge")).await.unwrap().value;
     let mut fog = w.service.watch(&w.admin, &query("fog")).await.unwrap().value;
-    w.patch("Node/robot-1", json!({ "spec": { "layer": "fog" } })).await.unwrap();
+    w.patch("Node/robot-1", json!({ "spec": { "layer": "fog" } }))
+        .await
+        .unwrap();
     let both = |op: &'static str| vec![(op, "Node/robot-1".to_owned()), (op, "Instance/slam/0".to_owned())];
     assert_eq!(next(&mut edge).await, (3, both("leave")));
     assert_eq!(next(&mut fog).await, (3, both("update")));
@@ -442,7 +661,10 @@ async fn a_watch_of_what_is_trimmed_is_refused_with_where_to_begin() {
         ..WatchQuery::default()
     };
     let refused = w.service.watch(&w.admin, &query(2)).await.err().unwrap();
-    assert_eq!((refused.code, refused.oldest_revision, refused.revision), (Code::RevisionTrimmed, Some(3), Some(6)));
+    assert_eq!(
+        (refused.code, refused.oldest_revision, refused.revision),
+        (Code::RevisionTrimmed, Some(3), Some(6))
+    );
     let mut stream = w.service.watch(&w.admin, &query(3)).await.unwrap().value;
     assert_eq!(next(&mut stream).await.0, 4);
 }
@@ -474,8 +696,14 @@ async fn a_bound_token_sees_and_changes_its_own_layer_alone() {
         let patch = json!({ "spec": spec });
         w.service.patch(&bound, &key(name), patch, Precondition::Any).await
     };
-    assert_eq!(code(patch("Service/slam", json!({ "description": "x" })).await), Code::PermissionDenied);
-    assert_eq!(code(patch("Node/robot-1", json!({ "layer": "fog" })).await), Code::PermissionDenied);
+    assert_eq!(
+        code(patch("Service/slam", json!({ "description": "x" })).await),
+        Code::PermissionDenied
+    );
+    assert_eq!(
+        code(patch("Node/robot-1", json!({ "layer": "fog" })).await),
+        Code::PermissionDenied
+    );
     assert!(patch("Node/robot-1", json!({ "type": "mobile" })).await.is_ok());
     // Who may make tokens could make one that is bound to nothing.
     let admin = caller(&["admin"], Some("edge"));
@@ -485,13 +713,27 @@ async fn a_bound_token_sees_and_changes_its_own_layer_alone() {
         layer: None,
         expires_in_s: 60,
     };
-    assert_eq!(code(w.service.create_token(&admin, token).await), Code::PermissionDenied);
+    assert_eq!(
+        code(w.service.create_token(&admin, token).await),
+        Code::PermissionDenied
+    );
     assert_eq!(code(w.service.revoke_token(&admin, "x").await), Code::PermissionDenied);
     assert_eq!(code(w.service.tokens(&admin, &read).await), Code::PermissionDenied);
-    assert_eq!(code(w.service.audit(&admin, AuditQuery::default(), "", &read).await), Code::PermissionDenied);
+    assert_eq!(
+        code(w.service.audit(&admin, AuditQuery::default(), "", &read).await),
+        Code::PermissionDenied
+    );
     assert_eq!(code(w.service.trim(&admin, 1, None).await), Code::PermissionDenied);
-    assert!(w.service.authorize(&caller(&["viewer"], None).claims, Right::Write).is_err());
-    assert!(w.service.authorize(&caller(&["admin", "wizard"], None).claims, Right::Read).is_err());
+    assert!(
+        w.service
+            .authorize(&caller(&["viewer"], None).claims, Right::Write)
+            .is_err()
+    );
+    assert!(
+        w.service
+            .authorize(&caller(&["admin", "wizard"], None).claims, Right::Read)
+            .is_err()
+    );
 }
 
 #[tokio::test]
@@ -506,7 +748,12 @@ async fn a_roll_out_counts_on_its_canaries_until_it_is_promoted() {
         "patch": { "config": { "camera": { "rate_hz": 5 } } },
         "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
     });
-    let started = w.service.create(&w.admin, input("Rollout/slower", spec.clone()), None).await.unwrap().value;
+    let started = w
+        .service
+        .create(&w.admin, input("Rollout/slower", spec.clone()), None)
+        .await
+        .unwrap()
+        .value;
     assert_eq!(started.document.status.as_ref().unwrap()["phase"], "canary");
     let on = |node: &str| Place {
         service: Some("slam".parse().unwrap()),
@@ -516,11 +763,17 @@ async fn a_roll_out_counts_on_its_canaries_until_it_is_promoted() {
     assert_eq!(w.effective(on("robot-2")).await.config["camera"]["rate_hz"], 5);
     assert_eq!(w.effective(on("robot-2")).await.rollout.as_deref(), Some("slower"));
     assert_eq!(w.effective(on("robot-1")).await.config["camera"]["rate_hz"], 30);
-    assert_eq!(code(w.service.create(&w.admin, input("Rollout/other", spec), None).await), Code::RolloutActive);
+    assert_eq!(
+        code(w.service.create(&w.admin, input("Rollout/other", spec), None).await),
+        Code::RolloutActive
+    );
     let name = "slower".parse().unwrap();
     w.service.promote_rollout(&w.admin, &name, None).await.unwrap();
     assert_eq!(w.effective(on("robot-1")).await.config["camera"]["rate_hz"], 5);
-    assert_eq!(code(w.service.abort_rollout(&w.admin, &name, "late", None).await), Code::RolloutState);
+    assert_eq!(
+        code(w.service.abort_rollout(&w.admin, &name, "late", None).await),
+        Code::RolloutState
+    );
 }
 
 #[tokio::test]
@@ -533,7 +786,10 @@ async fn many_writers_with_preconditions_lose_nothing() {
             let now = w.get("Service/counter").await.unwrap();
             let n = now.spec["config"]["n"].as_u64().unwrap();
             let next = json!({ "config": { "n": n + 1 } });
-            match w.try_put("Service/counter", next, Precondition::Revisions(vec![now.revision])).await {
+            match w
+                .try_put("Service/counter", next, Precondition::Revisions(vec![now.revision]))
+                .await
+            {
                 Ok(_) => done += 1,
                 Err(problem) => assert_eq!(problem.code, Code::PreconditionFailed),
             }

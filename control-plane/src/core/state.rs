@@ -49,7 +49,10 @@ pub(crate) fn redacted(document: &Arc<Document>) -> Arc<Document> {
     }
     let mut shown = (**document).clone();
     shown.spec = Arc::new(secret::redact(&document.spec).into_owned());
-    shown.status = document.status.as_ref().map(|status| secret::redact(status).into_owned());
+    shown.status = document
+        .status
+        .as_ref()
+        .map(|status| secret::redact(status).into_owned());
     Arc::new(shown)
 }
 
@@ -127,7 +130,10 @@ impl State {
     }
 
     /// Instances of a service.
-    pub(crate) fn instances<'a>(&'a self, service: &ServiceName) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
+    pub(crate) fn instances<'a>(
+        &'a self,
+        service: &ServiceName,
+    ) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
         let service = service.clone();
         let start = Key::instance(service.clone(), first_name());
         self.documents
@@ -235,7 +241,8 @@ impl State {
     /// The documents that a commit is about to change, as they are now.
     pub(crate) fn originals(&self, commit: &Commit) -> Vec<(Key, Option<Arc<Document>>)> {
         let keys = commit.changes.iter().map(|change| &change.document.key);
-        keys.map(|key| (key.clone(), self.get(key).map(|held| Arc::clone(&held.document)))).collect()
+        keys.map(|key| (key.clone(), self.get(key).map(|held| Arc::clone(&held.document))))
+            .collect()
     }
 
     /// Goes back to what documents were before a commit.
@@ -320,11 +327,20 @@ fn moved_with(before: &State, after: &State, commit: &Commit) -> Vec<Key> {
         }
         match key.kind() {
             Kind::Node => out.extend(after.on_node(&NodeName::from(key.name())).cloned()),
-            Kind::Service => out.extend(after.instances(&ServiceName::from(key.name())).map(|(key, _)| key.clone())),
+            Kind::Service => out.extend(
+                after
+                    .instances(&ServiceName::from(key.name()))
+                    .map(|(key, _)| key.clone()),
+            ),
             Kind::Layer | Kind::Instance | Kind::Rollout => {}
         }
     }
-    if !out.is_empty() || commit.changes.iter().any(|change| change.document.key.kind() != Kind::Rollout) {
+    if !out.is_empty()
+        || commit
+            .changes
+            .iter()
+            .any(|change| change.document.key.kind() != Kind::Rollout)
+    {
         let touched = |target: &Key| changed(target) || out.contains(target);
         let rollouts: Vec<Key> = after
             .of_kind(Kind::Rollout, None)

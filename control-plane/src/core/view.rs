@@ -1,7 +1,7 @@
 //! What a token sees and may change: the one place that decides it, for reads and writes of every interface.
 
-use blaze_domain::config::{Code, Document, Key, Kind, Problem};
 use blaze_domain::LayerName;
+use blaze_domain::config::{Code, Document, Key, Kind, Problem};
 
 use super::placement::{Placement, placement};
 use super::state::State;
@@ -57,7 +57,9 @@ impl View {
 
     /// Whether a document that counts there is seen.
     pub(crate) fn sees(&self, placement: &Placement) -> bool {
-        self.layer.as_ref().is_none_or(|layer| placement.visible.contains(layer))
+        self.layer
+            .as_ref()
+            .is_none_or(|layer| placement.visible.contains(layer))
     }
 
     /// Whether a document is seen.

@@ -89,8 +89,14 @@ impl Filter {
         self.kind.is_none_or(|kind| kind == key.kind())
             && self.name.as_ref().is_none_or(|name| name == key.name().as_str())
             && self.service.as_ref().is_none_or(|service| is_of_service(key, service))
-            && self.layer.as_ref().is_none_or(|layer| is_in_layer(key, placement, layer))
-            && self.selector.as_ref().is_none_or(|selector| selector.matches(&document.labels))
+            && self
+                .layer
+                .as_ref()
+                .is_none_or(|layer| is_in_layer(key, placement, layer))
+            && self
+                .selector
+                .as_ref()
+                .is_none_or(|selector| selector.matches(&document.labels))
             && self.view.sees(placement)
     }
 
@@ -208,7 +214,13 @@ struct Watcher {
 
 impl Watches {
     /// A stream from a revision on; the caller has checked that it is within the history.
-    pub(crate) fn open(self: &Arc<Self>, caller: &Caller, filter: Filter, since: u64, timeout_s: Option<u32>) -> WatchStream {
+    pub(crate) fn open(
+        self: &Arc<Self>,
+        caller: &Caller,
+        filter: Filter,
+        since: u64,
+        timeout_s: Option<u32>,
+    ) -> WatchStream {
         self.open.fetch_add(1, Ordering::Relaxed);
         let life = rand::rng().random_range(LIFE);
         let life = timeout_s.map_or(life, |timeout| life.min(u64::from(timeout)));
@@ -292,8 +304,13 @@ impl Watcher {
             return Some(Problem::new(Code::ShuttingDown, detail).retry_after(1));
         }
         let claims = &self.caller.claims;
-        let expired = claims.expires_s.is_some_and(|expires| now().as_millis() / 1000 >= expires);
-        let revoked = claims.token_id.as_ref().is_some_and(|id| self.shared.revocations.is_revoked(id));
+        let expired = claims
+            .expires_s
+            .is_some_and(|expires| now().as_millis() / 1000 >= expires);
+        let revoked = claims
+            .token_id
+            .as_ref()
+            .is_some_and(|id| self.shared.revocations.is_revoked(id));
         if expired || revoked {
             let detail = "the token ran out or was revoked; go on with the last id and a new token";
             return Some(Problem::new(Code::Unauthenticated, detail));
@@ -372,10 +389,16 @@ impl Watcher {
         if batch.floor > self.cursor {
             return Err(trimmed(batch.floor, self.shared.log.revision()));
         }
-        let Some(mut state) = self.rebuilt.take() else { return Ok(()) };
+        let Some(mut state) = self.rebuilt.take() else {
+            return Ok(());
+        };
         for commit in &batch.commits {
             let effects = state.apply(commit);
-            let previous = if self.everything { commit.revision - 1 } else { self.previous };
+            let previous = if self.everything {
+                commit.revision - 1
+            } else {
+                self.previous
+            };
             let seen = self.filter.commit(commit, &effects, previous).map(Arc::new);
             self.push(commit.revision, seen, super::log::commit_bytes(commit));
         }
@@ -433,7 +456,8 @@ fn too_slow() -> Problem {
 
 /// The refusal of a revision that the history does not have any more.
 pub(crate) fn trimmed(floor: u64, revision: u64) -> Problem {
-    let detail = format!("the history reaches back to revision {floor}: list again, then watch from the list's revision");
+    let detail =
+        format!("the history reaches back to revision {floor}: list again, then watch from the list's revision");
     let mut problem = Problem::new(Code::RevisionTrimmed, detail).at(revision);
     problem.oldest_revision = Some(floor);
     problem

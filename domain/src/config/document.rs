@@ -103,7 +103,10 @@ impl Document {
     #[must_use]
     pub fn overrides(&self, service: &str) -> Option<&Value> {
         match self.key.kind() {
-            Kind::Layer | Kind::Node => self.spec_member("overrides")?.get(service).filter(|value| !value.is_null()),
+            Kind::Layer | Kind::Node => self
+                .spec_member("overrides")?
+                .get(service)
+                .filter(|value| !value.is_null()),
             Kind::Service | Kind::Instance | Kind::Rollout => None,
         }
     }
@@ -119,6 +122,8 @@ impl Document {
 }
 
 fn object(labels: &Labels) -> Value {
-    let members = labels.iter().map(|(key, value)| (key.clone(), Value::from(value.as_str())));
+    let members = labels
+        .iter()
+        .map(|(key, value)| (key.clone(), Value::from(value.as_str())));
     Value::Object(members.collect())
 }

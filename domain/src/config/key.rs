@@ -182,10 +182,24 @@ mod tests {
 
     #[test]
     fn a_key_reads_as_it_is_written() {
-        for text in ["Layer/edge", "Node/robot-1", "Service/slam", "Instance/slam/0", "Rollout/slower"] {
+        for text in [
+            "Layer/edge",
+            "Node/robot-1",
+            "Service/slam",
+            "Instance/slam/0",
+            "Rollout/slower",
+        ] {
             assert_eq!(text.parse::<Key>().unwrap().to_string(), text);
         }
-        for text in ["Layer", "Layer/a/b", "Instance/slam", "layer/a", "Node/A", "Instance/slam/0/1", ""] {
+        for text in [
+            "Layer",
+            "Layer/a/b",
+            "Instance/slam",
+            "layer/a",
+            "Node/A",
+            "Instance/slam/0/1",
+            "",
+        ] {
             assert!(text.parse::<Key>().is_err(), "{text}");
         }
     }

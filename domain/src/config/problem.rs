@@ -83,7 +83,9 @@ impl Problem {
     /// A refusal with its places; the code and words of the first fault stand for all.
     #[must_use]
     pub fn faults(errors: Vec<FieldFault>) -> Self {
-        let first = errors.first().map(|fault| (fault.code, format!("{}: {}", fault.pointer, fault.detail)));
+        let first = errors
+            .first()
+            .map(|fault| (fault.code, format!("{}: {}", fault.pointer, fault.detail)));
         let (code, mut detail) = first.unwrap_or((Code::ValidationFailed, String::new()));
         if errors.len() > 1 {
             detail.push_str(&format!(" (and {} more)", errors.len() - 1));

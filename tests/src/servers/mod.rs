@@ -1,14 +1,15 @@
-//! Real servers for tests: Redis, Valkey, Kafka and MongoDB from the files that `scripts/services install` unpacked.
+//! Real servers for tests: Redis, Valkey, Kafka, MongoDB and etcd from the files that `scripts/services install` unpacked.
 //!
 //! Most tests share the servers that `scripts/services start` runs ([`shared_redis`], [`shared_kafka`], [`shared_mongo`])
 //! and keep apart by [`unique_name`]. A test that kills, freezes or configures a server starts one of its own:
-//! [`RedisServer`], [`KafkaServer`], [`MongoServer`]. Those listen on a free port of loopback, or of a host of a
-//! [network](crate::network) alone, and end with the value, or with the test's process.
+//! [`RedisServer`], [`KafkaServer`], [`MongoServer`], [`EtcdServer`]. Those listen on a free port of loopback, or of a host
+//! of a [network](crate::network) alone, and end with the value, or with the test's process.
 //!
 //! All calls block the thread. In an asynchronous test they need a runtime with several threads.
 
 mod certificates;
 mod endpoint;
+mod etcd;
 mod installed;
 mod kafka;
 mod kafka_wire;
@@ -19,6 +20,7 @@ mod process;
 mod redis;
 mod shared;
 
+pub use etcd::{EtcdOptions, EtcdServer};
 pub use kafka::{KafkaOptions, KafkaServer};
 pub use mongo::{
     MongoOptions, MongoServer, abandon_mongo_transaction, drop_mongo_database, mongo_command, mongo_insert,

@@ -96,6 +96,8 @@ pub struct MongoOptions {
     pub host: Option<Host>,
     /// A server that is alone: it has neither transactions nor change streams.
     pub alone: bool,
+    /// Where its folder is made; absent = among temporary files. For measurements, where the disk matters.
+    pub folder: Option<PathBuf>,
     /// Further arguments of `mongod`.
     pub extra: Vec<String>,
 }
@@ -124,7 +126,7 @@ impl MongoServer {
             } else {
                 options.port
             };
-            let process = ServerProcess::new("mongo")?;
+            let process = ServerProcess::new_in("mongo", options.folder.as_deref())?;
             std::fs::create_dir(process.folder().join("data"))?;
             let server = Self {
                 process,

@@ -72,6 +72,28 @@ impl Client {
         }
     }
 
+    /// The same user at the same or another process, by the same or another interface. gRPC has a connection of its own.
+    pub(crate) fn at(&self, via: Via, main: &Arc<Main>) -> Self {
+        Self {
+            via,
+            main: Arc::clone(main),
+            rest: self.rest.clone(),
+            grpc: Arc::default(),
+        }
+    }
+
+    /// The same user with other connections of REST.
+    pub(crate) fn over(&self, http: reqwest::Client) -> Self {
+        let mut other = self.at(self.via, &self.main);
+        other.rest.http = http;
+        other
+    }
+
+    /// Gives up the connection of gRPC.
+    pub(crate) async fn disconnect(&self) {
+        *self.grpc.lock().await = None;
+    }
+
     /// Replaces or makes service `name` with this `spec.config`.
     pub(crate) async fn put(&self, name: &str, config: &Value, must: Must) -> Told {
         match self.via {
@@ -194,6 +216,8 @@ impl Client {
             return Ok(ConfigServiceClient::new(channel.clone()));
         }
         let endpoint = Endpoint::from_shared(format!("http://{at}")).unwrap().timeout(PATIENCE);
+        // The smallest window: what is not read stays with the service.
+        let endpoint = endpoint.initial_stream_window_size(65_535);
         let channel = endpoint.connect().await.map_err(|error| format!("{error:?}"))?;
         *kept = Some((at, channel.clone()));
         Ok(ConfigServiceClient::new(channel))

@@ -6,7 +6,8 @@
 //! ```text
 //! stage    a store and the processes on it: start, kill -9, start again, backup, restore
 //! client   one user of one process, over REST or gRPC: put, apply, get, delete, list; yes, no or unknown
-//! watcher  a watch with cuts, that checks what it is told;  sse: events from bytes
+//! watcher  a watch with cuts, that checks what it is told;  stream, sse: events from bytes and messages
+//! writer   changes services of its own;  raw: gRPC by hand
 //! register, checker   the history of a register, and whether it can be explained
 //! ```
 
@@ -26,13 +27,16 @@ mod crashes;
 mod linearizable;
 mod matrix;
 mod other_layer;
+mod raw;
 mod register;
 mod resumes;
 mod sse;
 mod stage;
+mod stream;
 mod token;
 mod watch;
 mod watcher;
+mod writer;
 
 /// The full count, or a smaller one that fits into every run.
 pub(crate) fn count(full: usize, short: usize) -> usize {

@@ -119,12 +119,18 @@ impl Stage {
 
     /// A process on this store, ready.
     pub(crate) fn start(&self, name: &str) -> Arc<Main> {
-        self.start_with(name, "info")
+        self.launch(name, "warn", None)
     }
 
-    pub(crate) fn start_with(&self, name: &str, level: &str) -> Arc<Main> {
+    /// A process that logs all that it can; all of that goes to a file, which is named.
+    pub(crate) fn start_talkative(&self, name: &str) -> (Arc<Main>, PathBuf) {
+        let log = self.path(&format!("{name}.log"));
+        (self.launch(name, "trace", Some(&log)), log)
+    }
+
+    fn launch(&self, name: &str, level: &str, log: Option<&Path>) -> Arc<Main> {
         let node_file = self.node_file(name, level);
-        let (process, addresses) = launch(&node_file).unwrap();
+        let (process, addresses) = launch(&node_file, log).unwrap();
         Arc::new(Main {
             name: name.to_owned(),
             node_file,
@@ -135,7 +141,7 @@ impl Stage {
 
     /// Runs a command of the program that ends by itself; what it said on stderr.
     pub(crate) fn command(&self, arguments: &[&str]) -> anyhow::Result<String> {
-        let node_file = self.node_file("command", "info");
+        let node_file = self.node_file("command", "warn");
         let output = Command::new(process::binary("blaze-config")?)
             .arg("--config")
             .arg(node_file)
@@ -191,7 +197,7 @@ impl Main {
 
     /// Starts it again on the same store, with other ports; ready on return. Blocks the thread.
     pub(crate) fn start_again(&self) {
-        let (process, addresses) = launch(&self.node_file).unwrap();
+        let (process, addresses) = launch(&self.node_file, None).unwrap();
         *self.addresses.write() = addresses;
         *self.process.lock() = Some(process);
     }
@@ -204,12 +210,10 @@ impl Main {
         }
     }
 
-    /// Everything that it has said and kept since its last start.
-    pub(crate) fn said(&self) -> String {
-        match &*self.process.lock() {
-            Some(process) => [process.stdout(), process.stderr()].concat().join("\n"),
-            None => String::new(),
-        }
+    /// What it printed on stdout since its last start.
+    pub(crate) fn printed(&self) -> String {
+        let process = self.process.lock();
+        process.as_ref().map(|process| process.stdout().join("\n")).unwrap_or_default()
     }
 
     /// Resident memory in bytes.
@@ -225,9 +229,13 @@ impl std::fmt::Debug for Main {
     }
 }
 
-fn launch(node_file: &Path) -> anyhow::Result<(Process, Addresses)> {
+fn launch(node_file: &Path, log: Option<&Path>) -> anyhow::Result<(Process, Addresses)> {
     let node_file = node_file.to_str().context("the folder has a name in UTF-8")?;
-    let process = Process::start("blaze-config", &["--config", node_file], None)?;
+    let arguments = ["--config", node_file];
+    let process = match log {
+        Some(log) => Process::start_logged("blaze-config", &arguments, log)?,
+        None => Process::start("blaze-config", &arguments, None)?,
+    };
     let line = wait::until_some(
         "the ready line",
         START,
@@ -250,6 +258,12 @@ fn launch(node_file: &Path) -> anyhow::Result<(Process, Addresses)> {
 /// The runtime of a test asks blocking helpers from threads of their own.
 pub(crate) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
     tokio::task::spawn_blocking(work).await.unwrap()
+}
+
+/// An answer in time, or a failed test.
+pub(crate) async fn within<T>(what: &str, limit: Duration, work: impl Future<Output = T>) -> T {
+    let done = tokio::time::timeout(limit, work).await;
+    done.unwrap_or_else(|_| panic!("{what}: not within {limit:?}"))
 }
 
 /// Microseconds since the first call: one clock for writers and watchers of this process.

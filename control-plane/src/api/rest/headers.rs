@@ -1,10 +1,11 @@
 //! What the headers of a request say of documents: preconditions, keys of requests that come twice, where a watch goes on.
 //! Pure: every function takes headers and gives a value or a refusal.
 
+use axum::http::HeaderMap;
 use axum::http::header::{HeaderName, IF_MATCH, IF_NONE_MATCH};
-use axum::http::{HeaderMap, HeaderValue};
 use blaze_domain::config::{Code, MAX_INTEGER, Problem};
 
+use crate::api::request::single;
 use crate::core::Precondition;
 
 /// Name of the header with the store's revision.
@@ -21,13 +22,6 @@ const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 
 /// Longest idempotency key, in characters.
 const MAX_IDEMPOTENCY_KEY: usize = 128;
-
-/// The value of a header that comes once.
-fn single<'a>(headers: &'a HeaderMap, name: &HeaderName) -> Option<&'a HeaderValue> {
-    let mut values = headers.get_all(name).iter();
-    let first = values.next();
-    if values.next().is_some() { None } else { first }
-}
 
 /// Entity tags of a precondition.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -202,6 +196,7 @@ fn invalid(detail: impl Into<String>) -> Problem {
 
 #[cfg(test)]
 mod tests {
+    use axum::http::HeaderValue;
     use proptest::prelude::*;
 
     use super::*;

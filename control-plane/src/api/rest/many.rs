@@ -17,6 +17,8 @@ use crate::core::{Answer, ApplyItem, ApplyReport, ApplyRequest};
 
 /// Documents of one request, at most.
 const MAX_ITEMS: usize = 1000;
+/// Bodies from this size on, in bytes, are read beside the threads that serve others.
+const LARGE_BYTES: usize = 32 * 1024;
 /// Faults that are told, at most.
 const MAX_FAULTS: usize = 100;
 
@@ -30,16 +32,29 @@ pub(super) async fn apply(call: &Call) -> Result<Response, Problem> {
     };
     let idempotency = call.idempotency()?;
     let (media, bytes) = call.body();
-    let values = match media {
-        Media::Yaml => yaml(bytes)?,
-        Media::Json | Media::MergePatch => array(bytes)?,
+    let items = if bytes.len() < LARGE_BYTES {
+        read(media, bytes)?
+    } else {
+        // Text that is made for it takes seconds to read.
+        let bytes = bytes.clone();
+        let reading = tokio::task::spawn_blocking(move || read(media, &bytes));
+        reading
+            .await
+            .map_err(|_| Problem::new(Code::Internal, "the body could not be read"))??
     };
-    let items = items(values)?;
     let answer = call
         .service()
         .apply(&call.caller, ApplyRequest { items, ..request }, idempotency)
         .await?;
     Ok(report(&answer))
+}
+
+fn read(media: Media, bytes: &[u8]) -> Result<Vec<ApplyItem>, Problem> {
+    let values = match media {
+        Media::Yaml => yaml(bytes)?,
+        Media::Json | Media::MergePatch => array(bytes)?,
+    };
+    items(values)
 }
 
 /// `POST /revert`

@@ -105,10 +105,11 @@ impl Call {
     }
 
     /// Type and bytes of the body.
-    pub(super) fn body(&self) -> (Media, &[u8]) {
+    pub(super) fn body(&self) -> (Media, &Bytes) {
+        static NONE: Bytes = Bytes::new();
         match &self.body {
             Some((media, bytes)) => (*media, bytes),
-            None => (Media::Json, &[]),
+            None => (Media::Json, &NONE),
         }
     }
 

@@ -13,10 +13,8 @@ use super::super::page::Position;
 use super::super::placement::{Placement, placement};
 use super::super::report;
 use super::super::secrets;
-use super::super::state::{State, redacted};
-use super::super::types::{
-    Answer, Caller, Effective, HistoryEntry, ListQuery, Page, Place, ReadOptions, WatchQuery,
-};
+use super::super::state::{Held, State, redacted};
+use super::super::types::{Answer, Caller, Effective, HistoryEntry, ListQuery, Page, Place, ReadOptions, WatchQuery};
 use super::super::view::{may_reveal, view};
 use super::super::watch::{Filter, WatchStream, is_in_layer, trimmed};
 use super::{ConfigService, WAIT_FOR_REVISION, not_found, selector};
@@ -27,6 +25,10 @@ use crate::store::{Op, Version};
 const PAGE: u32 = 100;
 /// The same, at most.
 const MAX_PAGE: u32 = 1000;
+/// A page ends with the document that makes it this large, in bytes of JSON: then it fits into a message of gRPC.
+const PAGE_BYTES: usize = 8 * 1024 * 1024;
+/// Versions that are taken from the store at once: each may be a whole document.
+const VERSIONS_AT_ONCE: usize = 32;
 
 /// What changed between two revisions of a document.
 #[derive(Debug, Clone, PartialEq)]
@@ -116,7 +118,11 @@ impl ConfigService {
         }
         self.check_reveal(caller, &[&document.key]).await?;
         let mut clear = (**document).clone();
-        clear.spec = Arc::new(secrets::revealed(&self.inner.evaluator.keyring, document, &document.spec));
+        clear.spec = Arc::new(secrets::revealed(
+            &self.inner.evaluator.keyring,
+            document,
+            &document.spec,
+        ));
         Ok(Arc::new(clear))
     }
 
@@ -126,7 +132,10 @@ impl ConfigService {
         if !may_reveal(&caller.claims) {
             return Err(Problem::new(Code::PermissionDenied, "only an admin may reveal secrets"));
         }
-        let entries: Vec<_> = keys.iter().map(|key| Self::entry(caller, "reveal", Some(key))).collect();
+        let entries: Vec<_> = keys
+            .iter()
+            .map(|key| Self::entry(caller, "reveal", Some(key)))
+            .collect();
         let written = self.inner.store.append_audit(&entries).await;
         written.map_err(|error| unavailable(&error))
     }
@@ -158,7 +167,11 @@ impl ConfigService {
             let detail = format!("the store is at revision {}", state.revision());
             return Err(Problem::new(Code::RevisionUnknown, detail).at(state.revision()));
         }
-        let found = self.inner.store.versions(key, Some(revision.saturating_add(1)), 1).await;
+        let found = self
+            .inner
+            .store
+            .versions(key, Some(revision.saturating_add(1)), 1)
+            .await;
         let found = found.map_err(|error| unavailable(&error))?.into_iter().next();
         match found {
             Some(version) if version.change.op != Op::Delete => Ok(version),
@@ -201,9 +214,12 @@ impl ConfigService {
             },
         };
         let after: Option<Key> = match &position {
-            Some(position) => Some(position.after.parse().map_err(|_| {
-                Problem::new(Code::InvalidPageToken, "the page token is not one of this query")
-            })?),
+            Some(position) => Some(
+                position
+                    .after
+                    .parse()
+                    .map_err(|_| Problem::new(Code::InvalidPageToken, "the page token is not one of this query"))?,
+            ),
             None => None,
         };
         if let (Some(service), Some(Kind::Instance)) = (&query.service, query.kind) {
@@ -216,19 +232,26 @@ impl ConfigService {
         let view = view(&caller.claims);
         let narrow = query.layer.is_some() || query.node.is_some() || view.layer().is_some();
         let matches = |document: &Document| {
-            query.service.as_ref().is_none_or(|service| document.key.service_name() == Some(service))
+            query
+                .service
+                .as_ref()
+                .is_none_or(|service| document.key.service_name() == Some(service))
                 && labels.as_ref().is_none_or(|labels| labels.matches(&document.labels))
-                && (!narrow || is_placed(&placement(&state, document), document, query) && view.sees_document(&state, document))
+                && (!narrow
+                    || is_placed(&placement(&state, document), document, query) && view.sees_document(&state, document))
         };
-        let mut found = found_documents(&state, query.kind, after.as_ref())
-            .filter(|(_, held)| matches(&held.document))
-            .take(limit + 1);
+        let mut found = found_documents(&state, query.kind, after.as_ref()).filter(|(_, held)| matches(&held.document));
         let mut items: Vec<Arc<Document>> = Vec::new();
+        let mut bytes = 0;
         for (_, held) in found.by_ref() {
             items.push(Arc::clone(if read.reveal { &held.document } else { &held.shown }));
+            bytes += held.bytes;
+            if items.len() == limit || bytes >= PAGE_BYTES {
+                break;
+            }
         }
-        let more = items.len() > limit;
-        items.truncate(limit);
+        let more = found.next().is_some();
+        drop(found);
         if read.reveal {
             items = self.reveal_all(caller, items).await?;
         }
@@ -237,7 +260,9 @@ impl ConfigService {
             after: document.key.to_string(),
         });
         let page = Page {
-            next_page_token: next.map(|position| self.inner.pages.token(&bound, &position)).unwrap_or_default(),
+            next_page_token: next
+                .map(|position| self.inner.pages.token(&bound, &position))
+                .unwrap_or_default(),
             items,
         };
         Ok(answer(&state, page))
@@ -248,7 +273,11 @@ impl ConfigService {
         self.check_reveal(caller, &keys).await?;
         let clear = items.iter().map(|document| {
             let mut clear = (**document).clone();
-            clear.spec = Arc::new(secrets::revealed(&self.inner.evaluator.keyring, document, &document.spec));
+            clear.spec = Arc::new(secrets::revealed(
+                &self.inner.evaluator.keyring,
+                document,
+                &document.spec,
+            ));
             Arc::new(clear)
         });
         Ok(clear.collect())
@@ -274,7 +303,11 @@ impl ConfigService {
         let at = self.resolve(caller, &state, asked)?;
         let sources = Sources::at(&state, &at);
         if read.reveal {
-            let keys: Vec<Key> = sources.parts().iter().map(|(document, _, _)| document.key.clone()).collect();
+            let keys: Vec<Key> = sources
+                .parts()
+                .iter()
+                .map(|(document, _, _)| document.key.clone())
+                .collect();
             self.check_reveal(caller, &keys.iter().collect::<Vec<_>>()).await?;
         }
         let keyring = Arc::clone(&self.inner.evaluator.keyring);
@@ -312,7 +345,11 @@ impl ConfigService {
             layer: asked.layer.clone(),
             node: asked.node.clone(),
         };
-        let service = asked.service.as_ref().map(|service| exists(Key::service(service))).transpose()?;
+        let service = asked
+            .service
+            .as_ref()
+            .map(|service| exists(Key::service(service)))
+            .transpose()?;
         if let Some(layer) = &asked.layer {
             exists(Key::layer(layer))?;
         }
@@ -365,14 +402,12 @@ impl ConfigService {
         view(&caller.claims).check_key(&state, key)?;
         let below = position.as_ref().and_then(|position| position.after.parse().ok());
         let shown_at = position.map_or(state.revision(), |position| position.revision);
-        let below = Some(below.unwrap_or(shown_at + 1));
-        let versions = self.inner.store.versions(key, below, limit + 1).await;
-        let mut versions = versions.map_err(|error| unavailable(&error))?;
+        let (versions, more) = self
+            .versions_below(key, below.unwrap_or(shown_at + 1), limit, full)
+            .await?;
         if versions.is_empty() && page_token.is_empty() && state.get(key).is_none() {
             return Err(not_found(key, &state));
         }
-        let more = versions.len() > limit;
-        versions.truncate(limit);
         let next = versions.last().filter(|_| more).map(|version| Position {
             revision: shown_at,
             after: version.revision.to_string(),
@@ -388,9 +423,43 @@ impl ConfigService {
         });
         let page = Page {
             items: items.collect(),
-            next_page_token: next.map(|position| self.inner.pages.token(&bound, &position)).unwrap_or_default(),
+            next_page_token: next
+                .map(|position| self.inner.pages.token(&bound, &position))
+                .unwrap_or_default(),
         };
         Ok(answer(&state, page))
+    }
+
+    /// Versions of a document before a revision, newest first, and whether there are more: up to `limit`, and with the
+    /// documents (`full`) a page's bytes of them. Without `full` a version comes without what its document holds.
+    async fn versions_below(
+        &self,
+        key: &Key,
+        mut below: u64,
+        limit: usize,
+        full: bool,
+    ) -> Result<(Vec<Version>, bool), Problem> {
+        let mut found: Vec<Version> = Vec::new();
+        let mut bytes = 0;
+        loop {
+            let some = self.inner.store.versions(key, Some(below), VERSIONS_AT_ONCE).await;
+            let some = some.map_err(|error| unavailable(&error))?;
+            let all = some.len() < VERSIONS_AT_ONCE;
+            for mut version in some {
+                if found.len() == limit || bytes >= PAGE_BYTES {
+                    return Ok((found, true));
+                }
+                below = version.revision;
+                match full {
+                    true => bytes += Held::new(Arc::clone(&version.change.document)).bytes,
+                    false => Arc::make_mut(&mut version.change.document).spec = Arc::default(),
+                }
+                found.push(version);
+            }
+            if all {
+                return Ok((found, false));
+            }
+        }
     }
 
     /// What changed in a document between two revisions; it counts as empty where it did not exist.
@@ -488,7 +557,12 @@ impl ConfigService {
     ///
     /// # Errors
     /// [`Problem`].
-    pub async fn digest(&self, caller: &Caller, layer: &LayerName, read: &ReadOptions) -> Result<Answer<Value>, Problem> {
+    pub async fn digest(
+        &self,
+        caller: &Caller,
+        layer: &LayerName,
+        read: &ReadOptions,
+    ) -> Result<Answer<Value>, Problem> {
         self.authorize(&caller.claims, Right::Read)?;
         let state = self.read_state(read).await?;
         view(&caller.claims).check_layer(layer)?;
@@ -501,7 +575,9 @@ impl ConfigService {
 
 /// Digest of a layer's view.
 pub(crate) fn digest(state: &State, layer: &LayerName) -> String {
-    let seen = state.all().filter(|(_, held)| placement(state, &held.document).visible.contains(layer));
+    let seen = state
+        .all()
+        .filter(|(_, held)| placement(state, &held.document).visible.contains(layer));
     canonical::digest(seen.map(|(key, held)| {
         let service = key.service_name().map(ServiceName::as_str);
         (key.kind(), service, key.name().as_str(), held.document.revision)
@@ -510,7 +586,9 @@ pub(crate) fn digest(state: &State, layer: &LayerName) -> String {
 
 fn node_json(state: &State, key: &Key) -> Value {
     let node = NodeName::from(key.name());
-    let kind = state.get(key).and_then(|held| held.document.spec_member("type").cloned());
+    let kind = state
+        .get(key)
+        .and_then(|held| held.document.spec_member("type").cloned());
     let services = state.on_node(&node).map(|key| {
         json!({
             "service": key.service_name().map(ServiceName::as_str), "instance": key.name().as_str(),
@@ -541,8 +619,14 @@ fn bound_query(caller: &Caller, query: &ListQuery) -> String {
 }
 
 fn is_placed(placement: &Placement, document: &Document, query: &ListQuery) -> bool {
-    query.layer.as_ref().is_none_or(|layer| is_in_layer(&document.key, placement, layer))
-        && query.node.as_ref().is_none_or(|node| placement.node.as_ref() == Some(node))
+    query
+        .layer
+        .as_ref()
+        .is_none_or(|layer| is_in_layer(&document.key, placement, layer))
+        && query
+            .node
+            .as_ref()
+            .is_none_or(|node| placement.node.as_ref() == Some(node))
 }
 
 fn found_documents<'a>(
@@ -554,7 +638,11 @@ fn found_documents<'a>(
         Some(kind) => Box::new(state.of_kind(kind, after)),
         None => {
             let after = after.cloned();
-            Box::new(state.all().filter(move |(key, _)| after.as_ref().is_none_or(|after| *key > after)))
+            Box::new(
+                state
+                    .all()
+                    .filter(move |(key, _)| after.as_ref().is_none_or(|after| *key > after)),
+            )
         }
     }
 }

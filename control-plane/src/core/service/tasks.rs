@@ -47,7 +47,9 @@ impl ConfigService {
                 }
             }
         };
-        parts.readiness.add("store", Gate::Decides, CheckStatus::Ok, self.described());
+        parts
+            .readiness
+            .add("store", Gate::Decides, CheckStatus::Ok, self.described());
         let spawn = |name: &str, future| {
             supervisor.spawn(name, TaskPolicy::Essential, until(future));
         };
@@ -164,4 +166,3 @@ impl ConfigService {
         std::future::pending::<()>().await;
     }
 }
-

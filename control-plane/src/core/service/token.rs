@@ -37,7 +37,10 @@ pub(super) struct DenialLimit {
 impl DenialLimit {
     fn admit(&mut self, address: IpAddr) -> bool {
         let now = Instant::now();
-        if self.second.is_none_or(|since| now.duration_since(since) >= Duration::from_secs(1)) {
+        if self
+            .second
+            .is_none_or(|since| now.duration_since(since) >= Duration::from_secs(1))
+        {
             self.second = Some(now);
             self.counts.clear();
         }
@@ -134,7 +137,12 @@ impl ConfigService {
             _ => return Err(Problem::new(Code::InvalidRequest, format!("limit: 1 to {MAX_PAGE}"))),
         };
         query.limit = limit + 1;
-        let mut items = self.inner.store.audit(&query).await.map_err(|error| unavailable(&error))?;
+        let mut items = self
+            .inner
+            .store
+            .audit(&query)
+            .await
+            .map_err(|error| unavailable(&error))?;
         let more = items.len() > limit;
         items.truncate(limit);
         let next = items.last().filter(|_| more).map(|entry| Position {
@@ -145,7 +153,9 @@ impl ConfigService {
             revision: state.revision(),
             replayed: false,
             value: Page {
-                next_page_token: next.map(|position| self.inner.pages.token(&bound, &position)).unwrap_or_default(),
+                next_page_token: next
+                    .map(|position| self.inner.pages.token(&bound, &position))
+                    .unwrap_or_default(),
                 items,
             },
         })
@@ -189,7 +199,10 @@ impl ConfigService {
         let text = authenticator.sign(&token).ok_or_else(disabled)?;
         let text = text.map_err(|error| {
             tracing::error!(%error, "a token could not be signed");
-            Problem::new(Code::Internal, "the token could not be signed; see the log of the service")
+            Problem::new(
+                Code::Internal,
+                "the token could not be signed; see the log of the service",
+            )
         })?;
         let entry = Self::entry(caller, "token_create", None);
         let added = self.inner.store.add_token(&record, &entry).await;
@@ -208,7 +221,12 @@ impl ConfigService {
     pub async fn tokens(&self, caller: &Caller, read: &ReadOptions) -> Result<Answer<Vec<TokenRecord>>, Problem> {
         authorize_whole(&caller.claims)?;
         let state = self.read_state(read).await?;
-        let tokens = self.inner.store.tokens(now()).await.map_err(|error| unavailable(&error))?;
+        let tokens = self
+            .inner
+            .store
+            .tokens(now())
+            .await
+            .map_err(|error| unavailable(&error))?;
         Ok(Answer {
             revision: state.revision(),
             replayed: false,
@@ -267,7 +285,9 @@ fn check_token(request: &TokenRequest) -> Result<(), Problem> {
         id: "0",
     };
     token.check().map_err(|detail| {
-        let pointer = ["subject", "layer"].into_iter().find(|member| detail.starts_with(member));
+        let pointer = ["subject", "layer"]
+            .into_iter()
+            .find(|member| detail.starts_with(member));
         invalid(&format!("/{}", pointer.unwrap_or("roles")), detail)
     })
 }

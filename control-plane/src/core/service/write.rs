@@ -59,7 +59,11 @@ fn item(key: Key, content: Content, precondition: Precondition) -> Item {
 
 fn internal(what: &str) -> Problem {
     tracing::error!(what, "an answer could not be made");
-    Problem::new(Code::Internal, "the answer could not be made; see the log of the service").applied(Applied::Unknown)
+    Problem::new(
+        Code::Internal,
+        "the answer could not be made; see the log of the service",
+    )
+    .applied(Applied::Unknown)
 }
 
 impl ConfigService {
@@ -110,7 +114,8 @@ impl ConfigService {
             Problem::new(Code::Overloaded, "too many writes wait for the store; try again").retry_after(1)
         })?;
         let ended = || {
-            let detail = "the service ended before the store answered: read the documents to see whether it took effect";
+            let detail =
+                "the service ended before the store answered: read the documents to see whether it took effect";
             Problem::new(Code::ShuttingDown, detail).applied(Applied::Unknown)
         };
         result.await.map_err(|_| ended())?
@@ -170,7 +175,11 @@ impl ConfigService {
         self.check_view(caller, &input.key)?;
         let bytes = input.spec.to_string().len();
         let item = item(input.key.clone(), Content::Write(input), Precondition::None);
-        let action = if item.key.kind() == Kind::Rollout { "rollout_start" } else { "create" };
+        let action = if item.key.kind() == Kind::Rollout {
+            "rollout_start"
+        } else {
+            "create"
+        };
         self.write_one(request(caller, action, Form::Create, vec![item]), idempotency, bytes)
             .await
     }
@@ -189,7 +198,8 @@ impl ConfigService {
         self.check_view(caller, &input.key)?;
         let bytes = input.spec.to_string().len();
         let item = item(input.key.clone(), Content::Write(input), precondition);
-        self.write_one(request(caller, "update", Form::Single, vec![item]), None, bytes).await
+        self.write_one(request(caller, "update", Form::Single, vec![item]), None, bytes)
+            .await
     }
 
     /// Changes a document by a merge patch of its labels, annotations and spec.
@@ -207,7 +217,8 @@ impl ConfigService {
         self.check_view_of_existing(caller, key)?;
         let bytes = merge_patch.to_string().len();
         let item = item(key.clone(), Content::Patch(merge_patch), precondition);
-        self.write_one(request(caller, "patch", Form::Single, vec![item]), None, bytes).await
+        self.write_one(request(caller, "patch", Form::Single, vec![item]), None, bytes)
+            .await
     }
 
     /// Deletes a document; with `cascade` also those that refer to it.
@@ -250,7 +261,10 @@ impl ConfigService {
     ) -> Result<Answer<ApplyReport>, Problem> {
         self.authorize(&caller.claims, Right::Write)?;
         if asked.items.len() > MAX_ITEMS {
-            let detail = format!("{} documents, at most {MAX_ITEMS} are allowed at once", asked.items.len());
+            let detail = format!(
+                "{} documents, at most {MAX_ITEMS} are allowed at once",
+                asked.items.len()
+            );
             return Err(Problem::new(Code::PayloadTooLarge, detail));
         }
         let prune = match &asked.prune {
@@ -266,7 +280,11 @@ impl ConfigService {
                 Some(revision) => Precondition::Revisions(vec![revision]),
                 None => Precondition::None,
             };
-            let content = if one.delete { Content::Delete } else { Content::Write(one.input.clone()) };
+            let content = if one.delete {
+                Content::Delete
+            } else {
+                Content::Write(one.input.clone())
+            };
             item(one.input.key, content, precondition)
         });
         let mut request = request(caller, "apply", Form::Many, items.collect());
@@ -314,13 +332,21 @@ impl ConfigService {
         self.check_view_of_existing(caller, key)?;
         let version = match self.version_at(&state, key, revision).await {
             Err(problem) if problem.code == Code::RevisionUnknown => {
-                let detail = format!("there is no revision {revision} yet; the newest is {}", state.revision());
+                let detail = format!(
+                    "there is no revision {revision} yet; the newest is {}",
+                    state.revision()
+                );
                 return Err(Problem::new(Code::NotFound, detail));
             }
             other => other?,
         };
-        let item = item(key.clone(), Content::Restore(Some(version.change.document)), precondition);
-        self.write_one(request(caller, "rollback", Form::Single, vec![item]), idempotency, 0).await
+        let item = item(
+            key.clone(),
+            Content::Restore(Some(version.change.document)),
+            precondition,
+        );
+        self.write_one(request(caller, "rollback", Form::Single, vec![item]), idempotency, 0)
+            .await
     }
 
     /// Gives every document that a commit changed the content that it had before, in one commit.
@@ -345,7 +371,11 @@ impl ConfigService {
         if batch.floor >= revision {
             return Err(trimmed(batch.floor, state.revision()));
         }
-        let commit = batch.commits.into_iter().next().filter(|commit| commit.revision == revision);
+        let commit = batch
+            .commits
+            .into_iter()
+            .next()
+            .filter(|commit| commit.revision == revision);
         let commit = commit.ok_or_else(missing)?;
         let mut items = Vec::with_capacity(commit.changes.len());
         let mut unchanged_since = Vec::with_capacity(commit.changes.len());
@@ -376,7 +406,8 @@ impl ConfigService {
         name: &DocumentName,
         idempotency: Option<Idempotency>,
     ) -> Result<Answer<Written>, Problem> {
-        self.end_rollout(caller, name, "rollout_promote", Content::Promote, idempotency).await
+        self.end_rollout(caller, name, "rollout_promote", Content::Promote, idempotency)
+            .await
     }
 
     /// Ends a roll-out without effect.
@@ -391,7 +422,8 @@ impl ConfigService {
         idempotency: Option<Idempotency>,
     ) -> Result<Answer<Written>, Problem> {
         let content = Content::Abort(reason.chars().take(1000).collect());
-        self.end_rollout(caller, name, "rollout_abort", content, idempotency).await
+        self.end_rollout(caller, name, "rollout_abort", content, idempotency)
+            .await
     }
 
     async fn end_rollout(
@@ -406,7 +438,8 @@ impl ConfigService {
         let key = Key::rollout(name.clone());
         self.check_view_of_existing(caller, &key)?;
         let item = item(key, content, Precondition::None);
-        self.write_one(request(caller, action, Form::Single, vec![item]), idempotency, 0).await
+        self.write_one(request(caller, action, Form::Single, vec![item]), idempotency, 0)
+            .await
     }
 
     /// Removes commits before a revision. Gives the smallest revision that a watch may start after from now on.
@@ -447,7 +480,9 @@ impl ConfigService {
 /// A write that changed nothing reflects the revision of what is there.
 fn own_revision(done: &Done) -> u64 {
     match done.evaluated.changes.is_empty() {
-        true => done.written().map_or(done.revision, |written| written.document.revision),
+        true => done
+            .written()
+            .map_or(done.revision, |written| written.document.revision),
         false => done.revision,
     }
 }
