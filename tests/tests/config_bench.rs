@@ -10,7 +10,16 @@ use serde_json::Value;
 
 fn run(arguments: &[&str]) -> (bool, String) {
     let output = Command::new(env!("CARGO_BIN_EXE_blaze-config-bench"))
-        .args(["--documents", "200", "--connections", "2", "--watchers", "5", "--rate", "50"])
+        .args([
+            "--documents",
+            "200",
+            "--connections",
+            "2",
+            "--watchers",
+            "5",
+            "--rate",
+            "50",
+        ])
         .args(["--seconds", "0.2", "--warm-up", "0.05"])
         .args(arguments)
         .output()
@@ -30,11 +39,19 @@ fn every_load_is_done_by_everybody() {
     for load in ["get, 2 conn", "put, 2 conn", "apply 100, 2 conn", "watch, 5 at 50 Hz"] {
         let of_load: Vec<&Value> = rows.iter().filter(|row| row["load"] == load).collect();
         let names: Vec<&str> = of_load.iter().map(|row| row["subject"].as_str().unwrap()).collect();
-        let blaze = ["blaze grpc mongodb", "blaze grpc sqlite", "blaze rest mongodb", "blaze rest sqlite"];
+        let blaze = [
+            "blaze grpc mongodb",
+            "blaze grpc sqlite",
+            "blaze rest mongodb",
+            "blaze rest sqlite",
+        ];
         let in_turns: Vec<&str> = blaze.into_iter().flat_map(|name| ["etcd", name]).collect();
         assert_eq!(names, in_turns, "{load}");
         for row in of_load {
-            assert!(row["operations"].as_u64().unwrap() > 0 && row["p99_ms"].as_f64().unwrap() > 0.0, "{row}");
+            assert!(
+                row["operations"].as_u64().unwrap() > 0 && row["p99_ms"].as_f64().unwrap() > 0.0,
+                "{row}"
+            );
             let is_blaze = row["subject"] != "etcd";
             assert_eq!(row["to_etcd"].is_number(), is_blaze, "{row}");
             assert_eq!(row["batch"].is_number(), is_blaze && !load.starts_with("get"), "{row}");

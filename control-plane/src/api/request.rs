@@ -58,7 +58,7 @@ pub fn bearer(headers: &HeaderMap) -> Option<&str> {
 }
 
 /// The value of a header that comes exactly once.
-pub(super) fn single<'a>(headers: &'a HeaderMap, name: impl AsHeaderName) -> Option<&'a HeaderValue> {
+pub(super) fn single(headers: &HeaderMap, name: impl AsHeaderName) -> Option<&HeaderValue> {
     let mut values = headers.get_all(name).iter();
     let first = values.next();
     if values.next().is_some() { None } else { first }

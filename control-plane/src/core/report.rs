@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use blaze_domain::config::diff::document_diff;
+use blaze_domain::config::diff::{Delta, document_diff};
 use blaze_domain::config::{Document, Key, Timestamp};
 use blaze_domain::{InstanceName, LayerName, NodeName, ServiceName};
 use serde_json::{Value, json};
@@ -154,7 +154,7 @@ fn report_text(report: &ApplyReport) -> String {
         .results
         .iter()
         .map(|result| {
-            let changes: Vec<Value> = result.changes.iter().map(|delta| delta.to_json()).collect();
+            let changes: Vec<Value> = result.changes.iter().map(Delta::to_json).collect();
             json!({ "key": result.key.to_string(), "action": result.action.as_str(), "revision": result.revision, "changes": changes })
         })
         .collect();

@@ -419,20 +419,37 @@ impl Rest {
     /// Every document of a collection, and the revision that the list shows. `None` when its pages were trimmed away
     /// while it was read.
     pub(crate) async fn try_list(&self, at: SocketAddr, collection: &str) -> Option<(u64, Vec<Value>)> {
-        let (mut items, mut page) = (Vec::new(), String::new());
+        match self.try_pages(at, &format!("/api/v1/{collection}")).await {
+            Ok(list) => Some(list),
+            Err(answer) => {
+                assert_eq!(answer.status, 410, "{}", answer.text);
+                None
+            }
+        }
+    }
+
+    /// All entries of what comes in pages.
+    pub(crate) async fn pages(&self, at: SocketAddr, path: &str) -> Vec<Value> {
+        match self.try_pages(at, path).await {
+            Ok((_, items)) => items,
+            Err(answer) => panic!("{path}: {} {}", answer.status, answer.text),
+        }
+    }
+
+    async fn try_pages(&self, at: SocketAddr, path: &str) -> Result<(u64, Vec<Value>), Answer> {
+        let path = format!("{path}{}limit=1000", if path.contains('?') { '&' } else { '?' });
+        let (mut items, mut next) = (Vec::new(), path.clone());
         loop {
-            let path = format!("/api/v1/{collection}?limit=1000&page_token={page}");
-            let path = if page.is_empty() { format!("/api/v1/{collection}?limit=1000") } else { path };
-            let answer = self.get(at, &path).await.unwrap();
-            if answer.status == 410 {
-                return None;
+            let answer = self.get(at, &next).await.unwrap();
+            if answer.status != 200 {
+                return Err(answer);
             }
-            assert_eq!(answer.status, 200, "{}", answer.text);
             items.extend(answer.body["items"].as_array().unwrap().iter().cloned());
-            page = answer.body["next_page_token"].as_str().unwrap().to_owned();
+            let page = answer.body["next_page_token"].as_str().unwrap();
             if page.is_empty() {
-                return Some((answer.body["revision"].as_u64().unwrap(), items));
+                return Ok((answer.body["revision"].as_u64().unwrap(), items));
             }
+            next = format!("{path}&page_token={page}");
         }
     }
 

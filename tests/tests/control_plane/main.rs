@@ -30,6 +30,7 @@ mod other_layer;
 mod raw;
 mod register;
 mod resumes;
+mod routes;
 mod sse;
 mod stage;
 mod stream;

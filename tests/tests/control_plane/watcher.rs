@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 use tokio::sync::watch;
 
-use super::client::{Client, Seen};
+use super::client::{Client, Seen, Via};
 use super::stage::micros;
 use super::stream::{Change, Commit, Next, Op, Stream};
 
@@ -121,6 +121,11 @@ impl Watcher {
         self.clients = clients;
     }
 
+    /// The interface that it asks by.
+    pub(crate) fn via(&self) -> Via {
+        self.client().via
+    }
+
     /// Takes the next event. May be given up at any time.
     async fn next(&mut self) {
         if self.stream.is_none() {
@@ -159,7 +164,7 @@ impl Watcher {
     }
 
     /// Opens a watch where it was, or lists first where that was trimmed.
-    async fn open(&mut self) {
+    pub(crate) async fn open(&mut self) {
         for _ in 0..TRIES {
             let opened = match self.tally.commits {
                 0 => Stream::open(self.client(), self.cursor).await,

@@ -128,7 +128,11 @@ impl Connection {
                 };
                 let mut kvs = keys.range(request).await?.into_inner().kvs;
                 let one = kvs.pop().with_context(|| format!("no {}", name(number)))?;
-                anyhow::ensure!(kvs.is_empty() && one.key == key(number), "{:?} was not asked for", one.key);
+                anyhow::ensure!(
+                    kvs.is_empty() && one.key == key(number),
+                    "{:?} was not asked for",
+                    one.key
+                );
                 Ok(Found {
                     revision: one.mod_revision.try_into()?,
                     body: Body::Spec(one.value),
@@ -215,7 +219,10 @@ impl Connection {
                     ..v1::ApplyRequest::default()
                 };
                 let answer = client.apply(signed(request, token)).await?.into_inner();
-                let done = answer.results.iter().filter(|result| result.revision == answer.revision);
+                let done = answer
+                    .results
+                    .iter()
+                    .filter(|result| result.revision == answer.revision);
                 let done = done.count();
                 anyhow::ensure!(done == count, "{done} of {count} were applied");
                 Ok(answer.revision)
@@ -224,7 +231,10 @@ impl Connection {
                 let items: Vec<String> = documents
                     .iter()
                     .map(|(number, spec)| {
-                        format!("{{\"kind\":\"Service\",\"name\":\"{}\",\"spec\":{spec}}}", name(*number))
+                        format!(
+                            "{{\"kind\":\"Service\",\"name\":\"{}\",\"spec\":{spec}}}",
+                            name(*number)
+                        )
                     })
                     .collect();
                 let request = http.post(format!("{base}/apply")).bearer_auth(token);

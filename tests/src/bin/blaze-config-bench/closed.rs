@@ -59,7 +59,10 @@ pub(crate) async fn run(
             check(&mut connection, &subject.documents, number, true).await?;
         }
     }
-    anyhow::ensure!(!latencies.is_empty(), "nothing was done in the window: measure for longer");
+    anyhow::ensure!(
+        !latencies.is_empty(),
+        "nothing was done in the window: measure for longer"
+    );
     Ok((Figures::of(latencies.len(), timing.measured, latencies), used))
 }
 
@@ -74,7 +77,15 @@ async fn one(
     let mut count = 0_usize;
     loop {
         let took = match work {
-            Work::Get => check(&mut connection, &documents, documents.any(), count.is_multiple_of(SAMPLE)).await?,
+            Work::Get => {
+                check(
+                    &mut connection,
+                    &documents,
+                    documents.any(),
+                    count.is_multiple_of(SAMPLE),
+                )
+                .await?
+            }
             Work::Put => put(&mut connection, &documents).await?,
             Work::Apply => apply(&mut connection, &documents, &documents.some(APPLIED)).await?,
         };
@@ -100,7 +111,10 @@ async fn check(
     let found = connection.get(number).await?;
     let took = begin.elapsed();
     let revision = found.revision;
-    anyhow::ensure!(revision == known.revision, "{number} has revision {revision}, written was {known:?}");
+    anyhow::ensure!(
+        revision == known.revision,
+        "{number} has revision {revision}, written was {known:?}"
+    );
     if whole {
         check_spec(number, known.step, &found.spec()?)?;
     }

@@ -73,7 +73,12 @@ impl Documents {
     /// When there is no such document, or the revision was given twice.
     pub(crate) fn written(&self, number: usize, now: Known) -> anyhow::Result<()> {
         let mut known = self.slot(number)?.lock();
-        anyhow::ensure!(now.revision != known.revision, "{}: {now:?} after {:?}", name(number), *known);
+        anyhow::ensure!(
+            now.revision != known.revision,
+            "{}: {now:?} after {:?}",
+            name(number),
+            *known
+        );
         if now.revision > known.revision {
             *known = now;
         }

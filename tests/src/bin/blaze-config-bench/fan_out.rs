@@ -34,7 +34,9 @@ impl Sent {
 
     /// Which change of this measurement a step is.
     fn index(&self, step: u64) -> anyhow::Result<usize> {
-        let index = step.checked_sub(self.first_step).context("a change from before the watch")?;
+        let index = step
+            .checked_sub(self.first_step)
+            .context("a change from before the watch")?;
         let index = usize::try_from(index)?;
         anyhow::ensure!(index < self.times.len(), "a change that nobody made: step {step}");
         Ok(index)
@@ -73,7 +75,12 @@ pub(crate) async fn run(
         tasks.spawn(one(connection, watch, Arc::clone(&sent), before));
     }
     let mut writing = JoinSet::new();
-    writing.spawn(write_all(writer, Arc::clone(&subject.documents), Arc::clone(&sent), period));
+    writing.spawn(write_all(
+        writer,
+        Arc::clone(&subject.documents),
+        Arc::clone(&sent),
+        period,
+    ));
     let used = subject.used_in(window).await?;
     let mut latencies = Vec::with_capacity(watchers * counted);
     let ended = async {
@@ -85,7 +92,9 @@ pub(crate) async fn run(
         }
         anyhow::Ok(())
     };
-    timeout(PATIENCE, ended).await.context("a watcher was not told of all changes")??;
+    timeout(PATIENCE, ended)
+        .await
+        .context("a watcher was not told of all changes")??;
     anyhow::ensure!(latencies.len() == watchers * counted, "{} latencies", latencies.len());
     Ok((Figures::of(counted, timing.measured, latencies), used))
 }

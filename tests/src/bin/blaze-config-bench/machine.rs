@@ -1,7 +1,7 @@
 //! Where it was measured.
 
 use std::fs::File;
-use std::io::Write as _;
+use std::io::{Seek as _, Write as _};
 use std::path::Path;
 use std::time::Instant;
 
@@ -13,6 +13,7 @@ use serde::Serialize;
 const IN_MEMORY: [&str; 2] = ["tmpfs", "ramfs"];
 /// Writes that are synced to see what that costs.
 const SYNCS: usize = 50;
+const BLOCK: [u8; 4096] = [7; 4096];
 
 /// What figures depend on.
 #[derive(Debug, Clone, Serialize)]
@@ -23,7 +24,7 @@ pub(crate) struct Machine {
     pub(crate) file_system: String,
     /// Whether all data is lost with the power: then writes mean nothing.
     pub(crate) in_memory: bool,
-    /// To write 4 KiB and sync them, at the median.
+    /// To write 4 KiB in place and sync them, at the median.
     pub(crate) sync_ms: f64,
     pub(crate) etcd: String,
     /// Whether this program, and so the rest of the workspace beside it, was built with optimisation.
@@ -70,13 +71,17 @@ fn file_system<'a>(mounts: &'a str, folder: &Path) -> Option<&'a str> {
     above.max_by_key(|(depth, _)| *depth).map(|(_, kind)| kind)
 }
 
+/// In place, as a log does that was given its room before: a file that grows costs more.
 fn sync_ms(folder: &Path) -> anyhow::Result<f64> {
     let path = folder.join("sync");
     let mut file = File::create(&path)?;
+    file.write_all(&vec![0; SYNCS * BLOCK.len()])?;
+    file.sync_all()?;
+    file.rewind()?;
     let mut times = Vec::with_capacity(SYNCS);
     for _ in 0..SYNCS {
         let begin = Instant::now();
-        file.write_all(&[7; 4096])?;
+        file.write_all(&BLOCK)?;
         file.sync_data()?;
         times.push(begin.elapsed());
     }
@@ -92,7 +97,12 @@ mod tests {
     #[test]
     fn the_deepest_mount_is_the_one_that_counts() {
         let mounts = "/dev/vda / ext4 rw 0 0\ntmpfs /tmp tmpfs rw 0 0\n/dev/vdb /tmp/x xfs rw 0 0\n";
-        for (folder, expected) in [("/home/a", "ext4"), ("/tmp/y", "tmpfs"), ("/tmp/x/z", "xfs"), ("/tmpx", "ext4")] {
+        for (folder, expected) in [
+            ("/home/a", "ext4"),
+            ("/tmp/y", "tmpfs"),
+            ("/tmp/x/z", "xfs"),
+            ("/tmpx", "ext4"),
+        ] {
             assert_eq!(file_system(mounts, Path::new(folder)), Some(expected), "{folder}");
         }
     }

@@ -101,7 +101,8 @@ impl Arguments {
 
     fn contenders(&self) -> Vec<Contender> {
         let all = Contender::ALL.into_iter();
-        all.filter(|contender| contender.name().contains(&self.beside)).collect()
+        all.filter(|contender| contender.name().contains(&self.beside))
+            .collect()
     }
 }
 
@@ -135,7 +136,10 @@ fn main() -> anyhow::Result<ExitCode> {
     let contenders = arguments.contenders();
     anyhow::ensure!(!contenders.is_empty(), "nobody is called {:?}", arguments.beside);
     let loads = Load::all(&arguments.connections, arguments.watchers, arguments.rate);
-    let loads: Vec<Load> = loads.into_iter().filter(|load| load.name().contains(&arguments.only)).collect();
+    let loads: Vec<Load> = loads
+        .into_iter()
+        .filter(|load| load.name().contains(&arguments.only))
+        .collect();
     anyhow::ensure!(!loads.is_empty(), "no load is called {:?}", arguments.only);
 
     let parent = match &arguments.data {

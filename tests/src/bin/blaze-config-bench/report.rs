@@ -59,7 +59,9 @@ impl Report {
             machine.etcd
         );
         if machine.in_memory {
-            println!("NOTE: this file system is in memory, where syncing costs nothing: choose another one with --data");
+            println!(
+                "NOTE: this file system is in memory, where syncing costs nothing: choose another one with --data"
+            );
         }
         if !machine.optimised {
             println!("NOTE: built without optimisation: figures of blaze mean little");
@@ -71,7 +73,11 @@ impl Report {
         let mib = |kib: u64| kib as f64 / 1024.0;
         let beside = database.map(|kib| format!(", its database {:.0} MiB", mib(kib)));
         let (name, count) = (&subject.name, subject.documents.count());
-        println!("{name}: {count} documents, {:.0} MiB resident{}", mib(own), beside.unwrap_or_default());
+        println!(
+            "{name}: {count} documents, {:.0} MiB resident{}",
+            mib(own),
+            beside.unwrap_or_default()
+        );
         self.memory.push(Memory {
             subject: name.clone(),
             documents: count,
@@ -84,7 +90,17 @@ impl Report {
     pub(crate) fn print_head(&self) {
         println!(
             "\n{:<22} {:<19} {:>9} {:>9} {:>9} {:>7} {:>10} {:>9} {:>10} {:>7} {:>7}",
-            "LOAD", "SERVER", "PER S", "p50/ms", "p99/ms", "x ETCD", "SERVER us", "DB us", "CLIENT us", "BATCH", "ABORTS"
+            "LOAD",
+            "SERVER",
+            "PER S",
+            "p50/ms",
+            "p99/ms",
+            "x ETCD",
+            "SERVER us",
+            "DB us",
+            "CLIENT us",
+            "BATCH",
+            "ABORTS"
         );
     }
 

@@ -131,7 +131,10 @@ impl Subjects {
     /// When it was not started.
     pub(crate) fn of(&self, store: Store) -> anyhow::Result<&Subject> {
         let is_it = |subject: &&Subject| matches!(&subject.server, Server::Blaze(blaze) if blaze.store == store);
-        self.0.iter().find(is_it).with_context(|| format!("no {}", store.name()))
+        self.0
+            .iter()
+            .find(is_it)
+            .with_context(|| format!("no {}", store.name()))
     }
 }
 
@@ -239,7 +242,11 @@ impl Subject {
 
 /// Transactions that MongoDB undid since its start.
 fn aborted(mongo: &MongoServer) -> anyhow::Result<i64> {
-    let status = mongo_command(&mongo.uri(), "admin", &json!({ "serverStatus": 1, "repl": 0, "metrics": 0 }))?;
+    let status = mongo_command(
+        &mongo.uri(),
+        "admin",
+        &json!({ "serverStatus": 1, "repl": 0, "metrics": 0 }),
+    )?;
     let transactions = status.get_document("transactions")?;
     Ok(transactions.get_i64("totalAborted")?)
 }
@@ -267,7 +274,10 @@ impl Blaze {
         let node_file = write_node_file(&folder, &key_file, &store_section)?;
         let token = token(key.as_bytes())?;
 
-        let arguments = ["--config", node_file.to_str().context("the folder has a name in UTF-8")?];
+        let arguments = [
+            "--config",
+            node_file.to_str().context("the folder has a name in UTF-8")?,
+        ];
         let process = Process::start("blaze-config", &arguments, None)?;
         let line = wait::until_some(
             "the ready line of blaze-config",
@@ -292,7 +302,11 @@ impl Blaze {
 
     /// Revisions, and transactions, since its start.
     fn written(&self) -> anyhow::Result<(f64, f64)> {
-        let metric = |name: &str| self.admin.metric(name, &[]).with_context(|| format!("no metric {name}"));
+        let metric = |name: &str| {
+            self.admin
+                .metric(name, &[])
+                .with_context(|| format!("no metric {name}"))
+        };
         Ok((
             metric("blaze_config_revision")?,
             metric("blaze_config_commit_duration_seconds_count")?,

@@ -125,13 +125,19 @@ mod tests {
 
     #[test]
     fn changes_are_found_however_the_text_is_cut() {
-        let text = b"retry: 2731\n\nid: 4\nevent: change\ndata: {\"a\":{\"step\":17,\"b\":1}}\n\nid: 5\nevent: bookmark\n\
+        let text =
+            b"retry: 2731\n\nid: 4\nevent: change\ndata: {\"a\":{\"step\":17,\"b\":1}}\n\nid: 5\nevent: bookmark\n\
                      data: {\"revision\":5}\n\nid: 6\nevent: change\ndata: {\"step\":18}\n\n";
         let whole = Lines::default().push(&Bytes::from_static(text)).unwrap();
-        assert_eq!(whole, [Known { revision: 4, step: 17 }, Known { revision: 6, step: 18 }]);
+        assert_eq!(
+            whole,
+            [Known { revision: 4, step: 17 }, Known { revision: 6, step: 18 }]
+        );
         for size in 1..text.len() {
             let mut lines = Lines::default();
-            let pieces = text.chunks(size).flat_map(|piece| lines.push(&Bytes::from_static(piece)).unwrap());
+            let pieces = text
+                .chunks(size)
+                .flat_map(|piece| lines.push(&Bytes::from_static(piece)).unwrap());
             assert_eq!(pieces.collect::<Vec<_>>(), whole, "{size}");
         }
     }

@@ -29,7 +29,7 @@ use utoipa::openapi::{InfoBuilder, LicenseBuilder, OpenApi, OpenApiBuilder, Path
 
 use super::body::Media;
 use super::routes::{self, Action, Payload, Route, Verb};
-use shapes::{Shape, list, refer, text};
+use shapes::{Shape, list, refer, refer_or_null};
 
 pub(super) use twin::to_3_0;
 
@@ -209,10 +209,11 @@ fn request_body(payload: Payload) -> Option<RequestBody> {
                 .schema(Some(shape.clone()))
                 .example(Some(example.clone())),
             Media::Yaml => {
-                let said = "Documents split by `---`: YAML 1.2, core schema, no anchors, aliases or tags.";
+                let said = "One document; `---` begins another one, and empty ones count as none. YAML 1.2, core schema, no \
+                            anchors, aliases or tags.";
                 ContentBuilder::new()
-                    .schema(Some(text().description(Some(said))))
-                    .example(Some(json!("kind: Layer\nname: edge\nspec: { kind: edge }\n")))
+                    .schema(Some(refer_or_null("ApplyItem", said)))
+                    .example(Some(json!({ "kind": "Layer", "name": "edge", "spec": { "kind": "edge" } })))
             }
         };
         body = body.content(media.as_str(), content.build());

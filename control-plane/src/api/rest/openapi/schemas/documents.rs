@@ -4,11 +4,11 @@ use blaze_domain::LayerKind;
 use blaze_domain::config::selector::MAX_LABEL_BYTES;
 use blaze_domain::config::{Kind, MAX_INTEGER, MAX_LABELS, spec};
 use serde_json::json;
-use utoipa::openapi::schema::{ObjectBuilder, SchemaType, Type};
+use utoipa::openapi::schema::{ObjectBuilder, OneOfBuilder, Type};
 
 use super::super::patterns::{ADDRESS, ARCHITECTURE, LABEL_KEY, LABEL_VALUE};
 use super::super::shapes::{
-    Shape, answer, closed, formed, free, like, list, map, or_null, refer, said, text, time, whole, word,
+    Shape, answer, closed, flag, formed, free, like, list, map, or_null, refer, said, text, time, whole, word,
 };
 use super::{kinds, name, real_revision, revision, selector};
 
@@ -103,9 +103,14 @@ pub(super) fn spec_of(kind: Kind) -> ObjectBuilder {
 
 /// It is an object, or `true` or `false`.
 fn json_schema() -> Shape {
-    let schema = ObjectBuilder::new().schema_type(SchemaType::from_iter([Type::Object, Type::Boolean]));
     let description = "JSON Schema 2020-12 of the effective configuration; `$ref` within the schema only.";
-    said(like(schema, json!({ "type": "object" })), description)
+    // Not one schema of two types, of which generators of clients make an object without members.
+    OneOfBuilder::new()
+        .item(free())
+        .item(flag())
+        .description(Some(description))
+        .examples([json!({ "type": "object" })])
+        .into()
 }
 
 fn node_spec() -> ObjectBuilder {
