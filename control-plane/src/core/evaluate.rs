@@ -13,7 +13,7 @@ use blaze_domain::config::{
 use serde_json::{Map, Value, json};
 
 use super::effective::is_canary;
-use super::placement::{is_active, phase, rollout_target};
+use super::placement::{is_active, phase, placement, rollout_target};
 use super::refs;
 use super::schema::Schemas;
 use super::secrets::Vault;
@@ -516,19 +516,29 @@ fn begin_rollout(state: &State, input: &DocumentInput) -> Result<Value, Box<Prob
         spec: Arc::new(input.spec.clone()),
         status: None,
     };
+    let target = rollout_target(&rollout).and_then(|key| state.get(&key).cloned());
+    let place = target.as_ref().map(|target| placement(state, &target.document));
+    // A change of what a node never sees cannot be tried there.
+    let counts = |node: &Document| {
+        let on = placement(state, node);
+        place.as_ref().is_none_or(|place| {
+            on.layer.is_some_and(|layer| place.visible.contains(&layer))
+                && (place.node.is_none() || place.node == on.node)
+        })
+    };
     let nodes = state
         .of_kind(Kind::Node, None)
-        .filter(|(_, held)| is_canary(&rollout, &held.document));
+        .filter(|(_, held)| is_canary(&rollout, &held.document) && counts(&held.document));
     let canaries: Vec<Value> = nodes
         .map(|(key, _)| json!({ "node": key.name().as_str(), "phase": "pending", "revision": null, "reason": "" }))
         .collect();
     if canaries.is_empty() {
         return refuse(
             "/spec/canary/node_selector",
-            "matches no node; at least one must try the change",
+            "matches no node on which the target counts; at least one must try the change",
         );
     }
-    if let Some(target) = rollout_target(&rollout).and_then(|key| state.get(&key).cloned()) {
+    if let Some(target) = target {
         let mut patched = (*target.shown.spec).clone();
         if let Some(patch) = rollout.spec_member("patch") {
             merge::merge_patch(&mut patched, patch);

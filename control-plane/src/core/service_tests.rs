@@ -777,6 +777,45 @@ async fn a_roll_out_counts_on_its_canaries_until_it_is_promoted() {
 }
 
 #[tokio::test]
+async fn a_change_is_tried_only_where_its_target_counts() {
+    let w = world().await;
+    w.robot().await;
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    for (name, layer) in [("robot-2", "edge"), ("server", "fog")] {
+        let mut node = input(&format!("Node/{name}"), json!({ "layer": layer }));
+        node.labels.insert("canary".to_owned(), "true".to_owned());
+        w.service.create(&w.admin, node, None).await.unwrap();
+    }
+    w.put("Service/inner", json!({ "layers": ["fog"] })).await;
+    let spec = |kind: &str, name: &str| {
+        json!({
+            "target": { "kind": kind, "name": name }, "patch": { "config": { "a": 5 } },
+            "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+        })
+    };
+    for (kind, name, expected) in [
+        ("Service", "slam", &["robot-2", "server"][..]),
+        ("Service", "inner", &["server"]),
+        ("Layer", "edge", &["robot-2"]),
+        ("Node", "server", &["server"]),
+    ] {
+        let rollout = input(&format!("Rollout/to-{name}"), spec(kind, name));
+        let started = w.service.create(&w.admin, rollout, None).await.unwrap().value;
+        let canaries = started.document.status.as_ref().unwrap()["canaries"]
+            .as_array()
+            .unwrap()
+            .clone();
+        let names: Vec<&str> = canaries.iter().map(|canary| canary["node"].as_str().unwrap()).collect();
+        assert_eq!(names, expected, "{kind} {name}");
+    }
+    let nowhere = input("Rollout/nowhere", spec("Node", "robot-1"));
+    assert_eq!(
+        code(w.service.create(&w.admin, nowhere, None).await),
+        Code::ValidationFailed
+    );
+}
+
+#[tokio::test]
 async fn many_writers_with_preconditions_lose_nothing() {
     let w = world().await;
     w.put("Service/counter", json!({ "config": { "n": 0 } })).await;

@@ -102,7 +102,11 @@ impl View {
                     super::placement::rollout_target(document).is_none_or(|target| target.kind() != Kind::Service)
                         && self.sees_document(state, document)
                 }
-                Kind::Layer | Kind::Node | Kind::Instance => placement(state, document).layer.as_ref() == Some(layer),
+                // An instance of a service that the layer does not see is outside too, as if there were no such service.
+                Kind::Layer | Kind::Node | Kind::Instance => {
+                    let placement = placement(state, document);
+                    placement.layer.as_ref() == Some(layer) && placement.visible.contains(layer)
+                }
             };
             if !own {
                 return Err(self.outside(&document.key.to_string()));

@@ -24,7 +24,13 @@ use super::writer::Writer;
 
 /// What a restored store's revision is higher by, as the contract has it.
 const RAISED_BY: u64 = 1_000_000;
-const KINDS: [v1::Kind; 5] = [v1::Kind::Layer, v1::Kind::Node, v1::Kind::Service, v1::Kind::Instance, v1::Kind::Rollout];
+const KINDS: [v1::Kind; 5] = [
+    v1::Kind::Layer,
+    v1::Kind::Node,
+    v1::Kind::Service,
+    v1::Kind::Instance,
+    v1::Kind::Rollout,
+];
 const SECRET: &str = "kept-across-a-restore";
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -72,25 +78,42 @@ async fn restored_elsewhere(stage: Stage) {
     println!("{}", said.trim());
     let (now, services) = restored.rest.list(at, "services").await;
     assert_eq!(now, revision + RAISED_BY);
-    assert_ne!(word_after(&said, "restored as store "), store_of(&stage).await, "it is another store");
+    assert_ne!(
+        word_after(&said, "restored as store "),
+        store_of(&stage).await,
+        "it is another store"
+    );
 
     let expected = documents(&client, Some(revision)).await;
     let found = documents(&restored, None).await;
     assert!(expected.len() > 100, "there is something to compare");
     assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
     for (key, document) in &expected {
-        assert_eq!(found[key], *document, "{key}");
+        assert_eq!(found[key], *document, "{key:?}");
     }
     // The digest is that of the moment of the backup; that it is made like this shows the one of now.
     for (client, documents, what) in [
         (&client, documents(&client, None).await, "of the first store"),
         (&restored, expected, "of the restored one"),
     ] {
-        let answer = client.rest.get(client.main.at().rest, "/api/v1/digest?layer=edge").await.unwrap();
+        let answer = client
+            .rest
+            .get(client.main.at().rest, "/api/v1/digest?layer=edge")
+            .await
+            .unwrap();
         assert_eq!(answer.body["digest"], digest(&documents), "{what}: {}", answer.text);
     }
-    let secret = restored.rest.get(at, "/api/v1/services/with-secret?reveal=true").await.unwrap();
-    assert_eq!(secret.body.pointer("/spec/config/key/$secret/text"), Some(&json!(SECRET)), "{}", secret.text);
+    let secret = restored
+        .rest
+        .get(at, "/api/v1/services/with-secret?reveal=true")
+        .await
+        .unwrap();
+    assert_eq!(
+        secret.body.pointer("/spec/config/key/$secret/text"),
+        Some(&json!(SECRET)),
+        "{}",
+        secret.text
+    );
 
     // Whatever a watcher knew, it knows nothing of this store: it lists, and goes on from there.
     let mut writer = Writer::new(restored.clone(), "later", 3, 0);
@@ -137,7 +160,12 @@ async fn back_up(stage: &Arc<Stage>, mains: &[Arc<Main>], client: &Client) -> (P
     let mut writing = JoinSet::new();
     for index in 0..4 {
         let via = if index % 2 == 0 { Via::Rest } else { Via::Grpc };
-        let mut writer = Writer::new(client.at(via, &mains[index / 2 % mains.len()]), &format!("w{index}"), 50, 0);
+        let mut writer = Writer::new(
+            client.at(via, &mains[index / 2 % mains.len()]),
+            &format!("w{index}"),
+            50,
+            0,
+        );
         let (over, head) = (Arc::clone(&over), Arc::clone(&head));
         writing.spawn(async move {
             head.fetch_max(writer.put_all().await, Ordering::AcqRel);
@@ -152,7 +180,13 @@ async fn back_up(stage: &Arc<Stage>, mains: &[Arc<Main>], client: &Client) -> (P
     let (said, before, after) = blocking(move || {
         let head = || head_seen.load(Ordering::Acquire);
         let written = |least: u64| {
-            wait::until("writes", Duration::from_secs(120), || head() >= least, || format!("{} of {least}", head())).unwrap();
+            wait::until(
+                "writes",
+                Duration::from_secs(120),
+                || head() >= least,
+                || format!("{} of {least}", head()),
+            )
+            .unwrap();
             head()
         };
         let before = written(grown);
@@ -166,14 +200,22 @@ async fn back_up(stage: &Arc<Stage>, mains: &[Arc<Main>], client: &Client) -> (P
     over.store(true, Ordering::Release);
     writing.join_all().await;
     let revision: u64 = word_after(&said, "revision ").parse().unwrap();
-    println!("{} (writers had been told {before} before it and {after} after it)", said.trim());
-    // A commit may be in the backup before its writer hears of it.
-    assert!((before..=after + 300).contains(&revision) && after > before, "{before} {revision} {after}");
+    println!(
+        "{} (writers had been told {before} before it and {after} after it)",
+        said.trim()
+    );
+    // A commit of each writer may be in the backup before that one hears of it.
+    assert!(
+        (before..=after + 4).contains(&revision) && after > before,
+        "{before} {revision} {after}"
+    );
     (file, revision, head.load(Ordering::Acquire))
 }
 
 fn word_after<'a>(text: &'a str, before: &str) -> &'a str {
-    let (_, rest) = text.split_once(before).unwrap_or_else(|| panic!("{before:?} is not in {text}"));
+    let (_, rest) = text
+        .split_once(before)
+        .unwrap_or_else(|| panic!("{before:?} is not in {text}"));
     rest.split([' ', ':']).next().unwrap()
 }
 
@@ -250,11 +292,18 @@ async fn round_trip(client: &Client, stage: &Arc<Stage>) {
         let blaze = |arguments: &[&str]| {
             let mut command = Command::new(process::binary("blaze").unwrap());
             command.args(arguments).args(["--server", &server]);
-            command.env("BLAZE_TOKEN", &token).env("XDG_CONFIG_HOME", &home).stdin(Stdio::piped());
+            command
+                .env("BLAZE_TOKEN", &token)
+                .env("XDG_CONFIG_HOME", &home)
+                .stdin(Stdio::piped());
             command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
         };
         let exported = blaze(&["export"]).wait_with_output().unwrap();
-        assert!(exported.status.success(), "{}", String::from_utf8_lossy(&exported.stderr));
+        assert!(
+            exported.status.success(),
+            "{}",
+            String::from_utf8_lossy(&exported.stderr)
+        );
         let mut apply = blaze(&["apply", "-f", "-", "-o", "json"]);
         let mut input = apply.stdin.take().unwrap();
         let text = exported.stdout.clone();
@@ -277,7 +326,11 @@ async fn round_trip(client: &Client, stage: &Arc<Stage>) {
         assert_eq!(result["action"], "unchanged", "{result}");
         assert_eq!(result["changes"], json!([]), "{result}");
     }
-    assert_eq!(client.rest.list(at, "services").await.0, revision, "nothing was committed");
+    assert_eq!(
+        client.rest.list(at, "services").await.0,
+        revision,
+        "nothing was committed"
+    );
     assert_eq!(documents(client, None).await, before);
     println!("{} documents exported and applied again: all unchanged", results.len());
 }

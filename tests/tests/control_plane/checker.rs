@@ -56,9 +56,10 @@ pub(crate) fn check(history: &[Event], limit: usize) -> Verdict {
 /// When the first of the operations that must still be placed was answered; `None` when all are. What is unknown need not
 /// be placed: then it never took effect.
 fn first_answer(events: &[Event], placed: &[u64]) -> Option<u64> {
-    let left = events.iter().enumerate().filter(|(index, event)| {
-        event.outcome != Outcome::Unknown && !has(placed, *index)
-    });
+    let left = events
+        .iter()
+        .enumerate()
+        .filter(|(index, event)| event.outcome != Outcome::Unknown && !has(placed, *index));
     left.map(|(_, event)| event.end).min()
 }
 
@@ -166,12 +167,24 @@ mod tests {
         let swap = unknown(3, Op::Swap { seen: 1, new: 2 });
         let create = event(1, 2, Op::Create(1), Outcome::Done);
         let found = |time, content| event(time, time + 1, Op::Get, Outcome::Found(Some(content)));
-        assert_eq!(verdict(&[create, swap, found(5, 1), found(7, 1)]), Verdict::Linearizable);
-        assert_eq!(verdict(&[create, swap, found(5, 2), found(7, 2)]), Verdict::Linearizable);
+        assert_eq!(
+            verdict(&[create, swap, found(5, 1), found(7, 1)]),
+            Verdict::Linearizable
+        );
+        assert_eq!(
+            verdict(&[create, swap, found(5, 2), found(7, 2)]),
+            Verdict::Linearizable
+        );
         // Late, but it did.
-        assert_eq!(verdict(&[create, swap, found(5, 1), found(7, 2)]), Verdict::Linearizable);
+        assert_eq!(
+            verdict(&[create, swap, found(5, 1), found(7, 2)]),
+            Verdict::Linearizable
+        );
         assert_eq!(verdict(&[create, swap, found(5, 2), found(7, 1)]), Verdict::Impossible);
-        assert_eq!(verdict(&[create, unknown(9, Op::Create(7)), found(5, 7)]), Verdict::Impossible);
+        assert_eq!(
+            verdict(&[create, unknown(9, Op::Create(7)), found(5, 7)]),
+            Verdict::Impossible
+        );
     }
 
     #[test]
@@ -205,18 +218,35 @@ mod tests {
                     0 => Op::Create(new),
                     1 => Op::Get,
                     2 => Op::Swap { seen, new },
-                    _ => Op::Delete { seen: (guess > 1).then_some(seen) },
+                    _ => Op::Delete {
+                        seen: (guess > 1).then_some(seen),
+                    },
                 };
-                let done = Event { op, outcome: Outcome::Done, begin: point - before, end: point + after };
+                let done = Event {
+                    op,
+                    outcome: Outcome::Done,
+                    begin: point - before,
+                    end: point + after,
+                };
                 let event = match op {
-                    Op::Get => Event { outcome: Outcome::Found(state), ..done },
+                    Op::Get => Event {
+                        outcome: Outcome::Found(state),
+                        ..done
+                    },
                     Op::Create(_) | Op::Swap { .. } | Op::Delete { .. } => match done.on(state) {
                         Some(next) => {
                             state = next;
-                            let unknown = Event { outcome: Outcome::Unknown, end: u64::MAX, ..done };
+                            let unknown = Event {
+                                outcome: Outcome::Unknown,
+                                end: u64::MAX,
+                                ..done
+                            };
                             if lost && guess == 3 { unknown } else { done }
                         }
-                        None => Event { outcome: Outcome::Refused, ..done },
+                        None => Event {
+                            outcome: Outcome::Refused,
+                            ..done
+                        },
                     },
                 };
                 events.push(event);

@@ -145,7 +145,9 @@ impl Client {
             Via::Rest => {
                 let one = |(name, config): &(String, Value)| json!({ "kind": "Service", "name": name, "spec": { "config": config } });
                 let body = Value::Array(documents.iter().map(one).collect());
-                let answer = self.send(Method::POST, "/api/v1/apply", Must::Nothing, Some(&body)).await;
+                let answer = self
+                    .send(Method::POST, "/api/v1/apply", Must::Nothing, Some(&body))
+                    .await;
                 told(answer, |answer| answer.body["revision"].as_u64())
             }
             Via::Grpc => {
@@ -410,7 +412,11 @@ impl Rest {
     /// `PUT` whatever there is, and nothing but success.
     pub(crate) async fn put(&self, at: SocketAddr, path: &str, body: &Value) -> Answer {
         let there = self.get(at, path).await.unwrap().status == 200;
-        let headers = if there { vec![("if-match", "*".to_owned())] } else { Vec::new() };
+        let headers = if there {
+            vec![("if-match", "*".to_owned())]
+        } else {
+            Vec::new()
+        };
         let answer = self.send(at, Method::PUT, path, &headers, Some(body)).await.unwrap();
         assert!(answer.status < 300, "PUT {path}: {} {}", answer.status, answer.text);
         answer

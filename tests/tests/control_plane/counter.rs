@@ -104,11 +104,21 @@ async fn statuses(client: &Client, stale: u64) {
     let (path, body) = (format!("/api/v1/services/{NAME}"), json!({ "spec": {} }));
     for (must, status) in [(None, 428), (Some(stale), 412)] {
         for method in [Method::PUT, Method::PATCH, Method::DELETE] {
-            let headers: Vec<(&str, String)> = must.map(|revision| ("if-match", format!("\"{revision}\""))).into_iter().collect();
-            let answer = client.rest.send(client.main.at().rest, method.clone(), &path, &headers, Some(&body)).await;
+            let headers: Vec<(&str, String)> = must
+                .map(|revision| ("if-match", format!("\"{revision}\"")))
+                .into_iter()
+                .collect();
+            let answer = client
+                .rest
+                .send(client.main.at().rest, method.clone(), &path, &headers, Some(&body))
+                .await;
             let answer = answer.unwrap();
             assert_eq!(answer.status, status, "{method} {}", answer.text);
-            assert!(answer.body["revision"].as_u64() > Some(stale), "it tells what it is now: {}", answer.text);
+            assert!(
+                answer.body["revision"].as_u64() > Some(stale),
+                "it tells what it is now: {}",
+                answer.text
+            );
         }
     }
 }

@@ -90,7 +90,11 @@ async fn told_the_truth(stage: &Arc<Stage>, mains: &[Arc<Main>], victims: Vec<Vi
         blocking(move || kill_all(&stage, &mains, &victims, &progress))
     };
     within("the kills", limit, killing).await;
-    let attempts: Vec<Attempt> = within("the writers", limit, writers.join_all()).await.into_iter().flatten().collect();
+    let attempts: Vec<Attempt> = within("the writers", limit, writers.join_all())
+        .await
+        .into_iter()
+        .flatten()
+        .collect();
     let of = |one: fn(&Told) -> bool| attempts.iter().filter(|attempt| one(&attempt.told)).count();
     println!(
         "{} writes and {kills} kills in {:?}: yes {}, no {}, unknown {}",
@@ -104,7 +108,11 @@ async fn told_the_truth(stage: &Arc<Stage>, mains: &[Arc<Main>], victims: Vec<Vi
     check(&attempts, &history);
     for main in mains {
         let (_, items) = client.rest.list(main.at().rest, "services").await;
-        assert_eq!(state_of(&items), folded(&history), "the documents are those of the history");
+        assert_eq!(
+            state_of(&items),
+            folded(&history),
+            "the documents are those of the history"
+        );
     }
     audited(&client, &history).await;
 }
@@ -140,14 +148,19 @@ async fn write(client: Client, number: usize, progress: Arc<Progress>) -> Vec<At
     while progress.yes() < progress.goal {
         let count = attempts.len();
         let batch = format!("{number}-{count}");
-        let is_made = attempts.iter().any(|attempt: &Attempt| matches!(attempt.told, Told::Yes(_)));
+        let is_made = attempts
+            .iter()
+            .any(|attempt: &Attempt| matches!(attempt.told, Told::Yes(_)));
         // The first one that took effect has made all of them.
         let (names, told) = if !is_made || count.is_multiple_of(APPLY) {
             let documents: Vec<(String, Value)> = names.iter().map(|name| (name.clone(), content(&batch))).collect();
             (names.clone(), client.apply(&documents).await)
         } else {
             let name = &names[count % DOCUMENTS];
-            (vec![name.clone()], client.put(name, &content(&batch), Must::BeThere).await)
+            (
+                vec![name.clone()],
+                client.put(name, &content(&batch), Must::BeThere).await,
+            )
         };
         if let Told::Yes(_) = told {
             progress.yes.fetch_add(1, Ordering::AcqRel);
@@ -167,7 +180,9 @@ fn content(batch: &str) -> Value {
 /// Every commit there ever was.
 async fn history(client: &Client) -> Vec<Commit> {
     let head = client.rest.list(client.main.at().rest, "services").await.0;
-    let mut stream = Stream::open(client, 0).await.unwrap_or_else(|refused| panic!("{refused:?}"));
+    let mut stream = Stream::open(client, 0)
+        .await
+        .unwrap_or_else(|refused| panic!("{refused:?}"));
     let commits = stream.until(head).await.unwrap_or_else(|other| panic!("{other:?}"));
     let revisions: Vec<u64> = commits.iter().map(|commit| commit.revision).collect();
     assert_eq!(revisions, (1..=head).collect::<Vec<u64>>(), "no revision is missing");
@@ -179,8 +194,14 @@ fn check(attempts: &[Attempt], history: &[Commit]) {
     let mut found: BTreeMap<&str, Vec<(u64, Vec<&str>)>> = BTreeMap::new();
     for commit in history {
         let batch = commit.changes[0].config["batch"].as_str().unwrap();
-        assert!(commit.changes.iter().all(|change| change.config["batch"] == batch), "{commit:?}");
-        assert!(commit.changes.iter().all(|change| change.revision == commit.revision), "{commit:?}");
+        assert!(
+            commit.changes.iter().all(|change| change.config["batch"] == batch),
+            "{commit:?}"
+        );
+        assert!(
+            commit.changes.iter().all(|change| change.revision == commit.revision),
+            "{commit:?}"
+        );
         let names = commit.changes.iter().map(|change| change.name.as_str()).collect();
         found.entry(batch).or_default().push((commit.revision, names));
     }
@@ -192,7 +213,11 @@ fn check(attempts: &[Attempt], history: &[Commit]) {
             Told::Unknown(_) => there.is_empty() || whole(),
             Told::No(_) | Told::Refused(_) => there.is_empty(),
         };
-        assert!(is_true, "{}, {:?}: told {:?}, found {there:?}", attempt.batch, attempt.names, attempt.told);
+        assert!(
+            is_true,
+            "{}, {:?}: told {:?}, found {there:?}",
+            attempt.batch, attempt.names, attempt.told
+        );
     }
     assert!(found.is_empty(), "nobody wrote {found:?}");
 }
@@ -212,14 +237,25 @@ async fn audited(client: &Client, history: &[Commit]) {
     let at = client.main.at().rest;
     let mut expected: Vec<(u64, &str)> = Vec::new();
     for commit in history {
-        expected.extend(commit.changes.iter().map(|change| (commit.revision, change.name.as_str())));
+        expected.extend(
+            commit
+                .changes
+                .iter()
+                .map(|change| (commit.revision, change.name.as_str())),
+        );
     }
     expected.sort_unstable();
     let entries = client.rest.pages(at, "/api/v1/audit?outcome=allowed").await;
     let of_audit = |entry: &Value| Some((entry["revision"].as_u64()?, entry["name"].as_str()?.to_owned()));
     let mut audit: Vec<(u64, String)> = entries.iter().filter_map(of_audit).collect();
     audit.sort_unstable();
-    assert!(audit.iter().map(|(revision, name)| (*revision, name.as_str())).eq(expected.iter().copied()), "the audit differs");
+    assert!(
+        audit
+            .iter()
+            .map(|(revision, name)| (*revision, name.as_str()))
+            .eq(expected.iter().copied()),
+        "the audit differs"
+    );
     for index in 0..DOCUMENTS {
         let name = format!("w0-{index}");
         let path = format!("/api/v1/services/{name}/history?view=full");
@@ -227,9 +263,15 @@ async fn audited(client: &Client, history: &[Commit]) {
         let versions = versions.iter().rev().map(|version| {
             let document = &version["document"];
             assert_eq!(version["revision"], document["revision"]);
-            (document["revision"].as_u64().unwrap(), document["spec"]["config"].clone())
+            (
+                document["revision"].as_u64().unwrap(),
+                document["spec"]["config"].clone(),
+            )
         });
-        let changes = history.iter().flat_map(|commit| &commit.changes).filter(|change| change.name == name);
+        let changes = history
+            .iter()
+            .flat_map(|commit| &commit.changes)
+            .filter(|change| change.name == name);
         let changes = changes.map(|change| (change.revision, change.config.clone()));
         assert!(versions.eq(changes), "the history of {name} differs");
     }

@@ -175,7 +175,11 @@ impl User {
     }
 
     fn note(&mut self, key: usize, op: Op, outcome: Outcome, begin: u64) {
-        let end = if outcome == Outcome::Unknown { u64::MAX } else { micros() };
+        let end = if outcome == Outcome::Unknown {
+            u64::MAX
+        } else {
+            micros()
+        };
         self.events.push((
             key,
             Event {
@@ -208,7 +212,11 @@ impl User {
         let begin = micros();
         let told = match op {
             Op::Create(new) => self.client.put(&name, &json!({ "v": new }), Must::BeAbsent).await,
-            Op::Swap { new, .. } => self.client.put(&name, &json!({ "v": new }), Must::HaveRevision(revision)).await,
+            Op::Swap { new, .. } => {
+                self.client
+                    .put(&name, &json!({ "v": new }), Must::HaveRevision(revision))
+                    .await
+            }
             Op::Delete { seen: Some(_) } => self.client.delete(&name, Must::HaveRevision(revision)).await,
             Op::Delete { seen: None } => self.client.delete(&name, Must::BeThere).await,
             Op::Get => panic!("a look changes nothing"),
@@ -225,7 +233,10 @@ impl User {
             }
             Told::Refused(code) => {
                 let deletes = matches!(op, Op::Delete { .. });
-                assert!(code == "precondition_failed" || (deletes && code == "not_found"), "{op:?}: {code}");
+                assert!(
+                    code == "precondition_failed" || (deletes && code == "not_found"),
+                    "{op:?}: {code}"
+                );
                 self.note(key, op, Outcome::Refused, begin);
                 true
             }

@@ -68,7 +68,14 @@ fn rsa_token(stage: &Stage, private: &str, kid: &str) -> String {
         expires_s: now_s() + 3600,
         id: "rsa-1",
     };
-    sign_locally(&Realm::default(), private.as_bytes(), Algorithm::Rs256, Some(kid), &token).unwrap()
+    sign_locally(
+        &Realm::default(),
+        private.as_bytes(),
+        Algorithm::Rs256,
+        Some(kid),
+        &token,
+    )
+    .unwrap()
 }
 
 /// Everything that is no token of somebody. Each differs from a good one in one way.
@@ -122,8 +129,14 @@ fn bad(stage: &Stage, revoked: &str) -> Vec<Bad> {
 
     for algorithm in ["none", "None", "NONE", "nOnE", ""] {
         let header = header_with("alg", json!(algorithm));
-        add(&format!("alg {algorithm:?} without signature"), &[bearer(&format!("{}.", unsigned(&header, &good_claims())))]);
-        add(&format!("alg {algorithm:?} signed"), &[bearer(&hmac_token(&header, &good_claims(), &stage.secret))]);
+        add(
+            &format!("alg {algorithm:?} without signature"),
+            &[bearer(&format!("{}.", unsigned(&header, &good_claims())))],
+        );
+        add(
+            &format!("alg {algorithm:?} signed"),
+            &[bearer(&hmac_token(&header, &good_claims(), &stage.secret))],
+        );
     }
     for (what, name, value) in [
         ("of another algorithm of the key", "alg", json!("HS512")),
@@ -137,34 +150,67 @@ fn bad(stage: &Stage, revoked: &str) -> Vec<Bad> {
         add(what, &[bearer(&token)]);
     }
     let nameless = json!({ "alg": "HS256", "typ": "JWT" });
-    add("of no key", &[bearer(&hmac_token(&nameless, &good_claims(), &stage.secret))]);
+    add(
+        "of no key",
+        &[bearer(&hmac_token(&nameless, &good_claims(), &stage.secret))],
+    );
 
     // Who knows only what everybody may know.
     let public = stage.rsa.public.as_bytes();
     for (what, header) in [
-        ("HS256 with the public key, as that key", json!({ "alg": "HS256", "kid": "r1" })),
-        ("HS256 with the public key, as the other key", json!({ "alg": "HS256", "kid": "k1" })),
+        (
+            "HS256 with the public key, as that key",
+            json!({ "alg": "HS256", "kid": "r1" }),
+        ),
+        (
+            "HS256 with the public key, as the other key",
+            json!({ "alg": "HS256", "kid": "k1" }),
+        ),
         ("HS256 with the public key, as no key", json!({ "alg": "HS256" })),
-        ("RS256 said, HS256 with the public key", json!({ "alg": "RS256", "kid": "r1" })),
+        (
+            "RS256 said, HS256 with the public key",
+            json!({ "alg": "RS256", "kid": "r1" }),
+        ),
     ] {
         add(what, &[bearer(&hmac_token(&header, &good_claims(), public))]);
         let trimmed = stage.rsa.public.trim_end().as_bytes();
-        add(&format!("{what}, without its last line end"), &[bearer(&hmac_token(&header, &good_claims(), trimmed))]);
+        add(
+            &format!("{what}, without its last line end"),
+            &[bearer(&hmac_token(&header, &good_claims(), trimmed))],
+        );
     }
     let stranger = blaze_auth::generate_key(Algorithm::Rs256).unwrap();
-    add("of a stranger's key", &[bearer(&rsa_token(stage, &stranger.private, "r1"))]);
-    add("of the right key by the wrong name", &[bearer(&rsa_token(stage, &stage.rsa.private, "k1"))]);
+    add(
+        "of a stranger's key",
+        &[bearer(&rsa_token(stage, &stranger.private, "r1"))],
+    );
+    add(
+        "of the right key by the wrong name",
+        &[bearer(&rsa_token(stage, &stage.rsa.private, "k1"))],
+    );
     let mut secret = [0_u8; 48];
     rand::fill(&mut secret).unwrap();
-    add("of a stranger's secret", &[bearer(&hmac_token(&header(), &good_claims(), &secret))]);
-    add("of an empty secret", &[bearer(&hmac_token(&header(), &good_claims(), b""))]);
+    add(
+        "of a stranger's secret",
+        &[bearer(&hmac_token(&header(), &good_claims(), &secret))],
+    );
+    add(
+        "of an empty secret",
+        &[bearer(&hmac_token(&header(), &good_claims(), b""))],
+    );
 
     // More rights than it was signed with.
     let viewer = hmac_token(&header(), &claims_with("roles", json!(["viewer"])), &stage.secret);
     let signature = viewer.rsplit('.').next().unwrap();
-    add("with other claims than were signed", &[bearer(&format!("{}.{}.{signature}", parts[0], parts[1]))]);
+    add(
+        "with other claims than were signed",
+        &[bearer(&format!("{}.{}.{signature}", parts[0], parts[1]))],
+    );
     let other = unsigned(&header_with("typ", json!("at+jwt")), &good_claims());
-    add("with another header than was signed", &[bearer(&format!("{other}.{}", parts[2]))]);
+    add(
+        "with another header than was signed",
+        &[bearer(&format!("{other}.{}", parts[2]))],
+    );
     all
 }
 
@@ -175,7 +221,14 @@ struct Reply {
     body: Value,
 }
 
-async fn send(rest: &Rest, at: SocketAddr, method: &Method, path: &str, authorization: &[String], body: Option<&Value>) -> Reply {
+async fn send(
+    rest: &Rest,
+    at: SocketAddr,
+    method: &Method,
+    path: &str,
+    authorization: &[String],
+    body: Option<&Value>,
+) -> Reply {
     let mut request = rest.http.request(method.clone(), format!("http://{at}{path}"));
     for value in authorization {
         request = request.header("authorization", value);
@@ -207,10 +260,16 @@ async fn stage() -> (Stage, Arc<Main>, Rest, String) {
     let at = main.at().rest;
     let made = json!({ "subject": "gone", "roles": ["admin"], "layer": null, "expires_in_s": 3600 });
     let made = rest.post(at, "/api/v1/tokens", &made).await;
-    let (id, token) = (made.body["id"].as_str().unwrap(), made.body["token"].as_str().unwrap().to_owned());
+    let (id, token) = (
+        made.body["id"].as_str().unwrap(),
+        made.body["token"].as_str().unwrap().to_owned(),
+    );
     let as_made = rest.with_token(&token);
     assert_eq!(as_made.get(at, "/api/v1/nodes").await.unwrap().status, 200);
-    let answer = rest.send(at, Method::DELETE, &format!("/api/v1/tokens/{id}"), &[], None).await.unwrap();
+    let answer = rest
+        .send(at, Method::DELETE, &format!("/api/v1/tokens/{id}"), &[], None)
+        .await
+        .unwrap();
     assert_eq!(answer.status, 204, "{}", answer.text);
     let begin = Instant::now();
     while as_made.get(at, "/api/v1/nodes").await.unwrap().status != 401 {
@@ -224,26 +283,47 @@ async fn no_bad_token_gets_through_any_route_with_any_method() {
     let (stage, main, rest, revoked) = stage().await;
     let (at, admin) = (main.at().rest, Rest::new(""));
     let served: Value = admin.get(at, "/openapi.json").await.unwrap().body;
-    assert_eq!(served, serde_json::from_str::<Value>(OPENAPI).unwrap(), "the list of routes is that of the service");
+    assert_eq!(
+        served,
+        serde_json::from_str::<Value>(OPENAPI).unwrap(),
+        "the list of routes is that of the service"
+    );
     let bad = bad(&stage, &revoked);
     let operations = operations();
     let mut paths: Vec<String> = operations.iter().map(Operation::target).collect();
     paths.sort_unstable();
     paths.dedup();
     // What is no route gives nothing away either.
-    paths.extend(["/api/", "/api/v1", "/api/v2/nodes", "/api/v1/nodes/", "/api/v1/metrics", "/api//v1"].map(str::to_owned));
+    paths.extend(
+        [
+            "/api/",
+            "/api/v1",
+            "/api/v2/nodes",
+            "/api/v1/nodes/",
+            "/api/v1/metrics",
+            "/api//v1",
+        ]
+        .map(str::to_owned),
+    );
     let mut asked = Vec::new();
     for path in &paths {
         for method in &ALL_METHODS {
-            let is_operation = operations.iter().any(|one| one.method == *method && one.target() == *path);
+            let is_operation = operations
+                .iter()
+                .any(|one| one.method == *method && one.target() == *path);
             let all = is_operation || blaze_tests::long();
             // Of the rest, the plainest will do.
-            let some = bad.iter().filter(|bad| all || ["none", "garbage", "expired"].contains(&bad.what.as_str()));
+            let some = bad
+                .iter()
+                .filter(|bad| all || ["none", "garbage", "expired"].contains(&bad.what.as_str()));
             asked.extend(some.map(|bad| (method, path, bad)));
         }
     }
     let expected = anonymous(send(&rest, at, &Method::GET, "/api/v1/nodes", &[], None).await.body);
-    assert_eq!((&expected["code"], &expected["status"]), (&json!("unauthenticated"), &json!(401)));
+    assert_eq!(
+        (&expected["code"], &expected["status"]),
+        (&json!("unauthenticated"), &json!(401))
+    );
     let count = asked.len();
     futures::stream::iter(asked)
         .for_each_concurrent(AT_ONCE, |(method, path, bad)| {
@@ -252,7 +332,11 @@ async fn no_bad_token_gets_through_any_route_with_any_method() {
                 let reply = send(rest, at, method, path, &bad.values, None).await;
                 let what = format!("{method} {path} with a token {}: {}", bad.what, reply.body);
                 assert_eq!(reply.status, 401, "{what}");
-                let challenge = if bad.values.is_empty() { "Bearer" } else { "Bearer error=\"invalid_token\"" };
+                let challenge = if bad.values.is_empty() {
+                    "Bearer"
+                } else {
+                    "Bearer error=\"invalid_token\""
+                };
                 assert_eq!(reply.headers["www-authenticate"], challenge, "{what}");
                 assert!(!reply.headers.contains_key("blaze-revision"), "{what}");
                 if *method != Method::HEAD {
@@ -261,20 +345,53 @@ async fn no_bad_token_gets_through_any_route_with_any_method() {
             }
         })
         .await;
-    println!("{count} requests over {} paths with {} bad tokens: 401", paths.len(), bad.len());
+    println!(
+        "{count} requests over {} paths with {} bad tokens: 401",
+        paths.len(),
+        bad.len()
+    );
 
     // Those that differ in nothing are taken: the ways above are what was refused.
-    let good = [hmac_token(&header(), &good_claims(), &stage.secret), rsa_token(&stage, &stage.rsa.private, "r1"), stage.admin_token()];
+    let good = [
+        hmac_token(&header(), &good_claims(), &stage.secret),
+        rsa_token(&stage, &stage.rsa.private, "r1"),
+        stage.admin_token(),
+    ];
     for token in good {
         for operation in &operations {
             let body = (operation.right != Right::Read).then(|| json!({}));
-            let reply = send(&rest, at, &operation.method, &operation.target(), &[bearer(&token)], body.as_ref()).await;
-            assert!(![401, 403].contains(&reply.status), "{operation:?}: {} {}", reply.status, reply.body);
+            let reply = send(
+                &rest,
+                at,
+                &operation.method,
+                &operation.target(),
+                &[bearer(&token)],
+                body.as_ref(),
+            )
+            .await;
+            assert!(
+                ![401, 403].contains(&reply.status),
+                "{operation:?}: {} {}",
+                reply.status,
+                reply.body
+            );
         }
     }
-    for path in ["/livez", "/readyz", "/version", "/openapi.json", "/openapi-3.0.json", "/docs", "/docs/errors/not_found"] {
+    for path in [
+        "/livez",
+        "/readyz",
+        "/version",
+        "/openapi.json",
+        "/openapi-3.0.json",
+        "/docs",
+        "/docs/errors/not_found",
+    ] {
         for bad in [Vec::new(), vec![bearer("garbage")]] {
-            assert_eq!(send(&rest, at, &Method::GET, path, &bad, None).await.status, 200, "{path} needs no token");
+            assert_eq!(
+                send(&rest, at, &Method::GET, path, &bad, None).await.status,
+                200,
+                "{path} needs no token"
+            );
         }
     }
 }
@@ -284,7 +401,10 @@ async fn no_bad_token_gets_through_any_method_of_grpc() {
     let (stage, main, _, revoked) = stage().await;
     let raw = Raw::new(main.at().grpc);
     let bad = bad(&stage, &revoked);
-    let mut paths: Vec<String> = methods().into_iter().map(|(name, _)| format!("/{SERVICE}/{name}")).collect();
+    let mut paths: Vec<String> = methods()
+        .into_iter()
+        .map(|(name, _)| format!("/{SERVICE}/{name}"))
+        .collect();
     let known = paths.len();
     paths.extend(["Nothing", "get"].map(|name| format!("/{SERVICE}/{name}")));
     let asked = paths.iter().flat_map(|path| bad.iter().map(move |bad| (path, bad)));
@@ -300,21 +420,35 @@ async fn no_bad_token_gets_through_any_method_of_grpc() {
         }
     });
     let mut messages: Vec<String> = answers.buffer_unordered(AT_ONCE).collect().await;
-    println!("{} calls of {} methods with {} bad tokens: UNAUTHENTICATED", messages.len(), paths.len(), bad.len());
+    println!(
+        "{} calls of {} methods with {} bad tokens: UNAUTHENTICATED",
+        messages.len(),
+        paths.len(),
+        bad.len()
+    );
     messages.sort_unstable();
     messages.dedup();
     assert_eq!(messages.len(), 1, "it says why: {messages:?}");
     for path in &paths[..known] {
         let status = raw.call(path, &[bearer(&stage.admin_token())], &[]).await;
-        assert!(![Code::Unauthenticated, Code::PermissionDenied].contains(&status.code()), "{path}: {status:?}");
+        assert!(
+            ![Code::Unauthenticated, Code::PermissionDenied].contains(&status.code()),
+            "{path}: {status:?}"
+        );
     }
     // Not served here, so nobody is let through; and what needs no token.
     let reflection = "/grpc.reflection.v1.ServerReflection/ServerReflectionInfo".to_owned();
     for path in other_methods().into_iter().chain([reflection]) {
         let status = raw.call(&path, &[], &[]).await;
-        assert!([Code::Unauthenticated, Code::Unimplemented].contains(&status.code()), "{path}: {status:?}");
+        assert!(
+            [Code::Unauthenticated, Code::Unimplemented].contains(&status.code()),
+            "{path}: {status:?}"
+        );
     }
-    assert_eq!(raw.call("/grpc.health.v1.Health/Check", &[], &[]).await.code(), Code::Ok);
+    assert_eq!(
+        raw.call("/grpc.health.v1.Health/Check", &[], &[]).await.code(),
+        Code::Ok
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -327,7 +461,13 @@ async fn no_role_has_more_rights_than_the_table_gives_it() {
         let layer = (role == "worker").then_some("edge");
         tokens.push((role.to_owned(), stage.token("somebody", role, layer), rights));
     }
-    for roles in [json!([]), json!(["root"]), json!(["Admin"]), json!(["admin", "root"]), json!(["root", "admin"])] {
+    for roles in [
+        json!([]),
+        json!(["root"]),
+        json!(["Admin"]),
+        json!(["admin", "root"]),
+        json!(["root", "admin"]),
+    ] {
         let token = hmac_token(&header(), &claims_with("roles", roles.clone()), &stage.secret);
         tokens.push((roles.to_string(), token, [false; 3]));
     }
@@ -340,11 +480,22 @@ async fn no_role_has_more_rights_than_the_table_gives_it() {
     for (who, token, rights) in &tokens {
         let authorization = [bearer(token)];
         for operation in operations() {
-            let reply = send(&rest, main.at().rest, &operation.method, &filled(&operation.path), &authorization, None).await;
+            let reply = send(
+                &rest,
+                main.at().rest,
+                &operation.method,
+                &filled(&operation.path),
+                &authorization,
+                None,
+            )
+            .await;
             let what = format!("{who}: {operation:?}: {} {}", reply.status, reply.body);
             if !may(*rights, operation.right) {
                 assert_eq!(reply.status, 403, "{what}");
-                assert!(operation.method == Method::HEAD || reply.body["code"] == "permission_denied", "{what}");
+                assert!(
+                    operation.method == Method::HEAD || reply.body["code"] == "permission_denied",
+                    "{what}"
+                );
                 refused += 1;
             } else if who != "worker" {
                 assert!(![401, 403].contains(&reply.status), "{what}");
@@ -356,10 +507,17 @@ async fn no_role_has_more_rights_than_the_table_gives_it() {
             let what = format!("{who}: {method}: {status:?}");
             if !may(*rights, right) {
                 assert_eq!(status.code(), Code::PermissionDenied, "{what}");
-                assert_eq!(status.get_details_error_info().unwrap().metadata["code"], "permission_denied", "{what}");
+                assert_eq!(
+                    status.get_details_error_info().unwrap().metadata["code"],
+                    "permission_denied",
+                    "{what}"
+                );
                 refused += 1;
             } else if who != "worker" {
-                assert!(![Code::Unauthenticated, Code::PermissionDenied].contains(&status.code()), "{what}");
+                assert!(
+                    ![Code::Unauthenticated, Code::PermissionDenied].contains(&status.code()),
+                    "{what}"
+                );
                 allowed += 1;
             }
         }
@@ -371,7 +529,12 @@ async fn no_role_has_more_rights_than_the_table_gives_it() {
     assert_eq!(revision, 0);
     within("refusals in the audit", Duration::from_secs(5), async {
         let is_refusal = |entry: &Value| entry["code"] == "permission_denied" && entry["revision"].is_null();
-        while !rest.pages(at, "/api/v1/audit?outcome=denied").await.iter().any(is_refusal) {}
+        while !rest
+            .pages(at, "/api/v1/audit?outcome=denied")
+            .await
+            .iter()
+            .any(is_refusal)
+        {}
     })
     .await;
 }

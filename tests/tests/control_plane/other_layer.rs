@@ -141,16 +141,31 @@ fn cases(made: u64) -> Vec<Case> {
     let leak = |text: String| -> &'static str { Box::leak(text.into_boxed_str()) };
     for other in others() {
         let (route, collection, spec) = (other.route, other.collection, &other.spec);
-        let (one, below) = (leak(format!("{route}/{{name}}")), |part: &str| leak(format!("{route}/{{name}}/{part}")));
-        let (patch, whole) = (json!({ "labels": { "a": "b" } }), json!({ "spec": spec, "labels": { "a": "b" } }));
+        let (one, below) = (leak(format!("{route}/{{name}}")), |part: &str| {
+            leak(format!("{route}/{{name}}/{part}"))
+        });
+        let (patch, whole) = (
+            json!({ "labels": { "a": "b" } }),
+            json!({ "spec": spec, "labels": { "a": "b" } }),
+        );
         for method in [Method::GET, Method::HEAD] {
             add(method, route, collection.to_owned(), None, Filtered);
         }
-        add(Method::POST, route, collection.to_owned(), Some(json!({ "name": "new", "spec": spec })), Refused);
+        add(
+            Method::POST,
+            route,
+            collection.to_owned(),
+            Some(json!({ "name": "new", "spec": spec })),
+            Refused,
+        );
         // What is there, and what is not: both are outside.
         for name in [other.name, "absent"] {
             let target = format!("{collection}/{name}");
-            for (method, query) in [(Method::GET, ""), (Method::HEAD, ""), (Method::GET, "?consistency=cached")] {
+            for (method, query) in [
+                (Method::GET, ""),
+                (Method::HEAD, ""),
+                (Method::GET, "?consistency=cached"),
+            ] {
                 add(method, one, format!("{target}{query}"), None, Refused);
             }
             add(Method::GET, one, format!("{target}?revision={made}"), None, Refused);
@@ -159,15 +174,36 @@ fn cases(made: u64) -> Vec<Case> {
             add(Method::DELETE, one, target.clone(), None, Refused);
             add(Method::DELETE, one, format!("{target}?cascade=true"), None, Refused);
             for method in [Method::GET, Method::HEAD] {
-                add(method.clone(), below("history"), format!("{target}/history?view=full"), None, Refused);
-                add(method, below("diff"), format!("{target}/diff?from={made}"), None, Refused);
+                add(
+                    method.clone(),
+                    below("history"),
+                    format!("{target}/history?view=full"),
+                    None,
+                    Refused,
+                );
+                add(
+                    method,
+                    below("diff"),
+                    format!("{target}/diff?from={made}"),
+                    None,
+                    Refused,
+                );
             }
-            add(Method::POST, below("rollback"), format!("{target}/rollback"), Some(json!({ "revision": made })), Refused);
+            add(
+                Method::POST,
+                below("rollback"),
+                format!("{target}/rollback"),
+                Some(json!({ "revision": made })),
+                Refused,
+            );
         }
     }
     for service in ["hidden", "absent"] {
         // A service that the layer must not see has no instances to list, and none are made.
-        let (route, target) = ("/api/v1/services/{service}/instances", format!("/api/v1/services/{service}/instances"));
+        let (route, target) = (
+            "/api/v1/services/{service}/instances",
+            format!("/api/v1/services/{service}/instances"),
+        );
         add(Method::GET, route, target.clone(), None, Refused);
         let own = json!({ "name": "new", "spec": { "layer": "edge" } });
         add(Method::POST, route, target, Some(own), Refused);
@@ -175,11 +211,23 @@ fn cases(made: u64) -> Vec<Case> {
     for name in ["to-fog", "absent"] {
         for word in ["promote", "abort"] {
             let route = leak(format!("/api/v1/rollouts/{{name}}/{word}"));
-            add(Method::POST, route, format!("/api/v1/rollouts/{name}/{word}"), Some(json!({})), Refused);
+            add(
+                Method::POST,
+                route,
+                format!("/api/v1/rollouts/{name}/{word}"),
+                Some(json!({})),
+                Refused,
+            );
         }
     }
     let everything = "/api/v1/services/-/instances";
-    add(Method::GET, "/api/v1/services/{service}/instances", everything.to_owned(), None, Filtered);
+    add(
+        Method::GET,
+        "/api/v1/services/{service}/instances",
+        everything.to_owned(),
+        None,
+        Filtered,
+    );
     let foreign = json!([
         { "kind": "Node", "name": "e1", "spec": { "layer": "edge", "config": { "b": 2 } } },
         { "kind": "Node", "name": "f1", "spec": { "layer": "fog" } },
@@ -190,11 +238,23 @@ fn cases(made: u64) -> Vec<Case> {
     let nowhere = json!([{ "kind": "Instance", "service": "both", "name": "e", "spec": {} }]);
     for body in [foreign, gone, shared, moved, nowhere] {
         for query in ["", "?dry_run=true"] {
-            add(Method::POST, "/api/v1/apply", format!("/api/v1/apply{query}"), Some(body.clone()), Refused);
+            add(
+                Method::POST,
+                "/api/v1/apply",
+                format!("/api/v1/apply{query}"),
+                Some(body.clone()),
+                Refused,
+            );
         }
     }
     let revert = json!({ "revision": made, "force": true });
-    add(Method::POST, "/api/v1/revert", "/api/v1/revert".to_owned(), Some(revert), Refused);
+    add(
+        Method::POST,
+        "/api/v1/revert",
+        "/api/v1/revert".to_owned(),
+        Some(revert),
+        Refused,
+    );
     for method in [Method::GET, Method::HEAD] {
         for (route, query) in [
             ("/api/v1/effective", "?node=f1"),
@@ -226,10 +286,28 @@ fn cases(made: u64) -> Vec<Case> {
     let token = json!({ "subject": "a", "roles": ["admin"], "layer": null, "expires_in_s": 60 });
     let own = json!({ "subject": "a", "roles": ["viewer"], "layer": "edge", "expires_in_s": 60 });
     for body in [token, own] {
-        add(Method::POST, "/api/v1/tokens", "/api/v1/tokens".to_owned(), Some(body), Refused);
+        add(
+            Method::POST,
+            "/api/v1/tokens",
+            "/api/v1/tokens".to_owned(),
+            Some(body),
+            Refused,
+        );
     }
-    add(Method::DELETE, "/api/v1/tokens/{id}", "/api/v1/tokens/absent".to_owned(), None, Refused);
-    add(Method::POST, "/api/v1/trim", "/api/v1/trim".to_owned(), Some(json!({ "before": 1 })), Refused);
+    add(
+        Method::DELETE,
+        "/api/v1/tokens/{id}",
+        "/api/v1/tokens/absent".to_owned(),
+        None,
+        Refused,
+    );
+    add(
+        Method::POST,
+        "/api/v1/trim",
+        "/api/v1/trim".to_owned(),
+        Some(json!({ "before": 1 })),
+        Refused,
+    );
     cases
 }
 
@@ -241,26 +319,48 @@ async fn a_token_of_one_layer_is_refused_on_every_route_to_another() {
     let cases = cases(world.made);
     let walked: BTreeSet<(String, &str)> = cases.iter().map(|case| (case.method.to_string(), case.route)).collect();
     let all = operations();
-    let routes: BTreeSet<(String, &str)> = all.iter().map(|one| (one.method.to_string(), one.path.as_str())).collect();
+    let routes: BTreeSet<(String, &str)> = all
+        .iter()
+        .map(|one| (one.method.to_string(), one.path.as_str()))
+        .collect();
     assert_eq!(walked, routes, "every operation is walked");
     let (mut refused, mut filtered) = (0, 0);
     for role in ["viewer", "operator", "admin", "worker"] {
         let rest = world.admin.with_token(&stage.token("bound", role, Some("edge")));
         for case in &cases {
-            let changes = [Method::PUT, Method::PATCH, Method::DELETE].contains(&case.method) && !case.target.contains("absent");
-            let headers: Vec<(&str, String)> = changes.then(|| ("if-match", "*".to_owned())).into_iter().collect();
-            let answer = rest.send(at, case.method.clone(), &case.target, &headers, case.body.as_ref()).await.unwrap();
+            // What is missing, and what stands there, must not show by a precondition either.
+            let changes = [Method::PUT, Method::PATCH, Method::DELETE].contains(&case.method);
+            if changes {
+                let any = [("if-match", "*".to_owned())];
+                let answer = rest
+                    .send(at, case.method.clone(), &case.target, &any, case.body.as_ref())
+                    .await
+                    .unwrap();
+                assert_eq!(answer.status, 403, "{role}: {case:?} with If-Match: {}", answer.text);
+            }
+            let answer = rest
+                .send(at, case.method.clone(), &case.target, &[], case.body.as_ref())
+                .await
+                .unwrap();
             let what = format!("{role}: {case:?}: {} {}", answer.status, answer.text);
             assert!(!answer.text.contains(MARK), "{what}");
             match case.expect {
                 Expect::Refused => {
                     assert_eq!(answer.status, 403, "{what}");
-                    assert!(case.method == Method::HEAD || answer.code() == "permission_denied", "{what}");
+                    assert!(
+                        case.method == Method::HEAD || answer.code() == "permission_denied",
+                        "{what}"
+                    );
                     refused += 1;
                 }
                 Expect::Filtered => {
                     assert_eq!(answer.status, 200, "{what}");
-                    assert!(["f1", "f2", "to-fog", "hidden"].iter().all(|name| !answer.text.contains(&format!("\"{name}\""))), "{what}");
+                    assert!(
+                        ["f1", "f2", "to-fog", "hidden"]
+                            .iter()
+                            .all(|name| !answer.text.contains(&format!("\"{name}\""))),
+                        "{what}"
+                    );
                     filtered += 1;
                 }
             }
@@ -290,12 +390,27 @@ async fn own_layer(stage: &Stage, world: &World) {
         let answer = rest.get(at, target).await.unwrap();
         assert_eq!(answer.status, 200, "{target}: {}", answer.text);
     }
-    let names = |items: Vec<Value>| items.iter().map(|item| item["name"].as_str().unwrap().to_owned()).collect::<Vec<_>>();
+    let names = |items: Vec<Value>| {
+        items
+            .iter()
+            .map(|item| item["name"].as_str().unwrap().to_owned())
+            .collect::<Vec<_>>()
+    };
     assert_eq!(names(rest.list(at, "nodes").await.1), ["e1"]);
     assert_eq!(names(rest.list(at, "services/-/instances").await.1), ["anywhere", "e"]);
     assert_eq!(names(rest.list(at, "rollouts").await.1), ["to-edge"]);
-    rest.put(at, "/api/v1/nodes/e1", &json!({ "spec": { "layer": "edge", "config": { "own": true } } })).await;
-    rest.post(at, "/api/v1/nodes", &json!({ "name": "e2", "spec": { "layer": "edge" } })).await;
+    rest.put(
+        at,
+        "/api/v1/nodes/e1",
+        &json!({ "spec": { "layer": "edge", "config": { "own": true } } }),
+    )
+    .await;
+    rest.post(
+        at,
+        "/api/v1/nodes",
+        &json!({ "name": "e2", "spec": { "layer": "edge" } }),
+    )
+    .await;
     rest.post(at, "/api/v1/rollouts/to-edge/abort", &json!({})).await;
 }
 
@@ -309,7 +424,11 @@ async fn a_token_of_one_layer_is_refused_by_every_method_to_another() {
     // These leave out what is outside, and have no way to name it.
     let filtered = ["GetTopology", "ListWorkers", "List"];
     let all = methods();
-    let names: BTreeSet<&str> = all.iter().map(|(name, _)| name.as_str()).filter(|name| !filtered.contains(name)).collect();
+    let names: BTreeSet<&str> = all
+        .iter()
+        .map(|(name, _)| name.as_str())
+        .filter(|name| !filtered.contains(name))
+        .collect();
     assert_eq!(walked, names, "every method is walked");
     for role in ["viewer", "operator", "admin", "worker"] {
         let authorization = [format!("Bearer {}", stage.token("bound", role, Some("edge")))];
@@ -320,7 +439,13 @@ async fn a_token_of_one_layer_is_refused_by_every_method_to_another() {
     }
     let client = Client::new(Via::Grpc, &world.main, &stage.token("bound", "viewer", Some("edge")));
     let mut grpc = client.grpc().await.unwrap();
-    for kind in [v1::Kind::Layer, v1::Kind::Node, v1::Kind::Service, v1::Kind::Instance, v1::Kind::Rollout] {
+    for kind in [
+        v1::Kind::Layer,
+        v1::Kind::Node,
+        v1::Kind::Service,
+        v1::Kind::Instance,
+        v1::Kind::Rollout,
+    ] {
         let request = v1::ListRequest {
             kind: kind.into(),
             ..v1::ListRequest::default()
@@ -329,9 +454,19 @@ async fn a_token_of_one_layer_is_refused_by_every_method_to_another() {
         assert!(!list.items.is_empty(), "{kind:?}");
         assert!(!format!("{list:?}").contains(MARK), "{list:?}");
     }
-    let topology = grpc.get_topology(client.signed(v1::GetTopologyRequest {})).await.unwrap().into_inner().json;
-    assert!(topology.contains("\"e1\"") && !topology.contains("\"f1\""), "{topology}");
-    grpc.list_workers(client.signed(v1::ListWorkersRequest {})).await.unwrap();
+    let topology = grpc
+        .get_topology(client.signed(v1::GetTopologyRequest {}))
+        .await
+        .unwrap()
+        .into_inner()
+        .json;
+    assert!(
+        topology.contains("\"e1\"") && !topology.contains("\"f1\""),
+        "{topology}"
+    );
+    grpc.list_workers(client.signed(v1::ListWorkersRequest {}))
+        .await
+        .unwrap();
     let at = world.main.at().rest;
     assert_eq!(world.admin.list(at, "nodes").await.0, world.now, "nothing was written");
 }
@@ -392,7 +527,10 @@ fn messages(made: u64) -> Vec<(&'static str, Vec<u8>)> {
             cascade: true,
         };
         let apply = v1::ApplyRequest {
-            items: vec![v1::ApplyItem { document, delete: false }],
+            items: vec![v1::ApplyItem {
+                document,
+                delete: false,
+            }],
             ..v1::ApplyRequest::default()
         };
         let history = v1::ListHistoryRequest {
@@ -470,7 +608,13 @@ fn messages(made: u64) -> Vec<(&'static str, Vec<u8>)> {
         ("GetDigest", v1::GetDigestRequest { layer: fog() }.encode_to_vec()),
         ("Revert", revert.encode_to_vec()),
         ("CreateToken", token.encode_to_vec()),
-        ("RevokeToken", v1::RevokeTokenRequest { id: "absent".to_owned() }.encode_to_vec()),
+        (
+            "RevokeToken",
+            v1::RevokeTokenRequest {
+                id: "absent".to_owned(),
+            }
+            .encode_to_vec(),
+        ),
         ("ListTokens", Vec::new()),
         ("ListAudit", Vec::new()),
         ("Trim", v1::TrimRequest { before: 1 }.encode_to_vec()),
@@ -488,24 +632,43 @@ async fn a_watch_of_one_layer_tells_nothing_of_another() {
     let mut streams = Vec::new();
     for via in [Via::Rest, Via::Grpc] {
         let client = Client::new(via, &main, &token);
-        streams.push(Stream::open(&client, 0).await.unwrap_or_else(|refused| panic!("{refused:?}")));
+        streams.push(
+            Stream::open(&client, 0)
+                .await
+                .unwrap_or_else(|refused| panic!("{refused:?}")),
+        );
     }
     let put = async |path: &str, spec: Value| admin.put(at, path, &json!({ "spec": spec })).await.revision.unwrap();
     let instance = "/api/v1/services/both/instances/f";
-    put("/api/v1/nodes/f2", json!({ "layer": "fog", "config": { "mark": MARK, "n": 1 } })).await;
+    put(
+        "/api/v1/nodes/f2",
+        json!({ "layer": "fog", "config": { "mark": MARK, "n": 1 } }),
+    )
+    .await;
     let comes = put(instance, json!({ "node": "e1", "config": { "here": true } })).await;
-    put("/api/v1/services/hidden", json!({ "layers": ["fog"], "config": { "mark": MARK, "n": 2 } })).await;
+    put(
+        "/api/v1/services/hidden",
+        json!({ "layers": ["fog"], "config": { "mark": MARK, "n": 2 } }),
+    )
+    .await;
     let changes = put(instance, json!({ "node": "e1", "config": { "here": 2 } })).await;
     let leaves = put(instance, json!({ "node": "f1", "config": { "mark": MARK } })).await;
     put(instance, json!({ "node": "f1", "config": { "mark": MARK, "n": 3 } })).await;
-    let last = put("/api/v1/nodes/e1", json!({ "layer": "edge", "config": { "last": true } })).await;
+    let last = put(
+        "/api/v1/nodes/e1",
+        json!({ "layer": "edge", "config": { "last": true } }),
+    )
+    .await;
     for mut stream in streams {
         let told = within("the watch", Duration::from_secs(30), stream.until(last)).await;
         let commits = told.unwrap_or_else(|other: Next| panic!("{other:?}"));
         assert!(!format!("{commits:?}").contains(MARK), "{commits:?}");
         let mut previous = 0;
         for commit in &commits {
-            assert!(commit.previous.is_none_or(|found| found == previous), "{commit:?} after {previous}");
+            assert!(
+                commit.previous.is_none_or(|found| found == previous),
+                "{commit:?} after {previous}"
+            );
             previous = commit.revision;
         }
         let of_begin: BTreeSet<&str> = commits
@@ -514,7 +677,10 @@ async fn a_watch_of_one_layer_tells_nothing_of_another() {
             .flat_map(|commit| &commit.changes)
             .map(|change| change.name.as_str())
             .collect();
-        assert_eq!(of_begin, BTreeSet::from(["anywhere", "both", "e", "e1", "edge", "to-edge"]));
+        assert_eq!(
+            of_begin,
+            BTreeSet::from(["anywhere", "both", "e", "e1", "edge", "to-edge"])
+        );
         let later = commits.iter().filter(|commit| commit.revision > now);
         let later: Vec<(u64, Op, &str, &Value)> = later
             .map(|commit| {

@@ -25,7 +25,9 @@ impl Raw {
         frame.extend(u32::try_from(message.len()).unwrap().to_be_bytes());
         frame.extend(message);
         let mut request = self.http.post(format!("http://{}{path}", self.at)).body(frame);
-        request = request.header("content-type", "application/grpc").header("te", "trailers");
+        request = request
+            .header("content-type", "application/grpc")
+            .header("te", "trailers");
         for value in authorization {
             request = request.header("authorization", value);
         }

@@ -26,7 +26,10 @@ struct World {
 impl World {
     async fn trim(&self, floor: u64) {
         let body = json!({ "before": floor + 1 });
-        let answer = self.clients[0].rest.post(self.main.at().rest, "/api/v1/trim", &body).await;
+        let answer = self.clients[0]
+            .rest
+            .post(self.main.at().rest, "/api/v1/trim", &body)
+            .await;
         assert_eq!(answer.body["oldest_revision"], floor);
     }
 
@@ -59,7 +62,10 @@ impl World {
             }
             Err(refused) => {
                 assert_eq!(refused.code, "revision_trimmed", "{since}");
-                assert!(refused.oldest_revision.is_none_or(|oldest| oldest > since), "{since}: {refused:?}");
+                assert!(
+                    refused.oldest_revision.is_none_or(|oldest| oldest > since),
+                    "{since}: {refused:?}"
+                );
                 false
             }
         }
@@ -69,7 +75,10 @@ impl World {
         let skipped = usize::try_from(since).unwrap();
         assert_eq!(commits.len(), self.history.len() - skipped, "{since}");
         for (found, expected) in commits.into_iter().zip(&self.history[skipped..]) {
-            assert!(found.previous.is_none_or(|previous| previous == expected.revision - 1), "{since}: {found:?}");
+            assert!(
+                found.previous.is_none_or(|previous| previous == expected.revision - 1),
+                "{since}: {found:?}"
+            );
             let found = Commit {
                 previous: None,
                 ..found
@@ -83,7 +92,9 @@ impl World {
 async fn world(stage: &Stage, commits: usize) -> World {
     let main = stage.start("main");
     let client = Client::new(Via::Rest, &main, &stage.admin_token());
-    let mut stream = Stream::open(&client, 0).await.unwrap_or_else(|refused| panic!("{refused:?}"));
+    let mut stream = Stream::open(&client, 0)
+        .await
+        .unwrap_or_else(|refused| panic!("{refused:?}"));
     let mut writer = Writer::new(client.at(Via::Grpc, &main), "w", 3, 0);
     let mut history = Vec::new();
     for revision in 1..=commits as u64 {
@@ -151,6 +162,9 @@ async fn while_the_trim_point_moves_a_resume_is_exact_or_410() {
             raced[usize::from(is_exact)] += 1;
         }
     }
-    println!("{exact} exact, {gone} times 410, at the moving point itself {} exact and {} times 410", raced[1], raced[0]);
+    println!(
+        "{exact} exact, {gone} times 410, at the moving point itself {} exact and {} times 410",
+        raced[1], raced[0]
+    );
     assert!(exact > 0 && gone > 0 && raced[0] + raced[1] > 0);
 }

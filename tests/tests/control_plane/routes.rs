@@ -26,10 +26,27 @@ pub(crate) const ROLES: [(&str, [bool; 3]); 4] = [
 ];
 
 /// Methods of gRPC that change documents; those of administrators alone; all others read.
-const WRITES: [&str; 8] = ["Create", "Replace", "Patch", "Delete", "Apply", "Rollback", "SetRollout", "Revert"];
+const WRITES: [&str; 8] = [
+    "Create",
+    "Replace",
+    "Patch",
+    "Delete",
+    "Apply",
+    "Rollback",
+    "SetRollout",
+    "Revert",
+];
 const ADMIN: [&str; 5] = ["ListAudit", "CreateToken", "RevokeToken", "ListTokens", "Trim"];
 const READS: [&str; 9] = [
-    "List", "Get", "GetEffective", "ListHistory", "Diff", "Watch", "GetTopology", "ListWorkers", "GetDigest",
+    "List",
+    "Get",
+    "GetEffective",
+    "ListHistory",
+    "Diff",
+    "Watch",
+    "GetTopology",
+    "ListWorkers",
+    "GetDigest",
 ];
 
 /// One operation of REST.
@@ -43,7 +60,9 @@ pub(crate) struct Operation {
 
 impl Operation {
     fn new(method: Method, path: &str) -> Self {
-        let administers = ["/audit", "/tokens", "/trim"].iter().any(|part| path.starts_with(&format!("/api/v1{part}")));
+        let administers = ["/audit", "/tokens", "/trim"]
+            .iter()
+            .any(|part| path.starts_with(&format!("/api/v1{part}")));
         let right = match (administers, method == Method::GET || method == Method::HEAD) {
             (true, _) => Right::Admin,
             (false, true) => Right::Read,
@@ -64,7 +83,9 @@ impl Operation {
 
 /// A path with names of nothing in place of its placeholders.
 pub(crate) fn filled(path: &str) -> String {
-    path.replace("{name}", "none").replace("{service}", "none").replace("{id}", "0197c1d2-7f3a-7b64-9c1e-2f6f0a4e8d11")
+    path.replace("{name}", "none")
+        .replace("{service}", "none")
+        .replace("{id}", "0197c1d2-7f3a-7b64-9c1e-2f6f0a4e8d11")
 }
 
 /// All operations below `/api`, `HEAD` with each `GET`.
@@ -74,9 +95,14 @@ pub(crate) fn operations() -> Vec<Operation> {
     for (path, item) in document["paths"].as_object().unwrap() {
         assert!(path.starts_with("/api/v1/"), "{path} has no token");
         for name in item.as_object().unwrap().keys() {
-            let Ok(method) = name.to_ascii_uppercase().parse::<Method>() else { continue };
+            let Ok(method) = name.to_ascii_uppercase().parse::<Method>() else {
+                continue;
+            };
             if !["get", "put", "post", "patch", "delete"].contains(&name.as_str()) {
-                assert!(["parameters", "summary", "description"].contains(&name.as_str()), "{name} of {path}");
+                assert!(
+                    ["parameters", "summary", "description"].contains(&name.as_str()),
+                    "{name} of {path}"
+                );
                 continue;
             }
             if method == Method::GET {
@@ -95,7 +121,12 @@ fn descriptors() -> Vec<(String, String)> {
     for file in &set.file {
         for service in &file.service {
             let full = format!("{}.{}", file.package(), service.name());
-            methods.extend(service.method.iter().map(|method| (full.clone(), method.name().to_owned())));
+            methods.extend(
+                service
+                    .method
+                    .iter()
+                    .map(|method| (full.clone(), method.name().to_owned())),
+            );
         }
     }
     methods
@@ -103,7 +134,10 @@ fn descriptors() -> Vec<(String, String)> {
 
 /// The methods of [`SERVICE`], with the right that each needs. A method that nobody has given a right is a fault.
 pub(crate) fn methods() -> Vec<(String, Right)> {
-    let names = descriptors().into_iter().filter(|(service, _)| service == SERVICE).map(|(_, name)| name);
+    let names = descriptors()
+        .into_iter()
+        .filter(|(service, _)| service == SERVICE)
+        .map(|(_, name)| name);
     let right = |name: &str| match name {
         name if WRITES.contains(&name) => Right::Write,
         name if ADMIN.contains(&name) => Right::Admin,

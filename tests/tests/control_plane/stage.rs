@@ -213,7 +213,10 @@ impl Main {
     /// What it printed on stdout since its last start.
     pub(crate) fn printed(&self) -> String {
         let process = self.process.lock();
-        process.as_ref().map(|process| process.stdout().join("\n")).unwrap_or_default()
+        process
+            .as_ref()
+            .map(|process| process.stdout().join("\n"))
+            .unwrap_or_default()
     }
 
     /// Resident memory in bytes.

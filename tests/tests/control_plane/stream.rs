@@ -122,7 +122,11 @@ impl Stream {
         loop {
             match self.next().await {
                 Next::Commit(commit) => {
-                    assert!(commit.revision <= revision, "{} comes and {revision} did not", commit.revision);
+                    assert!(
+                        commit.revision <= revision,
+                        "{} comes and {revision} did not",
+                        commit.revision
+                    );
                     let is_last = commit.revision == revision;
                     commits.push(commit);
                     if is_last {

@@ -112,7 +112,12 @@ async fn each_is_told_everything_once_while_it_is_cut_and_the_history_is_trimmed
     }
     let sum = |one: fn(&Tally) -> usize| seen.iter().map(|watcher| one(&watcher.tally)).sum::<usize>();
     let gone = sum(|tally| tally.lists) - seen.len();
-    println!("{} commits told, {} cuts, {gone} times 410, {} times too slow", sum(|t| t.commits), sum(|t| t.cuts), sum(|t| t.slow));
+    println!(
+        "{} commits told, {} cuts, {gone} times 410, {} times too slow",
+        sum(|t| t.commits),
+        sum(|t| t.cuts),
+        sum(|t| t.slow)
+    );
     assert_eq!(sum(|tally| tally.cuts), watchers * cuts);
     assert!(trims > 0 && gone > 0, "the history was trimmed, and some came too late");
 }
@@ -160,7 +165,9 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
     let mut standing = Vec::new();
     for (via, client) in [(Via::Rest, narrow(&client)), (Via::Grpc, client.clone())] {
         let client = client.at(via, &mains[0]);
-        let mut stream = Stream::open(&client, first).await.unwrap_or_else(|refused| panic!("{refused:?}"));
+        let mut stream = Stream::open(&client, first)
+            .await
+            .unwrap_or_else(|refused| panic!("{refused:?}"));
         // The second one says that it has caught up.
         for _ in 0..2 {
             assert_eq!(stream.next().await, Next::Bookmark(first));
@@ -218,11 +225,18 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
     let seen = within("the watchers", limit, following.join_all()).await;
     let stood = begin.elapsed();
     for (client, stream) in standing {
-        within("the end of who stands still", limit, ended(&client, stream, first, last)).await;
+        within(
+            "the end of who stands still",
+            limit,
+            ended(&client, stream, first, last),
+        )
+        .await;
     }
 
     let slow: usize = seen.iter().map(|watcher| watcher.tally.slow).sum();
-    let delay = Duration::from_micros(p99(seen.iter().flat_map(|watcher| watcher.tally.delays.iter().copied())));
+    let delay = Duration::from_micros(p99(seen
+        .iter()
+        .flat_map(|watcher| watcher.tally.delays.iter().copied())));
     let grown = most.saturating_sub(before) / 1024 / 1024;
     println!(
         "{} commits in {stood:?} to {watchers} watchers: p99 {delay:?}, {slow} times too slow; RSS {} MiB, at most {grown} MiB more",
@@ -246,7 +260,12 @@ fn narrow(client: &Client) -> Client {
 async fn all_open(mains: &[Arc<Main>; 2], watchers: usize) {
     let admins = mains.clone().map(|main| main.admin());
     blocking(move || {
-        let open = || admins.iter().filter_map(|admin| admin.metric("blaze_config_watchers", &[])).sum::<f64>();
+        let open = || {
+            admins
+                .iter()
+                .filter_map(|admin| admin.metric("blaze_config_watchers", &[]))
+                .sum::<f64>()
+        };
         wait::until(
             "all watches",
             Duration::from_secs(60),
@@ -275,7 +294,9 @@ async fn ended(client: &Client, mut stream: Stream, first: u64, last: u64) {
     println!("{:?} got {} of {} commits", client.via, cursor - first, last - first);
     assert_eq!(code, "watch_too_slow");
     assert!(cursor + (MAX_BEHIND as u64) < last, "it was not behind");
-    let mut stream = Stream::resume(client, cursor).await.unwrap_or_else(|refused| panic!("{refused:?}"));
+    let mut stream = Stream::resume(client, cursor)
+        .await
+        .unwrap_or_else(|refused| panic!("{refused:?}"));
     let rest: Vec<Commit> = stream.until(last).await.unwrap_or_else(|other| panic!("{other:?}"));
     let revisions: Vec<u64> = rest.iter().map(|commit| commit.revision).collect();
     assert_eq!(revisions, (cursor + 1..=last).collect::<Vec<u64>>());

@@ -87,10 +87,10 @@ impl Watcher {
             while plan.cuts.pop_if(|cut| *cut <= self.cursor).is_some() {
                 self.cut().await;
                 if self.tally.cuts.is_multiple_of(plan.late) {
-                    let trimmed = plan.floor.wait_for(|floor| *floor > self.cursor);
+                    let cursor = self.cursor;
                     tokio::select! {
-                        result = trimmed => drop(result),
-                        result = plan.end.wait_for(Option::is_some) => drop(result),
+                        () = reaches(&mut plan.floor, |floor| *floor > cursor) => {}
+                        () = reaches(&mut plan.end, Option::is_some) => {}
                     }
                 }
                 self.open().await;
@@ -179,7 +179,11 @@ impl Watcher {
                 Err(refused) => {
                     assert_eq!(refused.code, "revision_trimmed", "{refused:?}");
                     let oldest = refused.oldest_revision.unwrap();
-                    assert!(oldest > self.cursor, "{} would do, {oldest} is said to be the oldest", self.cursor);
+                    assert!(
+                        oldest > self.cursor,
+                        "{} would do, {oldest} is said to be the oldest",
+                        self.cursor
+                    );
                     self.list().await;
                 }
             }
@@ -190,7 +194,11 @@ impl Watcher {
     async fn list(&mut self) {
         let client = self.client();
         let (revision, items) = client.rest.list(client.main.at().rest, "services").await;
-        assert!(revision >= self.cursor, "a list of {revision} after a commit of {}", self.cursor);
+        assert!(
+            revision >= self.cursor,
+            "a list of {revision} after a commit of {}",
+            self.cursor
+        );
         self.state = state_of(&items);
         self.cursor = revision;
         self.tally.lists += 1;
@@ -199,7 +207,10 @@ impl Watcher {
     fn take(&mut self, commit: &Commit) {
         let revision = commit.revision;
         assert_eq!(revision, self.cursor + 1, "{:?}", self.client().main);
-        assert!(commit.previous.is_none_or(|previous| previous == self.cursor), "{commit:?}");
+        assert!(
+            commit.previous.is_none_or(|previous| previous == self.cursor),
+            "{commit:?}"
+        );
         for change in &commit.changes {
             self.take_one(commit, change);
         }
@@ -220,24 +231,42 @@ impl Watcher {
         assert_eq!(change.kind, "Service", "{revision}");
         if change.op == Op::Delete {
             let last = self.state.remove(name);
-            assert_eq!(last, Some((change.revision, change.config.clone())), "{revision} deletes {name}");
+            assert_eq!(
+                last,
+                Some((change.revision, change.config.clone())),
+                "{revision} deletes {name}"
+            );
             assert_eq!(commit.changes.len(), 1);
             return;
         }
         assert_eq!(change.revision, revision);
-        assert_eq!(change.config["batch"], commit.changes[0].config["batch"], "{revision} is of several writes");
+        assert_eq!(
+            change.config["batch"], commit.changes[0].config["batch"],
+            "{revision} is of several writes"
+        );
         let before = self.state.insert(name.clone(), (revision, change.config.clone()));
         let op = if before.is_some() { Op::Update } else { Op::Create };
         assert_eq!(change.op, op, "{revision} {name}");
-        assert!(before.is_none_or(|(before, _)| before < revision), "{revision} holds {name} twice");
+        assert!(
+            before.is_none_or(|(before, _)| before < revision),
+            "{revision} holds {name} twice"
+        );
     }
+}
+
+/// Waits until a value holds, or nobody sets it any more.
+async fn reaches<T>(receiver: &mut watch::Receiver<T>, holds: impl FnMut(&T) -> bool) {
+    let _ = receiver.wait_for(holds).await;
 }
 
 /// What a list shows.
 pub(crate) fn state_of(items: &[Value]) -> State {
     let one = |item: &Value| {
         let name = item["name"].as_str().unwrap().to_owned();
-        (name, (item["revision"].as_u64().unwrap(), item["spec"]["config"].clone()))
+        (
+            name,
+            (item["revision"].as_u64().unwrap(), item["spec"]["config"].clone()),
+        )
     };
     items.iter().map(one).collect()
 }

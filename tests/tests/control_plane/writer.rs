@@ -12,6 +12,15 @@ use super::stage::micros;
 /// How often a write is tried that was refused without a fault of its own: the other process was first again and again.
 const TRIES: usize = 20;
 
+/// One commit, which may be tried several times.
+#[derive(Clone, Copy)]
+enum Write<'a> {
+    Apply(&'a [(String, Value)]),
+    Put(&'a str, &'a Value, Must),
+    /// With the revision that it has.
+    Delete(&'a str, u64),
+}
+
 /// A writer. Nobody else changes its services.
 pub(crate) struct Writer {
     client: Client,
@@ -27,7 +36,9 @@ pub(crate) struct Writer {
 impl Writer {
     /// Of so many services, each with so many bytes of padding.
     pub(crate) fn new(client: Client, name: &str, documents: usize, padding: usize) -> Self {
-        let seed = name.bytes().fold(7, |seed: u64, byte| seed.wrapping_mul(31) + u64::from(byte));
+        let seed = name
+            .bytes()
+            .fold(7, |seed: u64, byte| seed.wrapping_mul(31) + u64::from(byte));
         Self {
             client,
             name: name.to_owned(),
@@ -51,8 +62,10 @@ impl Writer {
     /// All services in one commit.
     pub(crate) async fn put_all(&mut self) -> u64 {
         let config = self.config(self.documents);
-        let documents: Vec<(String, Value)> = (0..self.documents).map(|index| (self.service(index), config.clone())).collect();
-        let revision = self.insist(async |client| client.apply(&documents).await).await;
+        let documents: Vec<(String, Value)> = (0..self.documents)
+            .map(|index| (self.service(index), config.clone()))
+            .collect();
+        let revision = self.insist(Write::Apply(&documents)).await;
         self.there = documents.into_iter().map(|(name, _)| (name, revision)).collect();
         revision
     }
@@ -61,8 +74,11 @@ impl Writer {
     pub(crate) async fn put_one(&mut self) -> u64 {
         let index = self.random.random_range(0..self.documents);
         let (name, config) = (self.service(index), self.config(1));
-        let must = self.there.get(&name).map_or(Must::BeAbsent, |revision| Must::HaveRevision(*revision));
-        let revision = self.insist(async |client| client.put(&name, &config, must).await).await;
+        let must = self
+            .there
+            .get(&name)
+            .map_or(Must::BeAbsent, |revision| Must::HaveRevision(*revision));
+        let revision = self.insist(Write::Put(&name, &config, must)).await;
         self.there.insert(name, revision);
         revision
     }
@@ -71,20 +87,28 @@ impl Writer {
         let Some((name, seen)) = self.there.pop_first() else {
             return self.put_one().await;
         };
-        self.insist(async |client| client.delete(&name, Must::HaveRevision(seen)).await).await
+        self.insist(Write::Delete(&name, seen)).await
     }
 
-    async fn insist(&self, write: impl AsyncFn(&Client) -> Told) -> u64 {
-        let mut told = write(&self.client).await;
+    async fn insist(&self, write: Write<'_>) -> u64 {
+        let mut told = self.send(write).await;
         for _ in 1..TRIES {
             match told {
-                Told::No(_) => told = write(&self.client).await,
+                Told::No(_) => told = self.send(write).await,
                 Told::Yes(_) | Told::Refused(_) | Told::Unknown(_) => break,
             }
         }
         match told {
             Told::Yes(revision) => revision,
             other => panic!("{} at {:?}: {other:?}", self.name, self.client.main),
+        }
+    }
+
+    async fn send(&self, write: Write<'_>) -> Told {
+        match write {
+            Write::Apply(documents) => self.client.apply(documents).await,
+            Write::Put(name, config, must) => self.client.put(name, config, must).await,
+            Write::Delete(name, seen) => self.client.delete(name, Must::HaveRevision(seen)).await,
         }
     }
 

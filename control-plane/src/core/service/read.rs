@@ -224,8 +224,9 @@ impl ConfigService {
         };
         if let (Some(service), Some(Kind::Instance)) = (&query.service, query.kind) {
             let key = Key::service(service);
+            // A service outside the view is refused like one that does not exist.
+            view(&caller.claims).check_key(&state, &key)?;
             if state.get(&key).is_none() && position.is_none() {
-                view(&caller.claims).check_key(&state, &key)?;
                 return Err(not_found(&key, &state));
             }
         }

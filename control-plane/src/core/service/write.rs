@@ -68,17 +68,26 @@ fn internal(what: &str) -> Problem {
 
 impl ConfigService {
     /// A bound token gets 403 for what is outside its view, before anything else is looked at.
-    fn check_view(&self, caller: &Caller, key: &Key) -> Result<(), Problem> {
-        let view = view(&caller.claims);
-        if view.layer().is_some() && self.state().get(key).is_some() {
-            view.check_key(&self.state(), key)?;
-        }
-        Ok(())
+    async fn check_view(&self, caller: &Caller, key: &Key) -> Result<(), Problem> {
+        self.check_view_of(caller, key, false).await
     }
 
-    /// The same, for what must exist.
-    fn check_view_of_existing(&self, caller: &Caller, key: &Key) -> Result<(), Problem> {
-        view(&caller.claims).check_key(&self.state(), key)
+    /// The same, for what must exist: what does not exist is outside of every layer.
+    async fn check_view_of_existing(&self, caller: &Caller, key: &Key) -> Result<(), Problem> {
+        self.check_view_of(caller, key, true).await
+    }
+
+    async fn check_view_of(&self, caller: &Caller, key: &Key, must_exist: bool) -> Result<(), Problem> {
+        let view = view(&caller.claims);
+        if view.layer().is_none() {
+            return Ok(());
+        }
+        // Another process may just have made it.
+        let state = self.read_state(&ReadOptions::default()).await?;
+        if must_exist || state.get(key).is_some() {
+            view.check_key(&state, key)?;
+        }
+        Ok(())
     }
 
     async fn submit(
@@ -172,7 +181,7 @@ impl ConfigService {
         idempotency: Option<Idempotency>,
     ) -> Result<Answer<Written>, Problem> {
         self.authorize(&caller.claims, Right::Write)?;
-        self.check_view(caller, &input.key)?;
+        self.check_view(caller, &input.key).await?;
         let bytes = input.spec.to_string().len();
         let item = item(input.key.clone(), Content::Write(input), Precondition::None);
         let action = if item.key.kind() == Kind::Rollout {
@@ -195,7 +204,10 @@ impl ConfigService {
         precondition: Precondition,
     ) -> Result<Answer<Written>, Problem> {
         self.authorize(&caller.claims, Right::Write)?;
-        self.check_view(caller, &input.key)?;
+        match precondition {
+            Precondition::Revisions(_) | Precondition::Any => self.check_view_of_existing(caller, &input.key).await?,
+            Precondition::None | Precondition::Absent => self.check_view(caller, &input.key).await?,
+        }
         let bytes = input.spec.to_string().len();
         let item = item(input.key.clone(), Content::Write(input), precondition);
         self.write_one(request(caller, "update", Form::Single, vec![item]), None, bytes)
@@ -214,7 +226,7 @@ impl ConfigService {
         precondition: Precondition,
     ) -> Result<Answer<Written>, Problem> {
         self.authorize(&caller.claims, Right::Write)?;
-        self.check_view_of_existing(caller, key)?;
+        self.check_view_of_existing(caller, key).await?;
         let bytes = merge_patch.to_string().len();
         let item = item(key.clone(), Content::Patch(merge_patch), precondition);
         self.write_one(request(caller, "patch", Form::Single, vec![item]), None, bytes)
@@ -233,7 +245,7 @@ impl ConfigService {
         cascade: bool,
     ) -> Result<Answer<()>, Problem> {
         self.authorize(&caller.claims, Right::Write)?;
-        self.check_view_of_existing(caller, key)?;
+        self.check_view_of_existing(caller, key).await?;
         let item = item(key.clone(), Content::Delete, precondition);
         let mut request = request(caller, "delete", Form::Single, vec![item]);
         request.cascade = cascade;
@@ -329,7 +341,7 @@ impl ConfigService {
     ) -> Result<Answer<Written>, Problem> {
         self.authorize(&caller.claims, Right::Write)?;
         let state = self.read_state(&ReadOptions::default()).await?;
-        self.check_view_of_existing(caller, key)?;
+        self.check_view_of_existing(caller, key).await?;
         let version = match self.version_at(&state, key, revision).await {
             Err(problem) if problem.code == Code::RevisionUnknown => {
                 let detail = format!(
@@ -436,7 +448,7 @@ impl ConfigService {
     ) -> Result<Answer<Written>, Problem> {
         self.authorize(&caller.claims, Right::Write)?;
         let key = Key::rollout(name.clone());
-        self.check_view_of_existing(caller, &key)?;
+        self.check_view_of_existing(caller, &key).await?;
         let item = item(key, content, Precondition::None);
         self.write_one(request(caller, action, Form::Single, vec![item]), idempotency, 0)
             .await

@@ -213,7 +213,9 @@ fn request_body(payload: Payload) -> Option<RequestBody> {
                             anchors, aliases or tags.";
                 ContentBuilder::new()
                     .schema(Some(refer_or_null("ApplyItem", said)))
-                    .example(Some(json!({ "kind": "Layer", "name": "edge", "spec": { "kind": "edge" } })))
+                    .example(Some(
+                        json!({ "kind": "Layer", "name": "edge", "spec": { "kind": "edge" } }),
+                    ))
             }
         };
         body = body.content(media.as_str(), content.build());
