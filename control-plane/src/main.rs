@@ -15,7 +15,7 @@ use clap::{Parser, Subcommand};
 #[derive(Parser)]
 #[command(name = "blaze-config", version)]
 struct Arguments {
-    /// The node file; else BLAZE_CONFIG, ./blaze.yaml, /etc/blaze/blaze.yaml.
+    /// The node file; else BLAZE_CONFIG, ./blaze.yaml, /etc/blaze/blaze.yaml (the last two not with --dev).
     #[arg(long, value_name = "FILE", global = true)]
     config: Option<PathBuf>,
     /// Only check the configuration: every fault on stderr, exit code 0 or 64.
@@ -68,7 +68,11 @@ fn main() -> ExitCode {
     }
     let names_store = overrides.iter().any(|(key, _)| key.starts_with("control_plane.store"));
     let mut sources = Sources::of_process(arguments.config, overrides);
-    sources.file_may_be_absent = arguments.dev;
+    if arguments.dev {
+        // Whatever lies in this folder must not be served without tokens by accident.
+        sources.search.clear();
+        sources.file_may_be_absent = true;
+    }
     let loaded = match load_typed(&sources, &schema()) {
         Ok(loaded) => loaded,
         Err(faults) => {

@@ -297,7 +297,13 @@ async fn admin(
     let text = move || {
         let mut text = String::new();
         if let Some(running) = running.get() {
-            metrics.revision(running.service.revision());
+            let core = &running.service;
+            metrics.state(
+                core.revision(),
+                core.oldest_revision(),
+                core.documents(),
+                core.denials_skipped(),
+            );
             text.push_str(&metrics_text(&running.counters));
         }
         metrics.text() + &text
@@ -322,7 +328,7 @@ async fn open_store(
             Err(error) => return Err(error.into()),
         };
         tracing::warn!(%error, "waiting for the store");
-        readiness.set("store", CheckStatus::Failed, error.to_string());
+        readiness.set("store", CheckStatus::Failed, error.told());
         let pause = rand::rng().random_range(Duration::from_millis(100)..Duration::from_secs(2));
         tokio::time::sleep(pause).await;
     }
@@ -354,7 +360,7 @@ async fn start(
         revocations: Revocations::new(),
         keyring: Arc::new(keyring),
         history: section.history.clone(),
-        on_commit: Arc::new(move |report| told.commit(report.duration)),
+        on_commit: Arc::new(move |report| told.commit(&report)),
         readiness: readiness.clone(),
     };
     let service = ConfigService::start(supervisor, options).await?;

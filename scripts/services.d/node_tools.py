@@ -5,6 +5,7 @@ from pathlib import Path
 from common import HOME, SCRIPTS, Failure
 
 FOLDER = HOME / "node"
+MODULES = HOME / "npm" / "node_modules"
 PACKAGES = SCRIPTS.parent / "tests" / "clients" / "typescript"
 
 
@@ -14,7 +15,7 @@ def node() -> Path:
 
 def modules() -> Path:
     """Packages of tests/clients/typescript/package-lock.json."""
-    return there(FOLDER / "packages" / "node_modules")
+    return there(MODULES)
 
 
 def there(path: Path) -> Path:

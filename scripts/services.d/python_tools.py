@@ -1,10 +1,12 @@
 """The Python packages that tests use: in a folder of their own, so that they need no virtual environment."""
 
 import os
+import sys
 
 from common import HOME, TEMPLATES, Failure
 
-FOLDER = HOME / "python"
+# Compiled packages fit one version of Python.
+FOLDER = HOME / "python" / f"{sys.version_info.major}.{sys.version_info.minor}"
 LOCK = TEMPLATES / "python.lock"
 
 

@@ -10,12 +10,14 @@
 //! that was made on the state n was exact, also those that ended in a refusal. A batch that writes nothing has no such
 //! proof; it asks the store for its newest revision before it answers.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use blaze_domain::config::{Applied, Code, Problem, Timestamp};
+use parking_lot::Mutex;
 use rand::RngExt as _;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 use tokio::time::Instant;
 
 use super::evaluate::{Evaluator, Request};
@@ -28,6 +30,8 @@ use crate::store::{AuditEntry, Commit, CommitError, CommitRecord, IdempotencyRec
 pub(crate) const QUEUE: usize = 4096;
 /// Requests in one transaction, at most.
 const MAX_BATCH: usize = 256;
+/// Bytes of the bodies of requests that may wait, at most, about: those whose callers have left wait on.
+pub(crate) const QUEUE_BYTES: usize = 64 * 1024 * 1024;
 /// Bytes of their bodies, at most, about.
 const MAX_BATCH_BYTES: usize = 4 * 1024 * 1024;
 /// How long one batch is tried.
@@ -48,6 +52,31 @@ pub(crate) struct Once {
     pub(crate) body: String,
 }
 
+/// Idempotency keys of requests that are running in this process.
+pub(crate) type RunningKeys = Arc<Mutex<HashSet<String>>>;
+
+/// An idempotency key is in use here until this goes, also when whoever asked goes before.
+pub(crate) struct Running {
+    keys: RunningKeys,
+    id: String,
+}
+
+impl Running {
+    /// `None` if it is in use already.
+    pub(crate) fn begin(keys: &RunningKeys, id: &str) -> Option<Self> {
+        keys.lock().insert(id.to_owned()).then(|| Self {
+            keys: Arc::clone(keys),
+            id: id.to_owned(),
+        })
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        self.keys.lock().remove(&self.id);
+    }
+}
+
 /// What the committer answers.
 #[derive(Debug)]
 pub(crate) enum Finished {
@@ -65,6 +94,19 @@ pub(crate) struct Queued {
     /// Of the body, about.
     pub(crate) bytes: usize,
     pub(crate) reply: oneshot::Sender<Result<Finished, Problem>>,
+    pub(crate) running: Option<Running>,
+    /// Its share of [`QUEUE_BYTES`].
+    pub(crate) _room: OwnedSemaphorePermit,
+}
+
+impl Queued {
+    fn finish(self, result: Result<Finished, Problem>) {
+        let Self { reply, running, .. } = self;
+        // First, for whoever gets the answer may ask again at once.
+        drop(running);
+        // Who has gone needs no answer; what was asked for is done all the same.
+        let _ = reply.send(result);
+    }
 }
 
 /// What is told of every transaction.
@@ -252,13 +294,7 @@ impl Committer {
             Err(CommitError::NotWritten(error)) => Err(Again::Refuse(unavailable(&error))),
             Err(CommitError::Unknown(error)) => {
                 self.doubtful = true;
-                tracing::warn!(%error, "the outcome of a commit is not known");
-                let detail = "the store went away while it wrote: read the documents to see whether it took effect";
-                Err(Again::Refuse(
-                    Problem::new(Code::OutcomeUnknown, detail)
-                        .applied(Applied::Unknown)
-                        .retry_after(2),
-                ))
+                Err(Again::Refuse(outcome_unknown(&error)))
             }
         }
     }
@@ -307,6 +343,15 @@ pub(crate) fn unavailable(error: &StoreError) -> Problem {
     Problem::new(Code::StoreUnavailable, detail).retry_after(2)
 }
 
+/// The refusal for a store that failed while it wrote.
+pub(crate) fn outcome_unknown(error: &StoreError) -> Problem {
+    tracing::warn!(%error, "the outcome of a write is not known");
+    let detail = "the store went away while it wrote: read what is there to see whether it took effect";
+    Problem::new(Code::OutcomeUnknown, detail)
+        .applied(Applied::Unknown)
+        .retry_after(2)
+}
+
 fn answer(batch: Vec<Queued>, tried: Vec<Tried>) {
     for (queued, tried) in batch.into_iter().zip(tried) {
         let result = match tried {
@@ -314,14 +359,13 @@ fn answer(batch: Vec<Queued>, tried: Vec<Tried>) {
             Tried::Before(revision, answer) => Ok(Finished::Before(revision, answer)),
             Tried::Done(done) => Ok(Finished::Done(done)),
         };
-        // Who has gone needs no answer; what was asked for is done all the same.
-        let _ = queued.reply.send(result);
+        queued.finish(result);
     }
 }
 
 fn refuse(batch: Vec<Queued>, problem: &Problem) {
     for queued in batch {
-        let _ = queued.reply.send(Err(problem.clone()));
+        queued.finish(Err(problem.clone()));
     }
 }
 

@@ -53,6 +53,16 @@ pub(crate) struct Item {
     pub(crate) precondition: Precondition,
 }
 
+impl Item {
+    /// Whether it makes no sense for a document that is not there.
+    fn must_exist(&self) -> bool {
+        matches!(
+            self.content,
+            Content::Patch(_) | Content::Delete | Content::Promote | Content::Abort(_)
+        ) || matches!(self.precondition, Precondition::Revisions(_) | Precondition::Any)
+    }
+}
+
 /// How a request is answered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Form {
@@ -83,7 +93,7 @@ pub(crate) struct Request {
     pub(crate) cascade: bool,
     pub(crate) prune: Option<Prune>,
     /// Documents changed since are a conflict (`revert`): key and revision that each must still have.
-    pub(crate) unchanged_since: Vec<(Key, u64)>,
+    pub(crate) unchanged_since: BTreeMap<Key, u64>,
 }
 
 /// What a request comes to.
@@ -126,6 +136,19 @@ impl Evaluator {
         revision: u64,
         time: Timestamp,
     ) -> Result<Evaluated, Problem> {
+        self.work_out(state, request, revision, time).map_err(|mut problem| {
+            if matches!(problem.code.http_status(), Some(409 | 412 | 428)) {
+                problem.revision.get_or_insert(state.revision());
+            }
+            problem
+        })
+    }
+
+    fn work_out(&self, state: &State, request: &Request, revision: u64, time: Timestamp) -> Result<Evaluated, Problem> {
+        let view = view(&request.caller.claims);
+        for item in &request.items {
+            view.check_named(state, &item.key, item.must_exist())?;
+        }
         let mut faults = Faults::new(request.form);
         let mut outcomes: BTreeMap<Key, (Outcome, Op)> = BTreeMap::new();
         let mut order: Vec<Key> = Vec::new();
@@ -185,7 +208,11 @@ impl Evaluator {
                     .map(|document| removal(document, revision, time, request)),
                 Outcome::Put(target) => {
                     match self.document(&key, before.as_deref(), *target, revision, time, request) {
-                        Ok(Some(document)) => Some(put(before.as_deref(), document, op)),
+                        Ok(Some(document)) => {
+                            // What is written anyway leaves old keys behind, so that they can be taken away one day.
+                            let document = self.keyring.reseal(&document).ok().flatten().unwrap_or(document);
+                            Some(put(before.as_deref(), document, op))
+                        }
                         Ok(None) => None,
                         Err(found) => {
                             found.into_iter().for_each(|fault| faults.add(index_of(&key), fault));
@@ -333,7 +360,11 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
     let update = if current.is_some() { Op::Update } else { Op::Create };
     let one = |outcome, op| Ok(vec![(item.key.clone(), outcome, op)]);
     match &item.content {
-        Content::Write(input) => one(Outcome::Put(Box::new(written(state, input, current)?)), update),
+        Content::Write(input) => {
+            // What POST finds is no document to compare with: it is refused as one that exists.
+            let compared = current.filter(|_| request.form != Form::Create);
+            one(Outcome::Put(Box::new(written(state, input, compared)?)), update)
+        }
         Content::Patch(patch) => {
             let current = current.ok_or_else(|| Box::new(not_found(&item.key)))?;
             let input = patch_input(state, &item.key, patch).map_err(|faults| Box::new(Problem::faults(faults)))?;
@@ -387,7 +418,7 @@ fn precondition(state: &State, request: &Request, item: &Item, current: Option<&
     let fail = |problem: Problem| Err(Box::new(problem.at(current.map_or(state.revision(), |d| d.revision))));
     let many = request.form == Form::Many;
     let rolls_back = matches!(item.content, Content::Restore(_) | Content::Promote | Content::Abort(_));
-    if let Some((_, revision)) = request.unchanged_since.iter().find(|(key, _)| *key == item.key)
+    if let Some(revision) = request.unchanged_since.get(&item.key)
         && current.map_or(0, |document| document.revision) != *revision
     {
         let detail = format!("{} was changed since; `force` reverts it all the same", item.key);

@@ -113,10 +113,14 @@ impl Log {
         true
     }
 
-    /// Starts anew from what the store has, when commits in between cannot be had any more.
+    /// Starts anew from what the store has, when commits in between cannot be had any more. Never goes back: another
+    /// task may have come further meanwhile.
     pub(crate) fn reset(&self, state: State, floor: u64) {
         let mut inner = self.inner.write();
         let revision = state.revision();
+        if revision <= inner.state.revision() {
+            return;
+        }
         *inner = Inner {
             state,
             floor,

@@ -15,6 +15,8 @@ use super::types::{ApplyAction, ApplyReport, ApplyResult, Place, Written};
 
 /// Places that are named in an answer.
 const MAX_AFFECTED: usize = 1000;
+/// Bytes of an answer that is kept whole. It is written beside the commit, where a store takes no text of any size.
+const MAX_KEPT_BYTES: usize = 4 * 1024 * 1024;
 
 /// What a request did, and to what.
 #[derive(Debug, Clone)]
@@ -90,11 +92,19 @@ impl Done {
         }
     }
 
-    /// The answer as it is kept for a request that comes again.
+    /// The answer as it is kept for a request that comes again; a large one without what changed.
     pub(crate) fn to_text(&self, kind: AnswerKind) -> String {
         match kind {
             AnswerKind::Document => self.written().map(|written| written_text(&written)).unwrap_or_default(),
-            AnswerKind::Report => report_text(&self.report(false)),
+            AnswerKind::Report => {
+                let mut report = self.report(false);
+                let text = report_text(&report);
+                if text.len() <= MAX_KEPT_BYTES {
+                    return text;
+                }
+                report.results.iter_mut().for_each(|result| result.changes.clear());
+                report_text(&report)
+            }
         }
     }
 }

@@ -1,11 +1,12 @@
 //! JSON Schemas of services: whether they are sound, and whether effective configurations match them.
 
+use std::collections::HashMap;
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
 use blaze_domain::ServiceName;
 use blaze_domain::config::spec::NODE_FILE_SECTIONS;
-use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_EFFECTIVE_BYTES};
+use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_DEPTH, MAX_EFFECTIVE_BYTES};
 use jsonschema::{Draft, PatternOptions, Validator};
 use lru::LruCache;
 use parking_lot::Mutex;
@@ -24,6 +25,11 @@ const CACHED: NonZeroUsize = NonZeroUsize::MIN.saturating_add(511);
 pub(crate) const MAX_FAULTS: usize = 20;
 /// Compiled patterns may take so many bytes each.
 const PATTERN_BYTES: usize = 1 << 20;
+/// Subschemas that may be looked at on the way to one leaf of a configuration. References that meet again multiply it.
+const MAX_STEPS: u64 = 10_000;
+/// How many of them may lie within each other: each takes a part of the stack.
+const MAX_NESTING: usize = 512;
+
 /// A schema, in full and without `required`.
 struct Compiled {
     full: Validator,
@@ -76,6 +82,7 @@ impl Schemas {
             let text: String = error.to_string().chars().take(500).collect();
             format!("at {:?}: {text}", error.instance_path().as_str())
         })?;
+        estimate(schema)?;
         let compiled = Arc::new(Compiled {
             full: build(schema)?,
             partial: build(&without_required(schema))?,
@@ -253,6 +260,169 @@ fn foreign_reference(value: &Value) -> Option<String> {
     }
 }
 
+/// What checking one leaf of a configuration comes to, at most.
+#[derive(Clone, Copy)]
+struct Effort {
+    steps: u64,
+    nesting: usize,
+}
+
+impl Effort {
+    const NONE: Self = Self { steps: 0, nesting: 0 };
+    const ONE: Self = Self { steps: 1, nesting: 1 };
+
+    /// Both are looked at.
+    fn and(self, other: Self) -> Self {
+        Self {
+            steps: self.steps.saturating_add(other.steps),
+            nesting: self.nesting.max(other.nesting),
+        }
+    }
+
+    /// One of them is looked at.
+    fn or(self, other: Self) -> Self {
+        Self {
+            steps: self.steps.max(other.steps),
+            nesting: self.nesting.max(other.nesting),
+        }
+    }
+}
+
+/// Refuses a schema that could take for ever, or the whole stack, although it is small.
+fn estimate(schema: &Value) -> Result<(), String> {
+    let mut anchors = HashMap::new();
+    find_anchors(schema, true, &mut anchors)?;
+    let mut estimate = Estimate {
+        root: schema,
+        anchors,
+        known: HashMap::new(),
+    };
+    estimate.effort(schema, MAX_DEPTH, 1).map(|_| ())
+}
+
+struct Estimate<'s> {
+    root: &'s Value,
+    anchors: HashMap<&'s str, &'s Value>,
+    /// By subschema, and how many levels of the configuration may still come.
+    known: HashMap<(*const Value, usize), Effort>,
+}
+
+impl<'s> Estimate<'s> {
+    fn effort(&mut self, schema: &'s Value, levels: usize, nesting: usize) -> Result<Effort, String> {
+        let Value::Object(members) = schema else {
+            return Ok(Effort::ONE);
+        };
+        let id = (std::ptr::from_ref(schema), levels);
+        if let Some(known) = self.known.get(&id) {
+            return Ok(*known);
+        }
+        if nesting > MAX_NESTING {
+            return Err(too_much());
+        }
+        // What leads back to itself at one place is not followed again.
+        self.known.insert(id, Effort::ONE);
+        let (mut here, mut below) = (Effort::NONE, Effort::NONE);
+        for (name, value) in members {
+            match (name.as_str(), value) {
+                ("$ref" | "$dynamicRef", Value::String(target)) => {
+                    let target = self.target(target)?;
+                    here = here.and(self.effort(target, levels, nesting + 1)?);
+                }
+                ("not" | "if" | "then" | "else", value) => {
+                    here = here.and(self.effort(value, levels, nesting + 1)?);
+                }
+                ("allOf" | "anyOf" | "oneOf", Value::Array(list)) => {
+                    for one in list {
+                        here = here.and(self.effort(one, levels, nesting + 1)?);
+                    }
+                }
+                ("dependentSchemas", Value::Object(named)) => {
+                    for one in named.values() {
+                        here = here.and(self.effort(one, levels, nesting + 1)?);
+                    }
+                }
+                _ if levels == 0 => {}
+                // A member has one name, and an item one place.
+                ("properties", Value::Object(named)) => {
+                    let mut any = Effort::NONE;
+                    for one in named.values() {
+                        any = any.or(self.effort(one, levels - 1, nesting + 1)?);
+                    }
+                    below = below.and(any);
+                }
+                ("prefixItems", Value::Array(list)) => {
+                    let mut any = Effort::NONE;
+                    for one in list {
+                        any = any.or(self.effort(one, levels - 1, nesting + 1)?);
+                    }
+                    below = below.and(any);
+                }
+                ("patternProperties", Value::Object(named)) => {
+                    for one in named.values() {
+                        below = below.and(self.effort(one, levels - 1, nesting + 1)?);
+                    }
+                }
+                (name, value) if ONE.contains(&name) => {
+                    below = below.and(self.effort(value, levels - 1, nesting + 1)?);
+                }
+                _ => {}
+            }
+        }
+        if members.contains_key("unevaluatedProperties") || members.contains_key("unevaluatedItems") {
+            // To know what is left over, everything is looked at once more.
+            here = here.and(here);
+        }
+        let within = here.and(below);
+        let effort = Effort {
+            steps: within.steps.saturating_add(1),
+            nesting: within.nesting + 1,
+        };
+        if effort.steps > MAX_STEPS || effort.nesting > MAX_NESTING {
+            return Err(too_much());
+        }
+        self.known.insert(id, effort);
+        Ok(effort)
+    }
+
+    fn target(&self, reference: &str) -> Result<&'s Value, String> {
+        let fragment = reference.strip_prefix('#').unwrap_or(reference);
+        let found = match fragment.is_empty() || fragment.starts_with('/') {
+            true => self.root.pointer(fragment),
+            false => self.anchors.get(fragment).copied(),
+        };
+        found.ok_or_else(|| {
+            let known = "#, #/… (without percent-encoding) or #anchor";
+            format!("$ref {reference:?} leads nowhere; it is {known}")
+        })
+    }
+}
+
+fn too_much() -> String {
+    format!(
+        "its references meet again and again: more than {MAX_STEPS} subschemas for one value, or {MAX_NESTING} within \
+         each other"
+    )
+}
+
+/// Anchors by name. Within a subschema with an `$id` of its own, `#` would be something else.
+fn find_anchors<'s>(value: &'s Value, is_root: bool, out: &mut HashMap<&'s str, &'s Value>) -> Result<(), String> {
+    match value {
+        Value::Object(members) => {
+            if !is_root && members.get("$id").is_some_and(Value::is_string) {
+                return Err("only the schema as a whole may have an $id".to_owned());
+            }
+            for name in ["$anchor", "$dynamicAnchor"] {
+                if let Some(anchor) = members.get(name).and_then(Value::as_str) {
+                    out.insert(anchor, value);
+                }
+            }
+            members.values().try_for_each(|inner| find_anchors(inner, false, out))
+        }
+        Value::Array(list) => list.iter().try_for_each(|inner| find_anchors(inner, false, out)),
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => Ok(()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use serde_json::json;
@@ -294,6 +464,48 @@ mod tests {
         ] {
             let error = schemas.check(&bad).unwrap_err();
             assert!(error.contains(why), "{bad}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_small_schema_that_takes_for_ever_is_refused() {
+        let schemas = Schemas::default();
+        let refused = |schema: &Value| {
+            let error = schemas.check(schema).unwrap_err();
+            assert!(error.contains("meet again"), "{error}");
+        };
+        let twice = |target: String| json!({ "allOf": [{ "$ref": target }, { "$ref": target }] });
+        // Each definition leads twice to the next one.
+        let mut defs: Map<String, Value> = (0..30)
+            .map(|n| (format!("d{n}"), twice(format!("#/$defs/d{}", n + 1))))
+            .collect();
+        defs.insert("d30".to_owned(), json!(true));
+        refused(&json!({ "$ref": "#/$defs/d0", "$defs": defs }));
+        // Each level of the configuration is checked twice as often as the one above it.
+        refused(&json!({ "properties": { "a": twice("#".to_owned()) } }));
+        refused(&json!({ "$anchor": "top", "properties": { "a": twice("#top".to_owned()) } }));
+        // Each level takes as much stack as there are definitions.
+        let mut chain: Map<String, Value> = (0..300)
+            .map(|n| (format!("d{n}"), json!({ "$ref": format!("#/$defs/d{}", n + 1) })))
+            .collect();
+        chain.insert("d300".to_owned(), json!({ "properties": { "a": { "$ref": "#" } } }));
+        refused(&json!({ "$ref": "#/$defs/d0", "$defs": chain }));
+    }
+
+    #[test]
+    fn a_schema_may_lead_back_to_itself() {
+        let schemas = Schemas::default();
+        for schema in [
+            json!({ "$ref": "#" }),
+            json!({ "allOf": [{ "$ref": "#" }, { "$ref": "#" }] }),
+            json!({ "properties": { "left": { "$ref": "#" }, "right": { "$ref": "#" }, "value": true } }),
+            json!({ "type": ["object", "string"], "additionalProperties": { "$ref": "#" } }),
+            json!({
+                "properties": { "shape": { "$ref": "#shape" } },
+                "$defs": { "shape": { "$anchor": "shape", "anyOf": [true, { "items": { "$ref": "#shape" } }] } },
+            }),
+        ] {
+            assert_eq!(schemas.check(&schema), Ok(()), "{schema}");
         }
     }
 

@@ -5,7 +5,7 @@ use blaze_domain::config::{Code, Document, FieldFault, Key};
 use serde_json::Value;
 use zeroize::Zeroizing;
 
-use crate::secrets::Keyring;
+use crate::secrets::{Keyring, OpenError};
 
 /// Where secrets of a document go and come from.
 pub(crate) struct Vault<'a> {
@@ -93,31 +93,43 @@ impl Vault<'_> {
     }
 }
 
+/// Why a secret of a document cannot be read here, if there is one such.
+pub(crate) fn unreadable(keyring: &Keyring, document: &Document) -> Option<OpenError> {
+    let mut found = None;
+    secret::walk(&document.spec, &mut |_, value| {
+        if found.is_none() {
+            found = keyring.open(&document.key, &document.uid, value).err();
+        }
+    });
+    found
+}
+
 /// A value with its secrets as text in place of the secret objects: what a service gets. What cannot be decrypted
 /// becomes empty.
 pub(crate) fn as_text(keyring: &Keyring, document: &Document, value: &Value) -> Value {
-    replaced(keyring, document, value, |text, _| Value::from(text))
+    replaced(keyring, document, value, |text, _| {
+        Value::from(text.unwrap_or_default())
+    })
 }
 
-/// A value with its secrets as `{"$secret":{"text","version"}}`.
+/// A value with its secrets as `{"$secret":{"text","version"}}`. What cannot be decrypted stays redacted: an empty
+/// text, written back, would take the place of the secret.
 pub(crate) fn revealed(keyring: &Keyring, document: &Document, value: &Value) -> Value {
-    replaced(
-        keyring,
-        document,
-        value,
-        |text, version| serde_json::json!({ "$secret": { "text": text, "version": version } }),
-    )
+    replaced(keyring, document, value, |text, version| match text {
+        Some(text) => Secret::Revealed { text, version }.to_json(),
+        None => Secret::Redacted { version }.to_json(),
+    })
 }
 
-fn replaced(keyring: &Keyring, document: &Document, value: &Value, form: impl Fn(&str, u64) -> Value) -> Value {
+fn replaced(keyring: &Keyring, document: &Document, value: &Value, form: impl Fn(Option<&str>, u64) -> Value) -> Value {
     let mut out = value.clone();
     secret::map(&mut out, &mut |_, found| {
         let version = match Secret::of(found) {
             Some(Ok(Secret::Stored { version, .. })) => version,
             _ => 0,
         };
-        let text = keyring.open(&document.key, &document.uid, found).unwrap_or_default();
-        Some(form(&text, version))
+        let text = keyring.open(&document.key, &document.uid, found).ok();
+        Some(form(text.as_ref().map(|text| text.as_str()), version))
     });
     out
 }

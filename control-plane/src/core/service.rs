@@ -5,7 +5,6 @@ mod tasks;
 mod token;
 mod write;
 
-use std::collections::HashSet;
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -16,15 +15,16 @@ use blaze_domain::config::{Code, Key, Problem};
 use blaze_domain::node_file::HistorySection;
 use blaze_runtime::{Readiness, Supervisor};
 use parking_lot::Mutex;
-use tokio::sync::mpsc;
+use tokio::sync::{Semaphore, mpsc};
 use tokio_util::sync::CancellationToken;
 
 use super::barrier::{Barrier, barrier};
-use super::committer::{Committer, OnCommit, QUEUE, Queued, now};
+use super::committer::{Committer, OnCommit, QUEUE, QUEUE_BYTES, Queued, RunningKeys, now};
 use super::evaluate::Evaluator;
 use super::log::Log;
 use super::page::Pages;
 use super::schema::Schemas;
+use super::secrets;
 use super::state::State;
 use super::view;
 use super::watch::Watches;
@@ -80,8 +80,9 @@ struct Inner {
     dev: Option<Arc<Claims>>,
     /// Versions of each document that trimming leaves.
     keep_versions: u32,
-    /// Idempotency keys of requests that are running in this process.
-    running: Mutex<HashSet<String>>,
+    running: RunningKeys,
+    /// Bytes that may still be queued.
+    room: Arc<Semaphore>,
     denied: mpsc::Sender<AuditEntry>,
     denials: Mutex<token::DenialLimit>,
 }
@@ -98,6 +99,7 @@ impl ConfigService {
             store_id = %snapshot.store_id, revision = snapshot.revision, documents = state.len(), floor = snapshot.floor,
             "the configuration is loaded"
         );
+        tell_unreadable(&options.keyring, &state);
         let log = Arc::new(Log::new(state, snapshot.floor));
         let evaluator = Arc::new(Evaluator {
             keyring: Arc::clone(&options.keyring),
@@ -135,7 +137,8 @@ impl ConfigService {
                 revocations: options.revocations,
                 dev: options.dev.then(|| Arc::new(dev::claims())),
                 keep_versions: options.history.keep_versions,
-                running: Mutex::default(),
+                running: RunningKeys::default(),
+                room: Arc::new(Semaphore::new(QUEUE_BYTES)),
                 denied,
                 denials: Mutex::default(),
             }),
@@ -225,6 +228,19 @@ impl ConfigService {
     }
 }
 
+/// Secrets that do not open stay redacted even where they are to be revealed, and services do not get them: say so.
+fn tell_unreadable(keyring: &Keyring, state: &State) {
+    let mut unreadable = state
+        .all()
+        .filter_map(|(key, held)| secrets::unreadable(keyring, &held.document).map(|error| (key, error)));
+    if let Some((first, error)) = unreadable.next() {
+        tracing::error!(
+            documents = unreadable.count() + 1, %first, %error,
+            "there are secrets that cannot be read: put their key back among control_plane.encryption.keys, or write them anew"
+        );
+    }
+}
+
 /// A label selector as it was given.
 pub(crate) fn selector(text: &str) -> Result<LabelSelector, Problem> {
     let refuse = |error: String| Problem::new(Code::InvalidLabelSelector, format!("label_selector {text:?}: {error}"));
@@ -236,7 +252,7 @@ fn not_found(key: &Key, state: &State) -> Problem {
     let near = state
         .of_kind(key.kind(), None)
         .take(1000)
-        .filter(|(other, _)| other.service_name() == key.service_name())
+        .filter(|(other, _)| other.service_name() == key.service_name() && *other != key)
         .map(|(other, _)| (strsim::damerau_levenshtein(other.name().as_str(), name), other))
         .min_by_key(|(distance, _)| *distance);
     let hint = match near {

@@ -6,13 +6,13 @@ use std::time::Duration;
 
 use blaze_domain::config::{Code, Document, Key, Labels, Problem};
 use blaze_runtime::Supervisor;
-use futures::StreamExt as _;
+use futures::{FutureExt as _, StreamExt as _};
 use serde_json::{Value, json};
 
 use super::types::*;
 use super::{ConfigService, testing};
 use crate::auth::{Claims, Right};
-use crate::store::AuditQuery;
+use crate::store::{AuditQuery, SqliteStore, Store};
 
 struct World {
     service: ConfigService,
@@ -378,6 +378,58 @@ async fn pruning_needs_confirmation_beyond_twenty() {
     assert_eq!(report.results.len(), 22);
 }
 
+/// A world on a store that may hold something, with these keys.
+async fn world_on(store: &Arc<SqliteStore>, keys: &[(&str, [u8; 32])]) -> World {
+    let supervisor = Supervisor::new("test");
+    let store = Arc::clone(store) as Arc<dyn Store>;
+    World {
+        admin: caller(&["admin"], None),
+        service: testing::service_on(&supervisor, store, keys).await.unwrap(),
+        _supervisor: supervisor,
+    }
+}
+
+#[tokio::test]
+async fn what_is_written_leaves_an_old_key_behind_and_what_has_no_key_is_not_shown_as_empty() {
+    let supervisor = Supervisor::new("store");
+    let store = Arc::new(SqliteStore::in_memory(&supervisor).await.unwrap());
+    let (old, new) = (("e1", [7; 32]), ("e2", [8; 32]));
+    let w = world_on(&store, &[old]).await;
+    for name in ["Service/a", "Service/b"] {
+        w.put(name, json!({ "config": { "password": { "$secret": "canary" } } }))
+            .await;
+    }
+    let w = world_on(&store, &[new, old]).await;
+    let again = json!({ "config": { "password": { "$secret": { "redacted": true, "version": 1 } } } });
+    assert_eq!(
+        w.put("Service/a", again).await.revision,
+        1,
+        "a new key alone is no change"
+    );
+    w.patch("Service/a", json!({ "spec": { "description": "x" } }))
+        .await
+        .unwrap();
+
+    let w = world_on(&store, &[new]).await;
+    let reveal = ReadOptions {
+        reveal: true,
+        ..ReadOptions::default()
+    };
+    let password = async |name: &str| {
+        let shown = w.service.get(&w.admin, &key(name), &reveal).await.unwrap().value;
+        shown.spec["config"]["password"]["$secret"].clone()
+    };
+    assert_eq!(password("Service/a").await, json!({ "text": "canary", "version": 1 }));
+    let kept = password("Service/b").await;
+    assert_eq!(kept, json!({ "redacted": true, "version": 2 }));
+    // Who writes it back as it was shown does not lose it.
+    let back = json!({ "description": "y", "config": { "password": { "$secret": kept } } });
+    w.put("Service/b", back).await;
+    let w = world_on(&store, &[new, old]).await;
+    let clear = w.service.get(&w.admin, &key("Service/b"), &reveal).await.unwrap().value;
+    assert_eq!(clear.spec["config"]["password"]["$secret"]["text"], "canary");
+}
+
 #[tokio::test]
 async fn secrets_are_kept_encrypted_and_shown_redacted() {
     let w = world().await;
@@ -489,6 +541,32 @@ async fn the_same_request_twice_is_done_once() {
         code(w.service.create(&w.admin, layer(), once(2)).await),
         Code::IdempotencyKeyReused
     );
+    assert_eq!(w.service.revision(), 1);
+}
+
+#[tokio::test]
+async fn a_request_whose_caller_left_is_not_done_again() {
+    let w = world().await;
+    let create = || {
+        let once = Idempotency {
+            key: "k".to_owned(),
+            path: "/api/v1/layers".to_owned(),
+            body: [1; 32],
+        };
+        w.service
+            .create(&w.admin, input("Layer/edge", json!({ "kind": "edge" })), Some(once))
+    };
+    // Asked once, it stands in the queue; then whoever asked is gone.
+    assert!(create().now_or_never().is_none());
+    loop {
+        match create().await {
+            Err(problem) if problem.code == Code::IdempotencyInProgress => tokio::task::yield_now().await,
+            again => {
+                assert!(again.unwrap().replayed);
+                break;
+            }
+        }
+    }
     assert_eq!(w.service.revision(), 1);
 }
 
@@ -705,6 +783,51 @@ async fn a_bound_token_sees_and_changes_its_own_layer_alone() {
         Code::PermissionDenied
     );
     assert!(patch("Node/robot-1", json!({ "type": "mobile" })).await.is_ok());
+    // An instance that runs elsewhere says nothing here.
+    w.put("Node/server", json!({ "layer": "fog" })).await;
+    w.put(
+        "Instance/slam/far",
+        json!({ "node": "server", "config": { "of": "fog" } }),
+    )
+    .await;
+    let far = Place {
+        instance: Some("far".parse().unwrap()),
+        layer: Some("edge".parse().unwrap()),
+        ..slam()
+    };
+    let far = w.service.effective(&bound, &far, false, &read).await;
+    assert_eq!(code(far), Code::PermissionDenied);
+    // Of many documents, those outside are refused before anything is told of them.
+    let apply = async |name: &str, spec: Value, revision: Option<u64>, delete: bool| {
+        let items = vec![ApplyItem {
+            input: input(name, spec),
+            revision,
+            delete,
+        }];
+        let request = ApplyRequest {
+            items,
+            ..ApplyRequest::default()
+        };
+        w.service.apply(&bound, request, None).await
+    };
+    let fog = || json!({ "layer": "fog" });
+    for outside in [
+        apply("Node/server", fog(), None, false).await,
+        apply("Node/server", fog(), Some(1), false).await,
+        apply("Node/absent", fog(), Some(1), false).await,
+        apply("Node/absent", json!({}), None, true).await,
+        apply("Service/slam", json!({}), None, false).await,
+    ] {
+        assert_eq!(code(outside), Code::PermissionDenied);
+    }
+    // What is placed nowhere counts everywhere: a roll-out on it is none of one layer's.
+    w.put("Instance/slam/anywhere", json!({})).await;
+    let rollout = json!({
+        "target": { "kind": "Instance", "service": "slam", "name": "anywhere" }, "patch": { "config": { "a": 5 } },
+        "canary": { "node_selector": "!absent" },
+    });
+    let started = w.service.create(&bound, input("Rollout/r", rollout), None).await;
+    assert_eq!(code(started), Code::PermissionDenied);
     // Who may make tokens could make one that is bound to nothing.
     let admin = caller(&["admin"], Some("edge"));
     let token = TokenRequest {

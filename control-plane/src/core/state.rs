@@ -1,6 +1,7 @@
 //! All documents at one revision. A clone shares everything and costs nothing, so that readers keep one as long as they
 //! like while commits go on.
 
+use std::collections::BTreeSet;
 use std::ops::Bound;
 use std::sync::Arc;
 
@@ -314,7 +315,7 @@ fn first_key(kind: Kind) -> Key {
 /// Documents that may count elsewhere although they did not change: instances with their node or service, roll-outs with
 /// their target.
 fn moved_with(before: &State, after: &State, commit: &Commit) -> Vec<Key> {
-    let changed = |key: &Key| commit.changes.iter().any(|change| change.document.key == *key);
+    let keys: BTreeSet<&Key> = commit.changes.iter().map(|change| &change.document.key).collect();
     let mut out: Vec<Key> = Vec::new();
     for change in &commit.changes {
         let key = &change.document.key;
@@ -341,7 +342,8 @@ fn moved_with(before: &State, after: &State, commit: &Commit) -> Vec<Key> {
             .iter()
             .any(|change| change.document.key.kind() != Kind::Rollout)
     {
-        let touched = |target: &Key| changed(target) || out.contains(target);
+        let moved: BTreeSet<&Key> = out.iter().collect();
+        let touched = |target: &Key| keys.contains(target) || moved.contains(target);
         let rollouts: Vec<Key> = after
             .of_kind(Kind::Rollout, None)
             .filter(|(_, held)| rollout_target(&held.document).is_some_and(|target| touched(&target)))
@@ -349,7 +351,7 @@ fn moved_with(before: &State, after: &State, commit: &Commit) -> Vec<Key> {
             .collect();
         out.extend(rollouts);
     }
-    out.retain(|key| !changed(key));
+    out.retain(|key| !keys.contains(key));
     out.sort();
     out.dedup();
     out

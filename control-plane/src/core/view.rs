@@ -3,7 +3,7 @@
 use blaze_domain::LayerName;
 use blaze_domain::config::{Code, Document, Key, Kind, Problem};
 
-use super::placement::{Placement, placement};
+use super::placement::{Placement, placement, rollout_target};
 use super::state::State;
 use crate::auth::{Claims, Right, Role, allowed, unbound};
 
@@ -86,6 +86,23 @@ impl View {
         }
     }
 
+    /// Refuses a key that a write names, if it is outside the view, before anything of it is told. What does not exist
+    /// is outside of every layer where it `must_exist`. Services belong to all layers.
+    pub(crate) fn check_named(&self, state: &State, key: &Key, must_exist: bool) -> Result<(), Problem> {
+        if self.layer.is_none() {
+            return Ok(());
+        }
+        let inside = match state.get(key) {
+            Some(held) => self.sees_document(state, &held.document),
+            None => !must_exist,
+        };
+        if inside && key.kind() != Kind::Service {
+            Ok(())
+        } else {
+            Err(self.outside(&key.to_string()))
+        }
+    }
+
     /// Refuses a change that reaches beyond the layer that the token is bound to: the document before and after must count
     /// in that layer alone. Services belong to all layers.
     pub(crate) fn check_write(
@@ -98,9 +115,13 @@ impl View {
             let Some(document) = document else { continue };
             let own = match document.key.kind() {
                 Kind::Service => false,
+                // As if the target itself were changed: one that is placed nowhere counts in other layers too.
                 Kind::Rollout => {
-                    super::placement::rollout_target(document).is_none_or(|target| target.kind() != Kind::Service)
-                        && self.sees_document(state, document)
+                    let target = rollout_target(document).and_then(|key| state.get(&key));
+                    target.is_some_and(|target| {
+                        let place = placement(state, &target.document);
+                        place.layer.as_ref() == Some(layer) && place.visible.contains(layer)
+                    })
                 }
                 // An instance of a service that the layer does not see is outside too, as if there were no such service.
                 Kind::Layer | Kind::Node | Kind::Instance => {

@@ -412,7 +412,7 @@ impl Watcher {
     async fn wait(&mut self) {
         let deadline = self.next_bookmark.min(self.end);
         let expires = self.caller.claims.expires_s.map(|expires| {
-            let left = (expires * 1000).saturating_sub(now().as_millis()).max(0);
+            let left = expires.saturating_mul(1000).saturating_sub(now().as_millis()).max(0);
             Instant::now() + Duration::from_millis(left.unsigned_abs())
         });
         let deadline = expires.map_or(deadline, |expires| deadline.min(expires));

@@ -217,6 +217,15 @@ pub enum StoreError {
 }
 
 impl StoreError {
+    /// The same without addresses, paths and names, for those who bring no token.
+    #[must_use]
+    pub fn told(&self) -> &'static str {
+        match self {
+            Self::Unavailable(_) => "the store cannot be reached",
+            Self::Corrupt(_) | Self::Refused(_) => "the store cannot be used; see the log of the service",
+        }
+    }
+
     /// Whether the same may succeed later.
     #[must_use]
     pub fn is_transient(&self) -> bool {

@@ -623,14 +623,14 @@ async fn read(world: &World, begin: u64) {
             let (revision, op) = (entry["revision"].as_u64().unwrap(), &entry["op"]);
             if op != "delete" {
                 world.read(&format!("/api/v1/{name}?revision={revision}")).await;
+                world
+                    .read(&format!("/api/v1/{name}/diff?from={begin}&to={revision}"))
+                    .await;
             }
             let diff = world
                 .read(&format!("/api/v1/{name}/diff?from={revision}&to={head}"))
                 .await;
             assert!(diff.body["changes"].is_array());
-            world
-                .read(&format!("/api/v1/{name}/diff?from={begin}&to={revision}"))
-                .await;
         }
     }
     for path in [

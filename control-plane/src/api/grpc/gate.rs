@@ -158,6 +158,8 @@ impl Gate {
 
     fn refuse(&self, head: &Head, claims: Option<&Claims>, problem: &Problem, action: &str) -> Response {
         if is_denial(problem) {
+            let (code, internal) = (problem.code.as_str(), problem.internal.as_deref().unwrap_or_default());
+            tracing::info!(target: "blaze_config::access", action, code, peer = %head.address, internal, "refused");
             self.core.denied(claims, problem, action, None, &head.id, head.address);
         }
         status::from_problem(problem, &head.id).into_http()

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use blaze_domain::config::{Code, Key, Problem};
+use blaze_domain::config::{Applied, Code, Key, Problem};
 use blaze_proto::v1::config_service_server;
 use blaze_proto::{Message, v1};
 use tonic::metadata::MetadataValue;
@@ -61,8 +61,13 @@ impl Service {
     }
 
     fn close<T: Message>(&self, call: &Call, done: Done<T>) -> Result<Response<T>, Status> {
-        let answer = done.and_then(bounded).map_err(|problem| self.refuse(call, &problem))?;
-        Ok(respond(answer))
+        let done = match done.map(bounded) {
+            // By now a write has taken effect.
+            Ok(Err(problem)) if call.method.writes => Err(problem.applied(Applied::Unknown)),
+            Ok(checked) => checked,
+            Err(problem) => Err(problem),
+        };
+        done.map(respond).map_err(|problem| self.refuse(call, &problem))
     }
 
     fn refuse(&self, call: &Call, problem: &Problem) -> Status {

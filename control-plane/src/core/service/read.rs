@@ -15,7 +15,7 @@ use super::super::report;
 use super::super::secrets;
 use super::super::state::{Held, State, redacted};
 use super::super::types::{Answer, Caller, Effective, HistoryEntry, ListQuery, Page, Place, ReadOptions, WatchQuery};
-use super::super::view::{may_reveal, view};
+use super::super::view::{View, may_reveal, view};
 use super::super::watch::{Filter, WatchStream, is_in_layer, trimmed};
 use super::{ConfigService, WAIT_FOR_REVISION, not_found, selector};
 use crate::auth::Right;
@@ -103,12 +103,22 @@ impl ConfigService {
         }
         let past = self.inner.store.documents_at(revision, now.revision()).await;
         let past = past.map_err(|error| unavailable(&error))?;
-        if revision < self.inner.log.floor() {
-            return Err(trimmed(self.inner.log.floor(), now.revision()));
-        }
+        self.check_floor(now, revision).await?;
         let mut state = now.clone();
         state.overlay(revision, past);
         Ok(state)
+    }
+
+    /// Refuses a revision below the floor, as the store has it now: another process may have trimmed, or this one is
+    /// about it. What was read of the past before is whole if this succeeds.
+    async fn check_floor(&self, now: &State, revision: u64) -> Result<(), Problem> {
+        let batch = self.inner.store.commits_after(revision, 1).await;
+        let floor = batch.map_err(|error| unavailable(&error))?.floor;
+        self.inner.log.raise_floor(floor);
+        if revision < floor {
+            return Err(trimmed(floor, now.revision()));
+        }
+        Ok(())
     }
 
     /// The document as it may be shown: redacted, or in clear where that is asked and allowed.
@@ -179,11 +189,13 @@ impl ConfigService {
                 Code::NotFound,
                 format!("{key} did not exist at revision {revision}"),
             )),
-            None if revision < self.inner.log.floor() => Err(trimmed(self.inner.log.floor(), state.revision())),
-            None => Err(Problem::new(
-                Code::NotFound,
-                format!("{key} did not exist at revision {revision}"),
-            )),
+            None => {
+                self.check_floor(state, revision).await?;
+                Err(Problem::new(
+                    Code::NotFound,
+                    format!("{key} did not exist at revision {revision}"),
+                ))
+            }
         }
     }
 
@@ -340,6 +352,13 @@ impl ConfigService {
         if asked.service.is_none() && asked.node.is_none() && asked.layer.is_none() {
             return invalid("say for which service, node or layer");
         }
+        if let (Some(service), Some(instance)) = (&asked.service, &asked.instance) {
+            // An instance without a document is nobody's; one with a document elsewhere is outside of the view.
+            let key = Key::instance(service.clone(), DocumentName::from(instance));
+            if state.get(&key).is_some() {
+                view.check_key(state, &key)?;
+            }
+        }
         let mut at = At {
             service: asked.service.clone(),
             instance: asked.instance.as_ref().map(DocumentName::from),
@@ -486,7 +505,13 @@ impl ConfigService {
         };
         let (old, new) = (side(from).await?, side(to).await?);
         if old.is_none() && new.is_none() {
-            return Err(not_found(key, &state));
+            return Err(match state.get(key) {
+                Some(_) => Problem::new(
+                    Code::NotFound,
+                    format!("{key} existed neither at revision {from} nor at {to}"),
+                ),
+                None => not_found(key, &state),
+            });
         }
         let changes = document_diff(old.as_deref(), new.as_deref());
         Ok(answer(&state, DiffReport { from, to, changes }))
@@ -514,6 +539,10 @@ impl ConfigService {
         if since < floor {
             return Err(trimmed(floor, state.revision()));
         }
+        if self.inner.log.after(since, 1).is_none() {
+            // It begins in the store, which may have been trimmed by another process.
+            self.check_floor(&state, since).await?;
+        }
         let stream = self.inner.watches.open(caller, filter, since, query.timeout_s);
         Ok(answer(&state, stream))
     }
@@ -535,7 +564,7 @@ impl ConfigService {
                 json!({
                     "name": layer.as_str(),
                     "kind": held.document.spec_member("kind"),
-                    "nodes": nodes.map(|key| node_json(&state, key)).collect::<Vec<_>>(),
+                    "nodes": nodes.map(|key| node_json(&state, &view, key)).collect::<Vec<_>>(),
                 })
             });
         let layers: Vec<Value> = layers.collect();
@@ -585,12 +614,16 @@ pub(crate) fn digest(state: &State, layer: &LayerName) -> String {
     }))
 }
 
-fn node_json(state: &State, key: &Key) -> Value {
+fn node_json(state: &State, view: &View, key: &Key) -> Value {
     let node = NodeName::from(key.name());
     let kind = state
         .get(key)
         .and_then(|held| held.document.spec_member("type").cloned());
-    let services = state.on_node(&node).map(|key| {
+    let seen = |key: &&Key| {
+        let held = state.get(key);
+        held.is_some_and(|held| view.sees_document(state, &held.document))
+    };
+    let services = state.on_node(&node).filter(seen).map(|key| {
         json!({
             "service": key.service_name().map(ServiceName::as_str), "instance": key.name().as_str(),
             "state": null, "config_revision": null,

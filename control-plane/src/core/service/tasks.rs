@@ -108,7 +108,10 @@ impl ConfigService {
             ticks.tick().await;
             match timeout(LOOK, self.inner.store.head()).await {
                 Ok(Ok(_)) => readiness.set("store", CheckStatus::Ok, self.described()),
-                Ok(Err(error)) => readiness.set("store", CheckStatus::Failed, error.to_string()),
+                Ok(Err(error)) => {
+                    tracing::debug!(%error, "the store does not answer");
+                    readiness.set("store", CheckStatus::Failed, error.told());
+                }
                 Err(_) => readiness.set("store", CheckStatus::Failed, "no answer within 1.2 s"),
             }
         }
@@ -130,7 +133,7 @@ impl ConfigService {
     async fn trim_old(&self, history: &HistorySection) -> Result<(), StoreError> {
         let by_count = self.revision().saturating_sub(history.keep_revisions);
         if by_count <= self.inner.log.floor() {
-            return Ok(());
+            return self.remove_expired(history).await;
         }
         let keep = i64::try_from(history.keep_s).unwrap_or(i64::MAX).saturating_mul(1000);
         let before = Timestamp::from_millis(now().as_millis().saturating_sub(keep));
@@ -140,6 +143,17 @@ impl ConfigService {
             let floor = self.inner.store.trim(floor, history.keep_versions).await?;
             self.inner.log.raise_floor(floor);
             tracing::info!(floor, "old history was removed");
+            return Ok(());
+        }
+        self.remove_expired(history).await
+    }
+
+    /// Answers to repeat, tokens and audit that have expired go with a trimming, also with one that leaves the floor
+    /// where it is. A shared store removes them by itself.
+    async fn remove_expired(&self, history: &HistorySection) -> Result<(), StoreError> {
+        if !self.inner.store.is_shared() {
+            let floor = self.inner.log.floor();
+            self.inner.store.trim(floor, history.keep_versions).await?;
         }
         Ok(())
     }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::config::{Code, FieldFault, Key, Problem, Timestamp};
 
-use super::super::committer::{now, unavailable};
+use super::super::committer::{now, outcome_unknown, unavailable};
 use super::super::page::Position;
 use super::super::types::{Answer, Caller, Page, ReadOptions, TokenRequest};
 use super::super::view::authorize_whole;
@@ -206,7 +206,7 @@ impl ConfigService {
         })?;
         let entry = Self::entry(caller, "token_create", None);
         let added = self.inner.store.add_token(&record, &entry).await;
-        added.map_err(|error| unavailable(&error))?;
+        added.map_err(|error| outcome_unknown(&error))?;
         Ok(Answer {
             revision: self.revision(),
             replayed: false,
@@ -242,10 +242,13 @@ impl ConfigService {
         authorize_whole(&caller.claims)?;
         let entry = Self::entry(caller, "token_revoke", None);
         let revoked = self.inner.store.revoke_token(id, now(), &entry).await;
-        if !revoked.map_err(|error| unavailable(&error))? {
+        if !revoked.map_err(|error| outcome_unknown(&error))? {
             return Err(Problem::new(Code::NotFound, format!("no token has the id {id:?}")));
         }
-        self.refresh_tokens().await.map_err(|error| unavailable(&error))?;
+        if let Err(error) = self.refresh_tokens().await {
+            // It is revoked; the next periodic reading learns of it.
+            tracing::warn!(%error, "revoked tokens were not read");
+        }
         Ok(Answer {
             revision: self.revision(),
             replayed: false,

@@ -1,5 +1,6 @@
 //! Writes: each becomes a request for the committer. A write that has begun goes on when whoever asked goes away.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use blaze_domain::DocumentName;
@@ -8,7 +9,7 @@ use serde_json::{Value, json};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::oneshot;
 
-use super::super::committer::{Finished, Once, Queued, now, unavailable};
+use super::super::committer::{Finished, Once, QUEUE_BYTES, Queued, Running, now, outcome_unknown, unavailable};
 use super::super::evaluate::{Content, Form, Item, Prune, Request};
 use super::super::report::{AnswerKind, Done, report_from, written_from};
 use super::super::types::{
@@ -25,18 +26,6 @@ const MAX_ITEMS: usize = 1000;
 /// Bytes that a queued request counts for besides its documents.
 const REQUEST_BYTES: usize = 1024;
 
-/// An idempotency key is in use here until this goes.
-struct Running<'a> {
-    service: &'a ConfigService,
-    id: String,
-}
-
-impl Drop for Running<'_> {
-    fn drop(&mut self) {
-        self.service.inner.running.lock().remove(&self.id);
-    }
-}
-
 fn request(caller: &Caller, action: &'static str, form: Form, items: Vec<Item>) -> Request {
     Request {
         caller: caller.clone(),
@@ -45,7 +34,7 @@ fn request(caller: &Caller, action: &'static str, form: Form, items: Vec<Item>) 
         items,
         cascade: false,
         prune: None,
-        unchanged_since: Vec::new(),
+        unchanged_since: BTreeMap::new(),
     }
 }
 
@@ -98,30 +87,31 @@ impl ConfigService {
         bytes: usize,
     ) -> Result<Finished, Problem> {
         let once = idempotency.map(|idempotency| once(&request.caller, &idempotency));
-        let _running = match &once {
-            Some(once) => {
-                if !self.inner.running.lock().insert(once.id.clone()) {
-                    let detail = "the first request with this Idempotency-Key is still running";
-                    return Err(Problem::new(Code::IdempotencyInProgress, detail).retry_after(1));
-                }
-                Some(Running {
-                    service: self,
-                    id: once.id.clone(),
-                })
-            }
+        let in_progress = || {
+            let detail = "the first request with this Idempotency-Key is still running";
+            Problem::new(Code::IdempotencyInProgress, detail).retry_after(1)
+        };
+        let running = match &once {
+            Some(once) => Some(Running::begin(&self.inner.running, &once.id).ok_or_else(in_progress)?),
             None => None,
         };
+        let overloaded =
+            || Problem::new(Code::Overloaded, "too many writes wait for the store; try again").retry_after(1);
+        let bytes = (bytes + REQUEST_BYTES).min(QUEUE_BYTES);
+        let room = Arc::clone(&self.inner.room);
+        let room = room.try_acquire_many_owned(u32::try_from(bytes).unwrap_or(u32::MAX));
+        let room = room.map_err(|_| overloaded())?;
         let (reply, result) = oneshot::channel();
         let queued = Queued {
             request: Arc::new(request),
             answer,
             once,
-            bytes: bytes + REQUEST_BYTES,
+            bytes,
             reply,
+            running,
+            _room: room,
         };
-        self.inner.queue.try_send(queued).map_err(|_| {
-            Problem::new(Code::Overloaded, "too many writes wait for the store; try again").retry_after(1)
-        })?;
+        self.inner.queue.try_send(queued).map_err(|_| overloaded())?;
         let ended = || {
             let detail =
                 "the service ended before the store answered: read the documents to see whether it took effect";
@@ -381,7 +371,14 @@ impl ConfigService {
         let batch = self.inner.store.commits_after(revision - 1, 1).await;
         let batch = batch.map_err(|error| unavailable(&error))?;
         if batch.floor >= revision {
-            return Err(trimmed(batch.floor, state.revision()));
+            let detail = format!(
+                "what commit {revision} did is no longer kept: the history begins after {}",
+                batch.floor
+            );
+            return Err(Problem {
+                detail,
+                ..trimmed(batch.floor, state.revision())
+            });
         }
         let commit = batch
             .commits
@@ -390,8 +387,13 @@ impl ConfigService {
             .filter(|commit| commit.revision == revision);
         let commit = commit.ok_or_else(missing)?;
         let mut items = Vec::with_capacity(commit.changes.len());
-        let mut unchanged_since = Vec::with_capacity(commit.changes.len());
+        let mut unchanged_since = BTreeMap::new();
+        let view = view(&caller.claims);
         for change in &commit.changes {
+            // Before anything is told of it: what a deleted document was counts too.
+            if !view.sees_document(&state, &change.document) {
+                return Err(view.outside(&format!("commit {revision}")));
+            }
             let key = change.document.key.clone();
             let before = match change.previous {
                 None => None,
@@ -399,7 +401,7 @@ impl ConfigService {
             };
             if !force {
                 let now = if change.op == Op::Delete { 0 } else { revision };
-                unchanged_since.push((key.clone(), now));
+                unchanged_since.insert(key.clone(), now);
             }
             items.push(item(key, Content::Restore(before), Precondition::None));
         }
@@ -478,8 +480,9 @@ impl ConfigService {
         let entry = Self::entry(caller, "trim", None);
         let noted = self.inner.store.append_audit(&[entry]).await;
         noted.map_err(|error| unavailable(&error))?;
+        // The floor rises first: what fails afterwards may have taken effect.
         let floor = self.inner.store.trim(before - 1, self.inner.keep_versions).await;
-        let floor = floor.map_err(|error| unavailable(&error))?;
+        let floor = floor.map_err(|error| outcome_unknown(&error))?;
         self.inner.log.raise_floor(floor);
         Ok(Answer {
             revision: state.revision(),

@@ -1,7 +1,7 @@
 //! Drives a blaze-config (`BLAZE_SERVER`, `BLAZE_TOKEN`) through the client that progenitor makes of `openapi-3.0.json`.
 
 mod client {
-    #![allow(clippy::all, unused, reason = "generated")]
+    #![allow(clippy::all, unused, unused_comparisons, reason = "generated")]
     include!(concat!(env!("OUT_DIR"), "/client.rs"));
 }
 
@@ -181,7 +181,7 @@ async fn replaced(client: &Client) -> anyhow::Result<()> {
     );
     let stale = refused(replace().send().await, 412, "precondition_failed").await?;
     ensure!(
-        stale.revision == Some(now.revision) && !stale.request_id.is_empty(),
+        stale.revision == Some(i64::try_from(now.revision.get())?) && !stale.request_id.is_empty(),
         "{stale:?}"
     );
     ensure!(stale.type_ == "/docs/errors/precondition_failed", "{stale:?}");

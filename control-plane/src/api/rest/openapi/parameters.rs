@@ -1,6 +1,5 @@
 //! Parameters of the operations: of the path, of the query, and headers.
 
-use blaze_domain::config::selector::MAX_SELECTOR_BYTES;
 use blaze_domain::config::{Kind, MAX_DOCUMENTS, MAX_INTEGER};
 use serde_json::{Value, json};
 use utoipa::openapi::Required;
@@ -72,10 +71,12 @@ fn query(param: Param, needed: bool) -> Parameter {
 fn shape(param: Param) -> ObjectBuilder {
     match param {
         Param::Limit => whole(1, 1000).default(Some(json!(100))),
-        Param::PageToken => formed(patterns::PAGE_TOKEN, 0, 1024),
-        Param::LabelSelector | Param::Prune => {
-            formed(patterns::SELECTOR, 1, MAX_SELECTOR_BYTES).examples([json!("site=lab")])
-        }
+        // Without a greatest length: far too long ones are refused as a URI, with 414, and not for their form.
+        Param::PageToken => text().pattern(Some(patterns::PAGE_TOKEN)),
+        Param::LabelSelector | Param::Prune => text()
+            .pattern(Some(patterns::SELECTOR))
+            .min_length(Some(1))
+            .examples([json!("site=lab")]),
         Param::Layer
         | Param::Node
         | Param::Service
