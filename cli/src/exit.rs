@@ -134,12 +134,21 @@ pub enum CliError {
     /// `diff` could not compare.
     #[error("{0}")]
     Diff(Box<CliError>),
+    /// One of the others, and what else there is to say about it.
+    #[error("{0}\n  {1}")]
+    Advised(Box<CliError>, String),
     /// Whoever read our output has gone; no failure.
     #[error("the output was closed")]
     OutputClosed,
 }
 
 impl CliError {
+    /// The same, with one more sentence for who reads it.
+    #[must_use]
+    pub fn advised(self, advice: impl Into<String>) -> Self {
+        Self::Advised(Box::new(self), advice.into())
+    }
+
     /// The exit code for it.
     #[must_use]
     pub fn exit(&self) -> Exit {
@@ -154,6 +163,7 @@ impl CliError {
                 Exit::Failed => Exit::DiffFailed,
                 exit => exit,
             },
+            Self::Advised(inner, _) => inner.exit(),
             Self::OutputClosed => Exit::Done,
             Self::Failed(_) | Self::Answer { .. } | Self::Foreign { .. } | Self::OutcomeUnknown { .. } => Exit::Failed,
         }
@@ -165,6 +175,13 @@ impl CliError {
         let (code, title) = match self {
             Self::Problem(refusal) => return refusal.problem.clone(),
             Self::Diff(inner) => return inner.to_json(),
+            Self::Advised(inner, advice) => {
+                let mut problem = inner.to_json();
+                if let Value::Object(members) = &mut problem {
+                    members.insert("hint".to_owned(), advice.as_str().into());
+                }
+                return problem;
+            }
             Self::Usage(_) => ("usage", "The options make no sense together."),
             Self::CannotConnect { .. } | Self::NoBroker { .. } | Self::NoServer { .. } => {
                 ("cannot_connect", "Nobody answers.")
@@ -229,5 +246,17 @@ mod tests {
                 .contains("Look before you try again")
         );
         assert_eq!(CliError::Usage("x".to_owned()).to_json()["applied"], "no");
+    }
+
+    #[test]
+    fn advice_changes_nothing_but_what_is_said() {
+        let error = CliError::Usage("x".to_owned()).advised("Try y.");
+        assert_eq!((error.exit(), error.to_string().as_str()), (Exit::Usage, "x\n  Try y."));
+        let problem = error.to_json();
+        assert_eq!(
+            (&problem["code"], &problem["hint"]),
+            (&json!("usage"), &json!("Try y."))
+        );
+        assert_eq!(problem["detail"], "x");
     }
 }

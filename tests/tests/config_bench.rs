@@ -20,7 +20,7 @@ fn run(arguments: &[&str]) -> (bool, String) {
             "--rate",
             "50",
         ])
-        .args(["--seconds", "0.2", "--warm-up", "0.05"])
+        .args(["--seconds", "0.15", "--warm-up", "0.03"])
         .args(arguments)
         .output()
         .unwrap();

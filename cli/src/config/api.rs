@@ -31,6 +31,8 @@ pub(crate) struct Filter {
     pub(crate) node: Option<NodeName>,
     /// At most so many; `None`: all.
     pub(crate) limit: Option<u64>,
+    /// With the text of secrets.
+    pub(crate) reveal: bool,
 }
 
 /// All pages of a listing.
@@ -73,7 +75,8 @@ impl Client {
         let call = Call::get(collection_path(kind, filter.service.as_ref()))
             .query_if("label_selector", filter.selector.clone())
             .query_if("layer", filter.layer.as_ref().map(LayerName::as_str))
-            .query_if("node", filter.node.as_ref().map(NodeName::as_str));
+            .query_if("node", filter.node.as_ref().map(NodeName::as_str))
+            .query_if("reveal", filter.reveal.then_some("true"));
         self.pages(&call, filter.limit).await
     }
 
@@ -133,7 +136,22 @@ impl Client {
     /// # Errors
     /// As [`Self::send`].
     pub(crate) async fn document(&self, key: &Key, revision: Option<u64>) -> Result<Answer, CliError> {
-        let call = Call::get(document_path(key)).query_if("revision", revision.map(|revision| revision.to_string()));
+        self.read_document(key, revision, false).await
+    }
+
+    /// As [`Self::document`]; with `reveal`, secrets have their text.
+    ///
+    /// # Errors
+    /// As [`Self::send`].
+    pub(crate) async fn read_document(
+        &self,
+        key: &Key,
+        revision: Option<u64>,
+        reveal: bool,
+    ) -> Result<Answer, CliError> {
+        let call = Call::get(document_path(key))
+            .query_if("revision", revision.map(|revision| revision.to_string()))
+            .query_if("reveal", reveal.then_some("true"));
         match self.send(&call).await {
             Err(CliError::Problem(refusal)) => Err(self.with_suggestion(*refusal, key).await),
             other => other,

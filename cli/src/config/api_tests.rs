@@ -121,3 +121,25 @@ fn a_clean_document_keeps_its_order() {
         r#"{"kind":"Node","name":"a","labels":{},"annotations":{},"spec":{"layer":"edge"}}"#
     );
 }
+
+#[tokio::test]
+async fn secrets_are_revealed_on_demand_alone() {
+    let stub = Stub::start(|_, _| Reply::json(&page(&[], ""))).await;
+    let client = stub.client();
+    let key = parse_key(Kind::Service, "slam").unwrap();
+    client.document(&key, None).await.unwrap();
+    client.read_document(&key, Some(4), true).await.unwrap();
+    let filter = Filter {
+        reveal: true,
+        ..Filter::default()
+    };
+    client.list(Kind::Service, &filter).await.unwrap();
+    assert_eq!(
+        stub.lines(),
+        [
+            "GET /api/v1/services/slam",
+            "GET /api/v1/services/slam?revision=4&reveal=true",
+            "GET /api/v1/services?reveal=true&limit=1000",
+        ]
+    );
+}

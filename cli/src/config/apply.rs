@@ -245,7 +245,11 @@ async fn wait(
             // The revision is written; whether the workers have it may show again in a moment.
             Err(error @ (CliError::NoServer { .. } | CliError::Foreign { .. })) => vec![error.to_string()],
             Err(CliError::Problem(refusal)) if refusal.status >= 500 => vec![refusal.to_string()],
-            Err(error) => return Err(error),
+            Err(error) => {
+                return Err(error.advised(format!(
+                    "Revision {revision} is written; which workers have it could not be asked."
+                )));
+            }
         };
         let now = Instant::now();
         if now >= until {

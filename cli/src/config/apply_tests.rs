@@ -151,6 +151,18 @@ async fn waiting_ends_when_all_have_it_or_the_time_is_over() {
         .unwrap_err();
     assert_eq!(error.exit() as u8, 1);
     assert!(error.to_string().contains("edge/robot-1 is at revision 419"), "{error}");
+    // Who may not ask for workers has written all the same.
+    let hidden = Stub::start(|_, _| Reply::problem(403, "permission_denied", "no")).await;
+    let error = wait(
+        &hidden.client(),
+        &done,
+        &sources(),
+        Duration::from_secs(60),
+        Format::Json,
+    )
+    .await
+    .unwrap_err();
+    assert!(error.to_string().contains("Revision 420 is written"), "{error}");
     // Where nothing changed there is nothing to wait for.
     let same = answer(420, &json!([]), ["unchanged", "unchanged"]);
     wait(&client, &same, &[], Duration::ZERO, Format::Json).await.unwrap();

@@ -22,6 +22,7 @@ fn every_command_of_the_contract_is_taken() {
         "get node/robot-1 --revision 4 --clean -o yaml",
         "get inst -l site=lab --layer edge --limit 5 -o name",
         "get services -w",
+        "get svc slam --reveal -o json",
         "describe svc slam",
         "apply -f a.yaml -f dir -f - --dry-run",
         "apply -f a.yaml --prune site=lab --prune-confirm 30 --wait 30s",
@@ -38,6 +39,10 @@ fn every_command_of_the_contract_is_taken() {
         "effective slam --instance 0 --node robot-1 --explain",
         "effective slam/0",
         "effective --layer edge",
+        "effective slam/0 --reveal",
+        "topology",
+        "digest edge -o json",
+        "trim --before 400 --yes",
         "watch",
         "watch node robot-1 --since 0",
         "watch instances --service slam -l a=b --bookmarks",
@@ -49,6 +54,8 @@ fn every_command_of_the_contract_is_taken() {
         "export",
         "export --layer edge --rollouts",
         "workers --server http://127.0.0.1:1 --token-file t --ca-file c --context lab",
+        "workers --client-cert c --client-key k",
+        "get nodes --client-cert c",
         "audit --kind node --outcome denied --since 24h --limit 10",
         "token create --subject ops --role operator --role viewer --expires 7d",
         "token create --subject w --role worker --layer edge --key-file k --alg EdDSA --key-id k1 --issuer i --audience a",
@@ -58,6 +65,7 @@ fn every_command_of_the_contract_is_taken() {
         "token inspect -",
         "token keygen --alg HS256 --out jwt.key",
         "context add lab --server https://lab.example",
+        "context add lab --server https://lab.example --client-cert c --client-key k",
         "context use lab",
         "context list",
         "context remove lab",
@@ -98,6 +106,12 @@ fn what_makes_no_sense_is_refused_with_exit_code_2() {
         "token create --subject s --role viewer --token abc",
         "token keygen --alg none --out f",
         "context add lab --server lab.example",
+        "context add lab --server https://lab.example --client-key k",
+        "get nodes --client-key k",
+        "digest",
+        "digest Edge",
+        "trim",
+        "trim --before 0",
         "context add a/b --server https://lab.example",
         "audit --outcome maybe",
     ] {
@@ -124,6 +138,31 @@ fn slips_get_a_suggestion() {
 fn no_option_takes_the_text_of_a_token() {
     let error = parse("get nodes --token abc").unwrap_err();
     assert_eq!(error.kind(), ErrorKind::UnknownArgument);
+}
+
+#[test]
+fn completions_have_every_command_and_option() {
+    use clap::CommandFactory as _;
+    for shell in [
+        clap_complete::Shell::Bash,
+        clap_complete::Shell::Zsh,
+        clap_complete::Shell::Fish,
+    ] {
+        let mut script = Vec::new();
+        clap_complete::generate(shell, &mut Arguments::command(), "blaze", &mut script);
+        let script = String::from_utf8(script).unwrap();
+        for word in [
+            "topology",
+            "digest",
+            "trim",
+            "client-cert",
+            "client-key",
+            "reveal",
+            "before",
+        ] {
+            assert!(script.contains(word), "{shell}: {word}");
+        }
+    }
 }
 
 #[tokio::test]

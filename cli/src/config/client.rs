@@ -12,6 +12,7 @@ use super::call::Call;
 use super::endpoint::{Endpoint, Surroundings, Token, TokenSource, resolve};
 use super::options::ServerOptions;
 use super::refusal::Refusal;
+use super::tls;
 use crate::exit::CliError;
 
 /// Largest answer that is read, in bytes.
@@ -73,7 +74,8 @@ impl Client {
     /// A client for a server; nothing is sent yet.
     ///
     /// # Errors
-    /// [`CliError::Invalid`] for a bad file of authorities, [`CliError::Failed`] when TLS cannot be set up.
+    /// [`CliError::Invalid`] for a bad file of authorities, of a certificate or its key, [`CliError::Failed`] when TLS cannot be
+    /// set up.
     pub(crate) fn new(endpoint: Endpoint) -> Result<Self, CliError> {
         let builder = reqwest::Client::builder()
             .user_agent(concat!("blaze/", env!("CARGO_PKG_VERSION")))
@@ -84,14 +86,24 @@ impl Client {
             .connect_timeout(CONNECT_TIMEOUT)
             .pool_idle_timeout(IDLE);
         let builder = match (&endpoint.ca_file, endpoint.is_tls()) {
-            (Some(file), true) => builder.tls_certs_only(authorities(file)?),
+            (Some(file), true) => builder.tls_certs_only(tls::authorities(file)?),
             (None, true) => builder,
             // Nothing is verified, so a machine without certificates of its own will do.
             (_, false) => builder.tls_certs_only(Vec::<Certificate>::new()),
         };
-        let http = builder
-            .build()
-            .map_err(|error| CliError::Failed(format!("the HTTP client cannot be set up: {}", reason(&error))))?;
+        let shown = endpoint.client_certificate.as_ref().filter(|_| endpoint.is_tls());
+        let builder = match shown {
+            Some(files) => builder.identity(tls::identity(files)?),
+            None => builder,
+        };
+        let http = builder.build().map_err(|error| match shown {
+            Some(files) if tls::fault(&error).is_some_and(tls::is_mismatch) => CliError::Invalid(format!(
+                "the client certificate {} and its key {} do not belong together",
+                files.cert_file.display(),
+                files.key_file.as_ref().unwrap_or(&files.cert_file).display()
+            )),
+            _ => CliError::Failed(format!("the HTTP client cannot be set up: {}", reason(&error))),
+        })?;
         Ok(Self { http, endpoint })
     }
 
@@ -226,6 +238,7 @@ impl Client {
     }
 
     fn no_answer(&self, call: &Call, fault: Fault, token: Option<&Token>) -> CliError {
+        let mut advice = None;
         let (reason, unreached) = match fault {
             Fault::Before(error) => return error,
             Fault::TooLarge => {
@@ -235,24 +248,28 @@ impl Client {
                 ));
             }
             Fault::Late => (format!("no answer within {} s", REQUEST_TIMEOUT.as_secs()), false),
-            Fault::Http(error) => (redact(&reason(&error), token), error.is_connect() || error.is_builder()),
+            Fault::Http(error) => {
+                let of_tls = tls::fault(&error);
+                advice = of_tls.and_then(|fault| tls::advice(fault, &self.endpoint));
+                if advice.is_none() && broke(&error) {
+                    advice = tls::broke_off(&self.endpoint);
+                }
+                let before = error.is_connect() || error.is_builder() || of_tls.is_some_and(tls::is_refused);
+                (redact(&reason(&error), token), before)
+            }
         };
         let server = self.server().to_owned();
         if !unreached && !call.harmless {
             return CliError::OutcomeUnknown { server, reason };
         }
-        let advice = if reason.contains("UnknownIssuer") || reason.contains("invalid peer certificate") {
-            "The certificate is not trusted: --ca-file FILE names the authority that signed it."
-        } else if !unreached && !self.endpoint.is_tls() {
-            "If it speaks TLS, name it with https://."
-        } else {
-            "Name the server with --server URL, BLAZE_SERVER or a context (`blaze context list`)."
-        };
-        CliError::NoServer {
-            server,
-            reason,
-            advice: advice.to_owned(),
-        }
+        let advice = advice.unwrap_or_else(|| {
+            if !unreached && !self.endpoint.is_tls() {
+                "If it speaks TLS, name it with https://.".to_owned()
+            } else {
+                "Name the server with --server URL, BLAZE_SERVER or a context (`blaze context list`).".to_owned()
+            }
+        });
+        CliError::NoServer { server, reason, advice }
     }
 }
 
@@ -270,15 +287,6 @@ async fn read(response: &mut Response) -> Result<Vec<u8>, Fault> {
         body.extend_from_slice(&chunk);
     }
     Ok(body)
-}
-
-fn authorities(file: &std::path::Path) -> Result<Vec<Certificate>, CliError> {
-    let place = file.display();
-    let pem = std::fs::read(file).map_err(|error| CliError::Failed(format!("the authorities in {place}: {error}")))?;
-    match Certificate::from_pem_bundle(&pem) {
-        Ok(certificates) if !certificates.is_empty() => Ok(certificates),
-        Ok(_) | Err(_) => Err(CliError::Invalid(format!("{place} holds no certificate in PEM form"))),
-    }
 }
 
 fn header(headers: &HeaderMap, name: &HeaderName) -> Option<String> {

@@ -1,7 +1,7 @@
 use serde_json::json;
 
 use super::*;
-use crate::config::endpoint::parse_server;
+use crate::config::endpoint::{ClientCertificate, parse_server};
 use crate::config::stub::{Reply, Stub};
 
 const NODES: &str = "/api/v1/nodes";
@@ -90,6 +90,7 @@ async fn nobody_there_means_exit_3_for_writes_too() {
     let client = Client::new(Endpoint {
         url: parse_server(&format!("http://{address}")).unwrap(),
         ca_file: None,
+        client_certificate: None,
         token: None,
     })
     .unwrap();
@@ -153,6 +154,7 @@ fn authorities_are_read_before_anything_is_sent() {
     let endpoint = Endpoint {
         url: parse_server("https://127.0.0.1:1").unwrap(),
         ca_file: Some(file.clone()),
+        client_certificate: None,
         token: None,
     };
     assert_eq!(Client::new(endpoint.clone()).unwrap_err().exit() as u8, 1);
@@ -162,49 +164,110 @@ fn authorities_are_read_before_anything_is_sent() {
     assert!(error.to_string().contains("ca.pem"), "{error}");
 }
 
-/// A server of TLS with a certificate for `localhost` and 127.0.0.1, and the file of its authority.
-async fn tls_server(directory: &std::path::Path) -> (String, std::path::PathBuf, tokio::task::JoinSet<()>) {
+/// A server of TLS with a certificate for `localhost` and 127.0.0.1, and the file of its authority. With an authority of
+/// clients it takes only those that show a certificate of it.
+async fn tls_server(
+    directory: &std::path::Path,
+    clients: Option<rustls::RootCertStore>,
+) -> (String, std::path::PathBuf, tokio::task::JoinSet<()>) {
+    use std::sync::Arc;
     use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
     let names = ["localhost".to_owned(), "127.0.0.1".to_owned()];
     let made = rcgen::generate_simple_self_signed(names).unwrap();
     let file = directory.join("ca.pem");
     std::fs::write(&file, made.cert.pem()).unwrap();
     let key = rustls::pki_types::PrivatePkcs8KeyDer::from(made.signing_key.serialize_der());
-    let provider = std::sync::Arc::new(rustls::crypto::aws_lc_rs::default_provider());
-    let config = rustls::ServerConfig::builder_with_provider(provider)
+    let provider = Arc::new(rustls::crypto::aws_lc_rs::default_provider());
+    let builder = rustls::ServerConfig::builder_with_provider(Arc::clone(&provider))
         .with_safe_default_protocol_versions()
-        .unwrap()
-        .with_no_client_auth()
+        .unwrap();
+    let builder = match clients {
+        Some(roots) => {
+            let verifier = rustls::server::WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider);
+            builder.with_client_cert_verifier(verifier.build().unwrap())
+        }
+        None => builder.with_no_client_auth(),
+    };
+    let config = builder
         .with_single_cert(vec![made.cert.der().clone()], key.into())
         .unwrap();
-    let acceptor = tokio_rustls::TlsAcceptor::from(std::sync::Arc::new(config));
+    let acceptor = tokio_rustls::TlsAcceptor::from(Arc::new(config));
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("https://{}", listener.local_addr().unwrap());
     let mut task = tokio::task::JoinSet::new();
     task.spawn(async move {
         loop {
             let (stream, _) = listener.accept().await.unwrap();
-            let Ok(mut stream) = acceptor.accept(stream).await else {
-                continue;
-            };
-            let mut request = [0_u8; 4096];
-            let _ = stream.read(&mut request).await;
-            let answer = "HTTP/1.1 200 OK\r\nconnection: close\r\ncontent-length: 2\r\n\r\n{}";
-            let _ = stream.write_all(answer.as_bytes()).await;
-            let _ = stream.shutdown().await;
+            match acceptor.accept(stream).into_fallible().await {
+                Ok(mut stream) => {
+                    let mut request = [0_u8; 4096];
+                    let _ = stream.read(&mut request).await;
+                    let answer = "HTTP/1.1 200 OK\r\nconnection: close\r\ncontent-length: 2\r\n\r\n{}";
+                    let _ = stream.write_all(answer.as_bytes()).await;
+                    let _ = stream.shutdown().await;
+                }
+                // What the client has sent already is read: else the system resets the connection, and the alert may be lost.
+                Err((_, mut stream)) => {
+                    let _ = stream.shutdown().await;
+                    let _ = tokio::io::copy(&mut stream, &mut tokio::io::sink()).await;
+                }
+            }
         }
     });
     (url, file, task)
 }
 
 #[tokio::test]
+async fn a_server_may_ask_for_a_certificate() {
+    let directory = tempfile::tempdir().unwrap();
+    let made = rcgen::generate_simple_self_signed(["client".to_owned()]).unwrap();
+    let mut roots = rustls::RootCertStore::empty();
+    roots.add(made.cert.der().clone()).unwrap();
+    let (url, ca_file, _task) = tls_server(directory.path(), Some(roots)).await;
+    let cert_file = directory.path().join("client.pem");
+    let key_file = directory.path().join("client.key");
+    std::fs::write(&cert_file, made.cert.pem()).unwrap();
+    std::fs::write(&key_file, made.signing_key.serialize_pem()).unwrap();
+    let endpoint = |client_certificate| Endpoint {
+        url: parse_server(&url).unwrap(),
+        ca_file: Some(ca_file.clone()),
+        client_certificate,
+        token: None,
+    };
+    let shown = ClientCertificate {
+        cert_file: cert_file.clone(),
+        key_file: Some(key_file.clone()),
+    };
+    let client = Client::new(endpoint(Some(shown.clone()))).unwrap();
+    client.send(&Call::get(NODES)).await.unwrap();
+    client.send(&Call::delete("/api/v1/nodes/a")).await.unwrap();
+
+    let error = Client::new(endpoint(None))
+        .unwrap()
+        .send(&Call::get(NODES))
+        .await
+        .unwrap_err();
+    assert_eq!(error.exit() as u8, 3, "{error}");
+    let text = error.to_string();
+    assert!(text.contains("--client-cert FILE --client-key FILE"), "{text}");
+    assert!(!text.contains("--server URL"), "{text}");
+
+    let other = rcgen::generate_simple_self_signed(["client".to_owned()]).unwrap();
+    std::fs::write(&key_file, other.signing_key.serialize_pem()).unwrap();
+    let error = Client::new(endpoint(Some(shown))).unwrap_err();
+    assert_eq!(error.exit() as u8, 7, "{error}");
+    assert!(error.to_string().contains("do not belong together"), "{error}");
+}
+
+#[tokio::test]
 async fn tls_needs_the_authority_that_signed() {
     let directory = tempfile::tempdir().unwrap();
-    let (url, ca_file, _task) = tls_server(directory.path()).await;
+    let (url, ca_file, _task) = tls_server(directory.path(), None).await;
     let client = |url: &str, ca_file| {
         let endpoint = Endpoint {
             url: parse_server(url).unwrap(),
             ca_file,
+            client_certificate: None,
             token: Some(TokenSource::Variable(Token::of("abc"))),
         };
         Client::new(endpoint).unwrap()

@@ -39,6 +39,12 @@ pub struct AddOptions {
     /// Authorities that may sign the server's certificate (PEM)
     #[arg(long, value_name = "FILE")]
     pub ca_file: Option<PathBuf>,
+    /// Certificate to show to a server that asks for one (PEM)
+    #[arg(long, value_name = "FILE")]
+    pub client_cert: Option<PathBuf>,
+    /// Its private key (PEM), where it is not in the same file
+    #[arg(long, value_name = "FILE", requires = "client_cert")]
+    pub client_key: Option<PathBuf>,
 }
 
 /// One context.
@@ -66,17 +72,21 @@ pub(super) fn run(command: &ContextCommand, format: Format) -> Result<Exit, CliE
 fn run_with(command: &ContextCommand, file: &Path, format: Format) -> Result<Exit, CliError> {
     match command {
         ContextCommand::Add(options) => {
-            for given in [&options.token_file, &options.ca_file]
-                .into_iter()
-                .flatten()
-                .filter(|file| !file.exists())
-            {
+            let files = [
+                &options.token_file,
+                &options.ca_file,
+                &options.client_cert,
+                &options.client_key,
+            ];
+            for given in files.into_iter().flatten().filter(|file| !file.exists()) {
                 note(format, &format!("{} does not exist yet", given.display()));
             }
             let context = Context {
                 server: options.server.clone(),
                 token_file: options.token_file.as_deref().map(absolute).transpose()?,
                 ca_file: options.ca_file.as_deref().map(absolute).transpose()?,
+                client_cert: options.client_cert.as_deref().map(absolute).transpose()?,
+                client_key: options.client_key.as_deref().map(absolute).transpose()?,
             };
             let known = contexts::update(file, |known| {
                 known.contexts.insert(options.name.clone(), context);
@@ -145,6 +155,7 @@ fn listed(known: &Contexts) -> Value {
             json!({
                 "name": name, "current": known.current.as_deref() == Some(name), "server": context.server,
                 "token_file": context.token_file, "ca_file": context.ca_file,
+                "client_cert": context.client_cert, "client_key": context.client_key,
             })
         })
         .collect();
@@ -165,6 +176,7 @@ fn table(listed: &Value) -> String {
         ("SERVER", Align::Left),
         ("TOKEN FILE", Align::Left),
         ("AUTHORITIES", Align::Left),
+        ("CLIENT CERTIFICATE", Align::Left),
     ];
     let row = |item: &Value| {
         let current = item.get("current").and_then(Value::as_bool).unwrap_or(false);
@@ -174,6 +186,7 @@ fn table(listed: &Value) -> String {
             cell(item.get("server")),
             cell(item.get("token_file")),
             cell(item.get("ca_file")),
+            cell(item.get("client_cert")),
         ]
     };
     render_table(&columns, items.iter().map(row).collect(), terminal_width())
@@ -189,6 +202,8 @@ mod tests {
             server: format!("https://{name}.example"),
             token_file: Some(PathBuf::from("token")),
             ca_file: None,
+            client_cert: Some(PathBuf::from("client.pem")),
+            client_key: None,
         })
     }
 
@@ -209,13 +224,22 @@ mod tests {
         assert_eq!(current().as_deref(), Some("hall"));
         let kept = contexts::load(&file).unwrap();
         assert!(kept.contexts["lab"].token_file.as_ref().unwrap().is_absolute());
+        assert!(kept.contexts["lab"].client_cert.as_ref().unwrap().is_absolute());
         assert!(
             table(&listed(&kept)).contains("hall  *        https://hall.example"),
             "{}",
             table(&listed(&kept))
         );
         let error = run(&ContextCommand::Use(named("labb"))).unwrap_err();
-        assert!(error.to_string().contains("did you mean lab?"), "{error}");
+        assert!(
+            error.to_string().contains("did you mean lab?\n  `blaze context list`"),
+            "{error}"
+        );
+        let error = run(&ContextCommand::Use(named("zebra"))).unwrap_err();
+        assert!(
+            error.to_string().starts_with("there is no context zebra\n  `blaze"),
+            "{error}"
+        );
         run(&ContextCommand::Remove(named("hall"))).unwrap();
         assert_eq!(current(), None);
         assert_eq!(contexts::load(&file).unwrap().contexts.len(), 1);

@@ -23,6 +23,12 @@ pub(crate) struct Context {
     /// Authorities that may sign the server's certificate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) ca_file: Option<PathBuf>,
+    /// Certificate to show to a server that asks for one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) client_cert: Option<PathBuf>,
+    /// Its private key; without it, the file of the certificate holds it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) client_key: Option<PathBuf>,
 }
 
 /// The file of contexts.
@@ -117,6 +123,8 @@ mod tests {
                 server: format!("https://{name}.example:8443"),
                 token_file: Some(PathBuf::from("/run/token")),
                 ca_file: None,
+                client_cert: None,
+                client_key: None,
             };
             contexts.contexts.insert(name.to_owned(), context);
             contexts.current.get_or_insert_with(|| name.to_owned());

@@ -1,6 +1,6 @@
 //! `blaze delete`.
 
-use std::io::{BufRead, IsTerminal as _, Write};
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use blaze_domain::config::Key;
@@ -8,14 +8,19 @@ use clap::Args;
 use serde_json::{Map, Value, json};
 
 use super::apply::{Request, send_array};
+use super::ask::{confirmed, must_be_possible};
 use super::call::Call;
+use super::cascade;
 use super::client::{Answer, Client};
 use super::files;
 use super::kinds::{self, Target, document_path, name_of};
 use super::options::ServerOptions;
-use super::text::{count, print};
+use super::text::{count, note, print};
 use crate::exit::{CliError, Exit};
 use crate::output::Format;
+
+/// Documents that a question lists of those that are named, and of those that go with them.
+const MAX_LISTED: usize = 100;
 
 /// Options of `blaze delete`.
 #[derive(Debug, Args)]
@@ -58,36 +63,66 @@ pub(super) async fn run(options: &DeleteOptions, format: Format) -> Result<Exit,
     if keys.is_empty() {
         return Err(CliError::Usage("the files hold no documents".to_owned()));
     }
-    let terminal = std::io::stdin().is_terminal();
-    if !options.yes && !terminal {
-        return Err(CliError::Usage(
-            "nobody can be asked without a terminal: give --yes".to_owned(),
-        ));
-    }
+    must_be_possible(options.yes)?;
     let client = Client::of(&options.server)?;
     let found = look(&client, &keys).await?;
-    if !options.yes
-        && !confirmed(
-            &question(&keys, options.cascade),
-            &mut std::io::stdin().lock(),
-            &mut std::io::stderr(),
-        )?
-    {
-        return Err(CliError::Failed("nothing was deleted".to_owned()));
+    if !options.yes {
+        let along = if options.cascade {
+            cascade::referrers(&client, &keys).await?
+        } else {
+            Vec::new()
+        };
+        if !confirmed(&question(&keys, &along))? {
+            return Err(CliError::Failed("nothing was deleted".to_owned()));
+        }
     }
-    delete(
-        &client,
-        &found,
-        options.cascade,
-        options.force,
-        options.target.is_none(),
-    )
-    .await?;
-    let deleted: Vec<Value> = keys.iter().map(|key| Value::Object(reference(key))).collect();
-    print(&json!({ "deleted": deleted }), format, |_| {
-        keys.iter().map(|key| format!("{} deleted\n", name_of(key))).collect()
-    })?;
-    Ok(Exit::Done)
+    let mut gone = Gone::default();
+    let several = options.target.is_none();
+    let ended = delete(&client, &found, options.cascade, options.force, several, &mut gone).await;
+    // What is deleted is told, also when the next one was refused.
+    if !gone.keys.is_empty() {
+        let complete = !options.cascade || gone.take_along(&client, format).await;
+        let deleted: Vec<Value> = gone.keys.iter().map(|key| Value::Object(reference(key))).collect();
+        let mut told = json!({ "deleted": deleted });
+        if !complete {
+            told["incomplete"] = true.into();
+        }
+        print(&told, format, |_| {
+            gone.keys
+                .iter()
+                .map(|key| format!("{} deleted\n", name_of(key)))
+                .collect()
+        })?;
+    }
+    ended.map(|()| Exit::Done)
+}
+
+/// What was deleted.
+#[derive(Debug, Default)]
+struct Gone {
+    /// Documents, those that were named first.
+    keys: Vec<Key>,
+    /// Revisions of the deletions.
+    revisions: BTreeSet<u64>,
+}
+
+impl Gone {
+    /// Adds what the deletions took along: the server tells it in the commits alone. Whether they could be read.
+    async fn take_along(&mut self, client: &Client, format: Format) -> bool {
+        match cascade::deleted(client, &self.revisions).await {
+            Some(along) => {
+                let named: BTreeSet<Key> = self.keys.iter().cloned().collect();
+                self.keys.extend(along.into_iter().filter(|key| !named.contains(key)));
+                true
+            }
+            None => {
+                let since = self.revisions.first().map(|first| first.saturating_sub(1));
+                let how = since.map_or_else(String::new, |since| format!(": `blaze watch --since {since}` shows it"));
+                note(format, &format!("what was deleted with it could not be read{how}"));
+                false
+            }
+        }
+    }
 }
 
 /// Reads all documents first: none is deleted when one does not exist.
@@ -106,10 +141,12 @@ async fn delete(
     cascade: bool,
     force: bool,
     several: bool,
+    gone: &mut Gone,
 ) -> Result<(), CliError> {
     if several && !cascade {
         let documents: Value = found.iter().map(|(key, answer)| deletion(key, answer, force)).collect();
         send_array(client, &documents, &Request::default()).await?;
+        gone.keys.extend(found.iter().map(|(key, _)| key.clone()));
         return Ok(());
     }
     for (index, (key, answer)) in found.iter().enumerate() {
@@ -122,7 +159,7 @@ async fn delete(
             .query_if("cascade", cascade.then_some("true"))
             .if_match(Some(tag));
         match client.send(&call).await {
-            Ok(_) => {}
+            Ok(answer) => gone.revisions.extend(answer.revision),
             // What stood before it has taken it along; it existed when all was read.
             Err(CliError::Problem(refusal)) if index > 0 && refusal.code() == "not_found" => {}
             Err(CliError::Problem(refusal)) if refusal.code() == "in_use" => {
@@ -131,6 +168,7 @@ async fn delete(
             }
             Err(error) => return Err(error),
         }
+        gone.keys.push(key.clone());
     }
     Ok(())
 }
@@ -155,29 +193,38 @@ fn reference(key: &Key) -> Map<String, Value> {
     members
 }
 
-fn question(keys: &[Key], cascade: bool) -> String {
-    let what = match keys {
-        [key] => name_of(key),
-        keys => {
-            let names: Vec<String> = keys.iter().take(20).map(name_of).collect();
-            let more = if keys.len() > 20 { ", …" } else { "" };
-            format!("{}: {}{more}", count(keys.len(), "document"), names.join(", "))
+/// What is asked. All that would go with it stands there, up to a number that can be read.
+fn question(keys: &[Key], along: &[Key]) -> String {
+    let listed = |keys: &[Key]| {
+        let mut text: String = keys
+            .iter()
+            .take(MAX_LISTED)
+            .map(|key| format!("  {}\n", name_of(key)))
+            .collect();
+        if keys.len() > MAX_LISTED {
+            text.push_str(&format!("  and {} more\n", keys.len() - MAX_LISTED));
         }
+        text
     };
-    let also = if cascade { " and all that refers to it" } else { "" };
-    format!("Delete {what}{also}? [y/N] ")
-}
-
-/// Asks; only `y` and `yes` are a yes.
-fn confirmed(question: &str, input: &mut dyn BufRead, output: &mut dyn Write) -> Result<bool, CliError> {
-    let failed = |error: std::io::Error| CliError::Failed(format!("the terminal: {error}"));
-    output
-        .write_all(question.as_bytes())
-        .and_then(|()| output.flush())
-        .map_err(failed)?;
-    let mut answer = String::new();
-    input.read_line(&mut answer).map_err(failed)?;
-    Ok(matches!(answer.trim().to_ascii_lowercase().as_str(), "y" | "yes"))
+    let mut text = match keys {
+        [key] if along.is_empty() => return format!("Delete {}?", name_of(key)),
+        [key] => format!("{} would be deleted", name_of(key)),
+        keys => format!("{} would be deleted:\n{}", count(keys.len(), "document"), listed(keys)),
+    };
+    if !along.is_empty() {
+        let with = if text.ends_with('\n') {
+            "With them"
+        } else {
+            ", and with it"
+        };
+        text.push_str(&format!(
+            "{with} what refers to it, {}:\n{}",
+            count(along.len(), "document"),
+            listed(along)
+        ));
+    }
+    text.push_str(&format!("Delete all {}?", keys.len() + along.len()));
+    text
 }
 
 #[cfg(test)]
@@ -199,7 +246,7 @@ mod tests {
             "POST" => Reply::json(&json!({"results": []})),
             _ if asked.target.contains("used") => Reply::problem(409, "in_use", "by an instance"),
             _ if asked.target.contains("taken") => Reply::problem(404, "not_found", "no"),
-            _ => Reply::Full(204, Vec::new(), String::new()),
+            _ => Reply::Full(204, vec![("blaze-revision", "413".to_owned())], String::new()),
         })
         .await
     }
@@ -209,8 +256,10 @@ mod tests {
         let stub = stub().await;
         let client = stub.client();
         let found = look(&client, &keys(&["node/a"])).await.unwrap();
-        delete(&client, &found, true, false, false).await.unwrap();
-        delete(&client, &found, false, true, false).await.unwrap();
+        let mut gone = Gone::default();
+        delete(&client, &found, true, false, false, &mut gone).await.unwrap();
+        assert_eq!((gone.keys.len(), &gone.revisions), (1, &BTreeSet::from([413])));
+        delete(&client, &found, false, true, false, &mut gone).await.unwrap();
         let asked = stub.asked();
         assert_eq!(asked[1].line(), "DELETE /api/v1/nodes/a?cascade=true");
         assert_eq!(asked[1].header("if-match"), Some("\"412\""));
@@ -223,7 +272,9 @@ mod tests {
         let stub = stub().await;
         let client = stub.client();
         let found = look(&client, &keys(&["node/a", "inst/slam/0"])).await.unwrap();
-        delete(&client, &found, false, false, true).await.unwrap();
+        let mut gone = Gone::default();
+        delete(&client, &found, false, false, true, &mut gone).await.unwrap();
+        assert_eq!(gone.keys, keys(&["node/a", "inst/slam/0"]));
         let last = stub.asked().pop().unwrap();
         assert_eq!(last.line(), "POST /api/v1/apply");
         assert_eq!(
@@ -237,32 +288,60 @@ mod tests {
         assert_eq!(error.exit() as u8, 4);
         // With cascade the second may be gone by then.
         let found = look(&client, &keys(&["node/a", "node/taken"])).await.unwrap();
-        delete(&client, &found, true, false, true).await.unwrap();
-        let found = look(&client, &keys(&["node/used"])).await.unwrap();
-        let error = delete(&client, &found, false, false, false).await.unwrap_err();
+        delete(&client, &found, true, false, true, &mut Gone::default())
+            .await
+            .unwrap();
+        let found = look(&client, &keys(&["node/a", "node/used"])).await.unwrap();
+        let mut gone = Gone::default();
+        let error = delete(&client, &found, true, false, true, &mut gone).await.unwrap_err();
+        // The first is gone all the same.
+        assert_eq!(gone.keys, keys(&["node/a"]));
         assert_eq!(error.exit() as u8, 5);
         assert!(error.to_string().contains("--cascade"), "{error}");
     }
 
     #[test]
-    fn only_a_yes_is_a_yes() {
-        for (answer, yes) in [
-            ("y\n", true),
-            (" YES \n", true),
-            ("\n", false),
-            ("", false),
-            ("yep\n", false),
-        ] {
-            let mut shown = Vec::new();
-            let question = question(&keys(&["node/a"]), true);
-            assert_eq!(
-                confirmed(&question, &mut answer.as_bytes(), &mut shown).unwrap(),
-                yes,
-                "{answer:?}"
-            );
-            assert_eq!(shown, b"Delete node/a and all that refers to it? [y/N] ");
-        }
-        let many = question(&keys(&["node/a", "ly/edge"]), false);
-        assert_eq!(many, "Delete 2 documents: node/a, layer/edge? [y/N] ");
+    fn a_question_says_all_that_would_go() {
+        let one = keys(&["ly/edge"]);
+        assert_eq!(question(&one, &[]), "Delete layer/edge?");
+        assert_eq!(
+            question(&one, &keys(&["node/a", "inst/slam/0"])),
+            "layer/edge would be deleted, and with it what refers to it, 2 documents:\n  node/a\n  instance/slam/0\nDelete all 3?"
+        );
+        let two = keys(&["node/a", "ly/edge"]);
+        assert_eq!(
+            question(&two, &[]),
+            "2 documents would be deleted:\n  node/a\n  layer/edge\nDelete all 2?"
+        );
+        assert!(question(&two, &keys(&["ro/a"])).contains("\nWith them what refers to it, 1 document:\n  rollout/a\n"));
+        let many: Vec<Key> = (0..MAX_LISTED + 3)
+            .map(|number| {
+                kinds::parse_target(&format!("node/n{number}"))
+                    .unwrap()
+                    .key(None)
+                    .unwrap()
+            })
+            .collect();
+        assert!(question(&one, &many).ends_with("  node/n99\n  and 3 more\nDelete all 104?"));
+    }
+
+    #[tokio::test]
+    async fn what_went_along_is_told_once_each() {
+        let stub = Stub::start(|_, _| {
+            let changes: Vec<Value> = ["a", "b"]
+                .map(|name| json!({"op": "delete", "kind": "Node", "name": name}))
+                .to_vec();
+            let data = json!({"revision": 413, "changes": changes});
+            Reply::Events(format!("retry: 1\nid: 413\nevent: change\ndata: {data}\n\n"))
+        })
+        .await;
+        let mut gone = Gone {
+            keys: keys(&["node/a"]),
+            revisions: BTreeSet::from([413]),
+        };
+        assert!(gone.take_along(&stub.client(), Format::Json).await);
+        assert_eq!(gone.keys, keys(&["node/a", "node/b"]));
+        gone.revisions.clear();
+        assert!(!gone.take_along(&stub.client(), Format::Json).await);
     }
 }

@@ -8,7 +8,7 @@ use serde_json::Value;
 use super::apply::{self, Request};
 use super::call::Call;
 use super::client::Client;
-use super::files;
+use super::files::{self, Source};
 use super::kinds::{self, Target, document_path};
 use super::options::ServerOptions;
 use super::text::{compact, member, note, print};
@@ -74,7 +74,7 @@ async fn compare(options: &DiffOptions, format: Format) -> Result<Exit, CliError
             differs
         }
         _ => {
-            let sources = files::read(&options.files)?;
+            let sources = without_revisions(files::read(&options.files)?);
             let client = Client::of(&options.server)?;
             let request = Request {
                 dry_run: true,
@@ -92,6 +92,17 @@ async fn compare(options: &DiffOptions, format: Format) -> Result<Exit, CliError
         note(format, "nothing differs");
     }
     Ok(if differs { Exit::Failed } else { Exit::Done })
+}
+
+/// `revision` in a file is the precondition of a change, and here nothing is changed: what others wrote in between is to be
+/// shown, not refused.
+fn without_revisions(mut sources: Vec<Source>) -> Vec<Source> {
+    for source in &mut sources {
+        if let Value::Object(members) = &mut source.value {
+            members.shift_remove("revision");
+        }
+    }
+    sources
 }
 
 fn has_differences(answer: &Value) -> bool {
@@ -139,6 +150,22 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+
+    #[test]
+    fn a_file_that_is_behind_is_compared_all_the_same() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = directory.path().join("a.yaml");
+        std::fs::write(
+            &file,
+            "kind: Node\nname: a\nrevision: 4\nspec: { config: { revision: 5 } }\n",
+        )
+        .unwrap();
+        let sources = without_revisions(files::read(&[file]).unwrap());
+        assert_eq!(
+            sources[0].value,
+            json!({"kind": "Node", "name": "a", "spec": {"config": {"revision": 5}}})
+        );
+    }
 
     #[test]
     fn differences_read_as_lines() {

@@ -3,6 +3,8 @@
 //! ```text
 //! GET (ETag) ─► file of the owner alone ─► $VISUAL, $EDITOR, vi ─► YAML ─► PUT with If-Match ─► file removed
 //!                                                                  └─ refused: the file stays, and how to go on is told
+//!
+//! The file holds the revision that was read: where it is applied later, it is the precondition.
 //! ```
 
 use std::fs::OpenOptions;
@@ -70,16 +72,14 @@ async fn edit(
     directory: &Path,
 ) -> Result<Option<Value>, CliError> {
     let mut answer = client.document(key, None).await?;
-    let before = clean(std::mem::take(&mut answer.body));
+    let document = std::mem::take(&mut answer.body);
     let tag = if force { "*".to_owned() } else { client.tag(answer)? };
-    let text = format!(
-        "# {}: save and leave to change it, leave it as it is to change nothing.\n# Secrets that are redacted stay as they are.\n{}",
-        name_of(key),
-        yaml::document(&before)
-    );
+    let (before, text) = shown(key, document, force);
     let file = new_file(directory, key, &text)?;
+    if let Err(error) = launch(editor, &file).await {
+        return Err(not_edited(error, &file, &text));
+    }
     let change = async {
-        launch(editor, &file).await?;
         let after = read_back(&file, key)?;
         if after == before {
             return Ok(None);
@@ -95,6 +95,23 @@ async fn edit(
         }
         Err(error) => Err(kept(error, &file, key)),
     }
+}
+
+/// What is edited, and the text of the file. Without `force` it has the revision, which fences what is applied later.
+fn shown(key: &Key, document: Value, force: bool) -> (Value, String) {
+    let revision = document.get("revision").filter(|_| !force).cloned();
+    let before = clean(document);
+    let mut text = format!(
+        "# {}: save and leave to change it, leave it as it is to change nothing.\n# Secrets that are redacted stay as they are.\n{}",
+        name_of(key),
+        yaml::document(&before)
+    );
+    if let Some(revision) = revision {
+        text.push_str(&format!(
+            "# What was read. It keeps this file from changing what others write in the meantime.\nrevision: {revision}\n"
+        ));
+    }
+    (before, text)
 }
 
 fn new_file(directory: &Path, key: &Key, text: &str) -> Result<PathBuf, CliError> {
@@ -145,30 +162,30 @@ fn read_back(file: &Path, key: &Key) -> Result<Value, CliError> {
     }
 }
 
+/// The editor failed: what stands in the file is told only where something was written.
+fn not_edited(error: CliError, file: &Path, text: &str) -> CliError {
+    let untouched = std::fs::read(file).is_ok_and(|content| content == text.as_bytes());
+    if untouched {
+        let _ = std::fs::remove_file(file);
+        error
+    } else {
+        error.advised(format!("What the editor left behind is in {}.", file.display()))
+    }
+}
+
 /// Says where the edited file is and how to go on.
 fn kept(error: CliError, file: &Path, key: &Key) -> CliError {
-    let name = name_of(key);
-    let file = file.display();
-    match error {
-        CliError::Problem(refusal) => {
-            let how = if refusal.exit() == Exit::Conflict {
-                format!(
-                    "what you wrote is in {file}; see what is different now with `blaze diff -f {file}`, then `blaze apply -f {file}`, or edit {name} anew"
-                )
-            } else {
-                format!("what you wrote is in {file}; correct it and `blaze apply -f {file}`")
-            };
-            CliError::Problem(Box::new(refusal.with_hint(how)))
-        }
-        CliError::Invalid(text) => CliError::Invalid(format!(
-            "{text}\n  What you wrote is in {file}; correct it and `blaze apply -f {file}`."
-        )),
-        CliError::Failed(text) => CliError::Failed(format!("{text}\n  What you wrote is in {file}.")),
-        other => {
-            eprintln!("blaze: what you wrote is in {file}");
-            other
-        }
-    }
+    let place = file.display();
+    let moved = matches!(&error, CliError::Problem(refusal) if matches!(refusal.code(), "precondition_failed" | "revision_conflict"));
+    let how = match error.exit() {
+        _ if moved => format!(
+            "`blaze diff -f {place}` shows how it differs from what is there now. Take that over, set its `revision` to the one of now, and `blaze apply -f {place}`; or `blaze edit {}` anew.",
+            name_of(key)
+        ),
+        Exit::Invalid => format!("Correct it and `blaze apply -f {place}`."),
+        _ => format!("To go on: `blaze apply -f {place}`."),
+    };
+    error.advised(format!("What you wrote is in {place}. {how}"))
 }
 
 #[cfg(test)]
@@ -243,6 +260,23 @@ mod tests {
             .await
             .unwrap_err();
         assert!(error.to_string().contains("nothing was changed"), "{error}");
+        assert!(!error.to_string().contains("What "), "{error}");
+        assert!(left(directory.path()).is_empty());
+        // It wrote something and failed then.
+        let error = edit(
+            &client,
+            &key(),
+            false,
+            "false $(sed -i s/static/mobile/ \"$1\")",
+            directory.path(),
+        )
+        .await
+        .unwrap_err();
+        assert!(
+            error.to_string().contains("What the editor left behind is in"),
+            "{error}"
+        );
+        assert_eq!(left(directory.path()).len(), 1);
         assert!(stub.asked().iter().all(|asked| asked.method == "GET"));
     }
 
@@ -263,7 +297,35 @@ mod tests {
                 .contains(&format!("blaze diff -f {}", files[0].display())),
             "{error}"
         );
-        assert!(std::fs::read_to_string(&files[0]).unwrap().contains("type: mobile"));
+        let text = std::fs::read_to_string(&files[0]).unwrap();
+        // Whoever forces a change wants no precondition.
+        assert!(text.contains("type: mobile") && !text.contains("revision"), "{text}");
+    }
+
+    #[tokio::test]
+    async fn what_stays_is_fenced_by_the_revision_that_was_read() {
+        let directory = tempfile::tempdir().unwrap();
+        let stub = stub(412).await;
+        let error = edit(
+            &stub.client(),
+            &key(),
+            false,
+            "sed -i s/static/mobile/",
+            directory.path(),
+        )
+        .await
+        .unwrap_err();
+        assert_eq!(error.exit() as u8, 5);
+        // The revision is the precondition of `apply`; here the entity tag is.
+        assert_eq!(stub.asked().pop().unwrap().json().get("revision"), None);
+        let file = left(directory.path()).remove(0);
+        let kept = files::read(&[file]).unwrap();
+        assert_eq!(kept[0].value["revision"], 412);
+        assert_eq!(kept[0].value["spec"]["type"], "mobile");
+        assert!(
+            error.to_string().contains("set its `revision` to the one of now"),
+            "{error}"
+        );
     }
 
     #[tokio::test]

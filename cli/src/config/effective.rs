@@ -31,6 +31,9 @@ pub struct EffectiveOptions {
     /// Where each value comes from, and what it overrides
     #[arg(long)]
     pub explain: bool,
+    /// With the text of secrets; needs the role admin, and is written down
+    #[arg(long)]
+    pub reveal: bool,
     /// Which server.
     #[command(flatten)]
     pub server: ServerOptions,
@@ -95,7 +98,8 @@ fn call(options: &EffectiveOptions) -> Result<Call, CliError> {
         )
         .query_if("node", options.node.as_ref().map(NodeName::as_str))
         .query_if("layer", options.layer.as_ref().map(LayerName::as_str))
-        .query_if("explain", options.explain.then_some("true")))
+        .query_if("explain", options.explain.then_some("true"))
+        .query_if("reveal", options.reveal.then_some("true")))
 }
 
 /// For people: for whom, then the configuration, or where each value comes from.

@@ -8,6 +8,7 @@ use blaze_runtime::environment;
 use reqwest::Url;
 
 use super::contexts::{self, Context};
+use super::files::small;
 use super::options::ServerOptions;
 use crate::admin::closest;
 use crate::exit::CliError;
@@ -23,6 +24,8 @@ pub(crate) struct Surroundings {
     pub(crate) server: Option<String>,
     pub(crate) token_file: Option<PathBuf>,
     pub(crate) token: Option<Token>,
+    pub(crate) client_cert: Option<PathBuf>,
+    pub(crate) client_key: Option<PathBuf>,
     pub(crate) contexts: Option<PathBuf>,
 }
 
@@ -32,6 +35,8 @@ impl Surroundings {
             server: environment::variable("BLAZE_SERVER"),
             token_file: environment::variable("BLAZE_TOKEN_FILE").map(PathBuf::from),
             token: environment::variable("BLAZE_TOKEN").map(Token),
+            client_cert: environment::variable("BLAZE_CLIENT_CERT").map(PathBuf::from),
+            client_key: environment::variable("BLAZE_CLIENT_KEY").map(PathBuf::from),
             contexts: contexts::default_file(),
         }
     }
@@ -77,8 +82,7 @@ impl TokenSource {
         let (text, place) = match self {
             Self::File(file) => {
                 let place = file.display().to_string();
-                let content = std::fs::read(file)
-                    .map_err(|error| CliError::Failed(format!("the token file {place}: {error}")))?;
+                let content = small(file, "the token file")?;
                 (String::from_utf8(content).unwrap_or_default(), place)
             }
             Self::Variable(token) => (token.0.clone(), "BLAZE_TOKEN".to_owned()),
@@ -94,6 +98,15 @@ impl TokenSource {
     }
 }
 
+/// A certificate that is shown to a server that asks for one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct ClientCertificate {
+    /// The certificate, and what leads from it to its authority.
+    pub(crate) cert_file: PathBuf,
+    /// Its private key; `None`: the file of the certificate holds it.
+    pub(crate) key_file: Option<PathBuf>,
+}
+
 /// A server and how to speak with it.
 #[derive(Debug, Clone)]
 pub(crate) struct Endpoint {
@@ -101,6 +114,8 @@ pub(crate) struct Endpoint {
     pub(crate) url: Url,
     /// Authorities that may sign its certificate.
     pub(crate) ca_file: Option<PathBuf>,
+    /// Which certificate is shown to it if it asks for one.
+    pub(crate) client_certificate: Option<ClientCertificate>,
     /// The token, if there is one.
     pub(crate) token: Option<TokenSource>,
 }
@@ -119,11 +134,12 @@ impl Endpoint {
 
 /// Puts together what options, environment and context say, each part from the first that has it.
 ///
-/// A context's token and authorities belong to its server: they go to another one only where the context is named on the
-/// command line.
+/// A context's token, authorities and certificate belong to its server: they go to another one only where the context is named
+/// on the command line.
 ///
 /// # Errors
-/// [`CliError::Usage`] for an unknown context, a bad URL, or a token that would go in clear over a network;
+/// [`CliError::Usage`] for an unknown context, a bad URL, a key without its certificate, or a token that would go in clear over
+/// a network;
 /// [`CliError::Invalid`] for a bad file of contexts.
 pub(crate) fn resolve(options: &ServerOptions, around: &Surroundings) -> Result<Endpoint, CliError> {
     let endpoint = choose(options, around)?;
@@ -154,8 +170,39 @@ pub(crate) fn choose(options: &ServerOptions, around: &Surroundings) -> Result<E
         .map(TokenSource::File)
         .or_else(|| around.token.clone().map(TokenSource::Variable))
         .or_else(|| context.as_ref()?.token_file.clone().map(TokenSource::File));
+    let client_certificate = own_certificate(options, around)?.or_else(|| of_context(context.as_ref()?));
     let ca_file = options.ca_file.clone().or_else(|| context?.ca_file);
-    Ok(Endpoint { url, ca_file, token })
+    Ok(Endpoint {
+        url,
+        ca_file,
+        client_certificate,
+        token,
+    })
+}
+
+/// The certificate that options or environment name. Certificate and key come from the same of them: they are a pair.
+fn own_certificate(options: &ServerOptions, around: &Surroundings) -> Result<Option<ClientCertificate>, CliError> {
+    let pair = |cert_file: &PathBuf, key_file: &Option<PathBuf>| {
+        Some(ClientCertificate {
+            cert_file: cert_file.clone(),
+            key_file: key_file.clone(),
+        })
+    };
+    match (&options.client_cert, &around.client_cert, &around.client_key) {
+        (Some(cert_file), _, _) => Ok(pair(cert_file, &options.client_key)),
+        (None, Some(cert_file), _) => Ok(pair(cert_file, &around.client_key)),
+        (None, None, Some(_)) => Err(CliError::Usage(
+            "BLAZE_CLIENT_KEY is set, BLAZE_CLIENT_CERT is not: a key goes with its certificate".to_owned(),
+        )),
+        (None, None, None) => Ok(None),
+    }
+}
+
+fn of_context(context: &Context) -> Option<ClientCertificate> {
+    Some(ClientCertificate {
+        cert_file: context.client_cert.clone()?,
+        key_file: context.client_key.clone(),
+    })
 }
 
 fn chosen_context(options: &ServerOptions, around: &Surroundings) -> Result<Option<Context>, CliError> {
@@ -181,7 +228,7 @@ fn chosen_context(options: &ServerOptions, around: &Surroundings) -> Result<Opti
 pub(crate) fn unknown_context<'a>(name: &str, known: impl Iterator<Item = &'a String>) -> String {
     let meant =
         closest(name, known.map(String::as_str)).map_or_else(String::new, |meant| format!("; did you mean {meant}?"));
-    format!("there is no context {name}{meant} `blaze context list` shows all, `blaze context add` makes one")
+    format!("there is no context {name}{meant}\n  `blaze context list` shows all, `blaze context add` makes one.")
 }
 
 /// Reads the URL of a server: scheme, host and perhaps port, nothing else.
@@ -231,6 +278,8 @@ mod tests {
                     server: format!("https://{name}.example"),
                     token_file: Some(directory.join(name)),
                     ca_file: Some(PathBuf::from("/ca.pem")),
+                    client_cert: Some(PathBuf::from("/client.pem")),
+                    client_key: None,
                 };
                 contexts.contexts.insert(name.to_owned(), context);
             }
@@ -279,6 +328,37 @@ mod tests {
     }
 
     #[test]
+    fn certificate_and_key_come_as_a_pair_from_the_first_that_has_one() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut around = around(directory.path());
+        let mut options = ServerOptions::default();
+        let shown =
+            |options: &ServerOptions, around: &Surroundings| resolve(options, around).unwrap().client_certificate;
+        let pair = |cert_file: &str, key_file: Option<&str>| {
+            Some(ClientCertificate {
+                cert_file: PathBuf::from(cert_file),
+                key_file: key_file.map(PathBuf::from),
+            })
+        };
+        assert_eq!(shown(&options, &Surroundings::default()), None);
+        assert_eq!(shown(&options, &around), pair("/client.pem", None));
+        around.client_cert = Some(PathBuf::from("/variable.pem"));
+        around.client_key = Some(PathBuf::from("/variable.key"));
+        assert_eq!(shown(&options, &around), pair("/variable.pem", Some("/variable.key")));
+        // A certificate without a key of its own is not put together with another one's.
+        options.client_cert = Some(PathBuf::from("/option.pem"));
+        assert_eq!(shown(&options, &around), pair("/option.pem", None));
+        options.client_key = Some(PathBuf::from("/option.key"));
+        assert_eq!(shown(&options, &around), pair("/option.pem", Some("/option.key")));
+        let alone = Surroundings {
+            client_key: Some(PathBuf::from("/variable.key")),
+            ..Surroundings::default()
+        };
+        let error = resolve(&ServerOptions::default(), &alone).unwrap_err();
+        assert!(matches!(error, CliError::Usage(_)), "{error}");
+    }
+
+    #[test]
     fn a_contexts_token_does_not_go_elsewhere_by_itself() {
         let directory = tempfile::tempdir().unwrap();
         let around = around(directory.path());
@@ -288,6 +368,7 @@ mod tests {
         };
         let endpoint = resolve(&options, &around).unwrap();
         assert_eq!((endpoint.token, endpoint.ca_file), (None, None));
+        assert_eq!(endpoint.client_certificate, None);
         options.server = Some("https://lab.example:443/".to_owned());
         assert!(resolve(&options, &around).unwrap().token.is_some());
         options.server = Some("https://127.0.0.1:9443".to_owned());
@@ -352,7 +433,12 @@ mod tests {
             ..ServerOptions::default()
         };
         let error = resolve(&options, &around(directory.path())).unwrap_err();
-        assert!(error.to_string().contains("did you mean hall?"), "{error}");
+        assert!(
+            error
+                .to_string()
+                .contains("there is no context hal; did you mean hall?\n  `blaze"),
+            "{error}"
+        );
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! `blaze export`: all documents as YAML that `apply` takes.
+//! `blaze export`: all documents in a form that `apply` takes.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,7 +15,7 @@ use super::options::ServerOptions;
 use super::stream::{Told, Watcher};
 use super::yaml;
 use crate::exit::{CliError, Exit};
-use crate::output;
+use crate::output::{self, Format};
 
 /// How often all is read again when the history is trimmed meanwhile.
 const TRIES: usize = 5;
@@ -40,7 +40,7 @@ pub struct ExportOptions {
 ///
 /// # Errors
 /// [`CliError`].
-pub(super) async fn run(options: &ExportOptions) -> Result<Exit, CliError> {
+pub(super) async fn run(options: &ExportOptions, format: Format) -> Result<Exit, CliError> {
     let client = Client::of(&options.server)?;
     if let Some(layer) = &options.layer {
         // A layer that does not exist is no empty one.
@@ -53,8 +53,18 @@ pub(super) async fn run(options: &ExportOptions) -> Result<Exit, CliError> {
         .filter(|(key, document)| view.as_ref().is_none_or(|view| view.sees(key, document)))
         .map(|(_, document)| clean(document.clone()))
         .collect();
-    let text = yaml::documents(&documents);
-    output::print(&format!("# {}, revision {revision}\n{text}", client.server()))?;
+    output::print(&match format {
+        Format::Table | Format::Yaml => {
+            format!(
+                "# {}, revision {revision}\n{}",
+                client.server(),
+                yaml::documents(&documents)
+            )
+        }
+        Format::Json => {
+            serde_json::to_string_pretty(&documents).map_err(|error| CliError::Failed(error.to_string()))?
+        }
+    })?;
     Ok(Exit::Done)
 }
 
@@ -97,7 +107,7 @@ async fn catch_up(
     let mut watcher = Watcher::new(client, Call::get(format!("{BASE}/watch")), Some(oldest), false);
     loop {
         let reached = match watcher.next().await? {
-            Told::Relist => return Ok(None),
+            Told::Relist(_) => return Ok(None),
             Told::Bookmark(bookmark) => revision_of(&bookmark),
             Told::Change(commit) => {
                 let revision = revision_of(&commit);

@@ -13,6 +13,7 @@ use std::sync::Arc;
 
 use blaze_domain::config::{Key, json};
 use blaze_runtime::config::{LocatedFault, Place, yaml_documents};
+use blaze_runtime::state::read_small;
 use serde_json::Value;
 
 use super::kinds::key_of;
@@ -59,6 +60,16 @@ pub(crate) struct Source {
     pub(crate) value: Value,
     /// Where it comes from.
     pub(crate) origin: Origin,
+}
+
+/// A file of a key, a certificate or a token, up to 1 MiB.
+///
+/// # Errors
+/// [`CliError::Failed`] that begins with what the file is.
+pub(crate) fn small(file: &Path, what: &str) -> Result<Vec<u8>, CliError> {
+    let failed = |reason: String| CliError::Failed(format!("{what} {}: {reason}", file.display()));
+    let content = read_small(file).map_err(|error| failed(error.to_string()))?;
+    content.ok_or_else(|| failed("there is no such file".to_owned()))
 }
 
 /// Reads all documents of `-f FILE|DIR|-`. Empty documents are passed over.
@@ -179,26 +190,49 @@ fn parse(path: &Path, name: &str, bytes: Vec<u8>) -> Result<Vec<(Value, Origin)>
     let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
     let looks_like_json = text.trim_start().starts_with(['[', '{']);
     let is_json = path.extension().is_some_and(|extension| extension == "json");
-    let (values, lines) = if is_json || (is_stdin(path) && looks_like_json) {
-        let value = json::parse_within(text.as_bytes(), MAX_DEPTH).map_err(|fault| {
-            let pointer = if fault.pointer.is_empty() {
-                String::new()
-            } else {
-                format!("{}: ", fault.pointer)
-            };
-            vec![format!("{name}:{}: {pointer}{}", fault.line, fault.detail)]
-        })?;
-        (vec![value], Vec::new())
+    let (values, lines) = if is_json {
+        parse_json(text, name)?
+    } else if is_stdin(path) && looks_like_json {
+        // `{ kind: Layer, … }` and `{…}` behind `---` are YAML.
+        match parse_json(text, name) {
+            Ok(read) => read,
+            Err(faults) => parse_yaml(text, name).map_err(|others| if is_quoted(text) { faults } else { others })?,
+        }
     } else {
-        let values = yaml_documents(text, MAX_DOCUMENTS).map_err(|faults| {
-            faults
-                .into_iter()
-                .map(|fault| in_file(fault, name).to_string())
-                .collect::<Vec<_>>()
-        })?;
-        (values, document_lines(text))
+        parse_yaml(text, name)?
     };
     Ok(located(values, &lines, name))
+}
+
+/// Documents, and the lines on which they begin, if those are known.
+type Parsed = (Vec<Value>, Vec<usize>);
+
+fn parse_json(text: &str, name: &str) -> Result<Parsed, Vec<String>> {
+    let value = json::parse_within(text.as_bytes(), MAX_DEPTH).map_err(|fault| {
+        let pointer = if fault.pointer.is_empty() {
+            String::new()
+        } else {
+            format!("{}: ", fault.pointer)
+        };
+        vec![format!("{name}:{}: {pointer}{}", fault.line, fault.detail)]
+    })?;
+    Ok((vec![value], Vec::new()))
+}
+
+fn parse_yaml(text: &str, name: &str) -> Result<Parsed, Vec<String>> {
+    let values = yaml_documents(text, MAX_DOCUMENTS).map_err(|faults| {
+        faults
+            .into_iter()
+            .map(|fault| in_file(fault, name).to_string())
+            .collect::<Vec<_>>()
+    })?;
+    Ok((values, document_lines(text)))
+}
+
+/// Whether a text that is neither JSON nor YAML was meant as JSON: its first member has a quoted name.
+fn is_quoted(text: &str) -> bool {
+    let begin = text.trim_start_matches(|c: char| c.is_whitespace() || matches!(c, '[' | '{'));
+    begin.starts_with('"')
 }
 
 /// The same fault with the name of the file.

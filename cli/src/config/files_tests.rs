@@ -91,6 +91,42 @@ fn json_comes_as_one_document_a_list_or_what_get_prints() {
 }
 
 #[test]
+fn standard_input_that_begins_like_json_may_be_yaml() {
+    let read_stdin = |text: &str| read_from(&[PathBuf::from("-")], &mut text.as_bytes());
+    let layer = json!({"kind": "Layer", "name": "fog", "spec": {"kind": "fog"}});
+    for text in [
+        "{ kind: Layer, name: fog, spec: { kind: fog } }\n",
+        "[{ kind: Layer, name: fog, spec: { kind: fog } }]\n",
+        "{\"kind\": \"Layer\", \"name\": \"fog\", \"spec\": {\"kind\": \"fog\"}}\n---\n# no more\n",
+    ] {
+        let sources = read_stdin(text).unwrap();
+        assert_eq!(sources.len(), 1, "{text}");
+        assert_eq!(sources[0].value, layer, "{text}");
+    }
+    let two = read_stdin("{ kind: Layer, name: fog }\n---\n{ kind: Layer, name: edge }\n").unwrap();
+    assert_eq!(two[1].origin.to_string(), "stdin:3 (document 2)");
+    // What is wrong is told in the terms of what was meant.
+    let told = |text: &str| read_stdin(text).unwrap_err().to_string();
+    let text = told("{\"kind\": \"Node\",\n\"name\": \"a\", \"name\": \"b\"}");
+    assert!(text.starts_with("stdin:2: "), "{text}");
+    assert!(
+        told("{ kind: Layer, name: [ }\n").contains("stdin"),
+        "flow that does not end"
+    );
+}
+
+#[test]
+fn small_files_are_bounded_and_named() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("token");
+    let told = |file: &Path| small(file, "the token file").unwrap_err().to_string();
+    assert!(told(&file).starts_with("the token file /") && told(&file).ends_with("no such file"));
+    fs::write(&file, vec![b'x'; 2 * 1024 * 1024]).unwrap();
+    assert!(told(&file).contains("is larger than"), "{}", told(&file));
+    assert!(told(Path::new("/dev/zero")).contains("is larger than"));
+}
+
+#[test]
 fn directories_give_their_files_in_order() {
     let directory = tempfile::tempdir().unwrap();
     for (name, node) in [("b.yml", "b"), ("a.yaml", "a"), ("c.json", "c"), ("d.txt", "d")] {

@@ -43,6 +43,9 @@ pub struct GetOptions {
     /// Without the members that the server sets: what can be applied again
     #[arg(long)]
     pub clean: bool,
+    /// With the text of secrets, with -o json or yaml; needs the role admin, and is written down
+    #[arg(long)]
+    pub reveal: bool,
     /// Then show every change as it happens
     #[arg(short, long)]
     pub watch: bool,
@@ -68,6 +71,12 @@ impl GetOptions {
         if self.watch && (self.limit.is_some() || self.revision.is_some() || output == Output::Name) {
             return usage("--watch goes with neither --limit nor --revision nor -o name");
         }
+        if self.reveal && !matches!(output, Output::Json | Output::Yaml) {
+            return usage("--reveal shows secrets where they stand in documents: give -o json or -o yaml");
+        }
+        if self.reveal && self.watch {
+            return usage("changes come without the text of secrets: --reveal goes without --watch");
+        }
         if self.watch && self.node.is_some() {
             return usage("changes cannot be watched by node; --layer and -l can");
         }
@@ -81,6 +90,7 @@ impl GetOptions {
             layer: self.layer.clone(),
             node: self.node.clone(),
             limit: self.limit,
+            reveal: self.reveal,
         }
     }
 }
@@ -96,7 +106,7 @@ pub(super) async fn run(options: &GetOptions, output: Output) -> Result<Exit, Cl
     let kind = options.document.target.kind;
     let since = match &key {
         Some(key) => {
-            let answer = client.document(key, options.revision).await?;
+            let answer = client.read_document(key, options.revision, options.reveal).await?;
             let document = if options.clean { clean(answer.body) } else { answer.body };
             show_one(kind, &document, output, options.watch)?;
             answer.revision
@@ -231,6 +241,9 @@ mod tests {
             assert!(matches!(check(bad, Output::Table), Err(CliError::Usage(_))), "{bad}");
         }
         assert!(check("nodes -w", Output::Name).is_err());
+        assert!(check("svc slam --reveal", Output::Yaml).is_ok() && check("services --reveal", Output::Json).is_ok());
+        assert!(check("svc slam --reveal", Output::Table).is_err());
+        assert!(check("svc slam --reveal -w", Output::Json).is_err());
     }
 
     #[test]

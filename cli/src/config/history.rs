@@ -77,6 +77,9 @@ pub(super) async fn run(options: &HistoryOptions, format: Format) -> Result<Exit
         }
         other => other?,
     };
+    if options.full {
+        note(format, "--full shows the documents with -o json or -o yaml");
+    }
     if listing.is_cut() {
         note(format, "there are older changes: --limit N shows more");
     }

@@ -12,7 +12,9 @@
 
 mod api;
 mod apply;
+mod ask;
 mod call;
+mod cascade;
 mod client;
 mod context_command;
 mod contexts;
@@ -38,8 +40,11 @@ mod stream;
 mod stub;
 mod tables;
 mod text;
+mod tls;
 mod token;
 mod token_local;
+mod topology;
+mod trim;
 mod watch;
 mod yaml;
 
@@ -62,6 +67,8 @@ pub use patch::PatchOptions;
 pub use refusal::Refusal;
 pub use rollout::RolloutCommand;
 pub use token::TokenCommand;
+pub use topology::{DigestOptions, TopologyOptions};
+pub use trim::TrimOptions;
 pub use watch::WatchOptions;
 
 use crate::exit::{CliError, Exit};
@@ -98,12 +105,18 @@ pub enum ConfigCommand {
     /// Try a change on some nodes first
     #[command(subcommand)]
     Rollout(RolloutCommand),
-    /// All documents as YAML that `apply` takes
+    /// All documents as YAML that `apply` takes, or with -o json as an array
     Export(ExportOptions),
+    /// Layers, their nodes, and what runs there
+    Topology(TopologyOptions),
+    /// A digest of what the worker of a layer should hold
+    Digest(DigestOptions),
     /// Workers of all layers, and which revision they have
     Workers(WorkersOptions),
     /// Who changed what, and who was refused
     Audit(AuditOptions),
+    /// Remove old history
+    Trim(TrimOptions),
     /// Tokens: create, list, revoke, look into
     #[command(subcommand)]
     Token(TokenCommand),
@@ -131,9 +144,12 @@ pub async fn run(command: ConfigCommand, output: Output) -> Result<Exit, CliErro
         ConfigCommand::Effective(options) => effective::run(&options, output.format()?).await,
         ConfigCommand::Watch(options) => watch::run(&options, output.format()?).await,
         ConfigCommand::Rollout(command) => rollout::run(&command, output.format()?).await,
-        ConfigCommand::Export(options) => export::run(&options).await,
+        ConfigCommand::Export(options) => export::run(&options, output.format()?).await,
+        ConfigCommand::Topology(options) => topology::run(&options, output.format()?).await,
+        ConfigCommand::Digest(options) => topology::digest(&options, output.format()?).await,
         ConfigCommand::Workers(options) => fleet::workers(&options, output.format()?).await,
         ConfigCommand::Audit(options) => fleet::audit(&options, output.format()?).await,
+        ConfigCommand::Trim(options) => trim::run(&options, output.format()?).await,
         ConfigCommand::Token(command) => token::run(&command, output.format()?).await,
         ConfigCommand::Context(command) => context_command::run(&command, output.format()?),
     }

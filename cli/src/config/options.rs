@@ -23,6 +23,12 @@ pub struct ServerOptions {
     /// Authorities that may sign the server's certificate (PEM); else the file of the context, else those of the system
     #[arg(long, value_name = "FILE", help_heading = "Server")]
     pub ca_file: Option<PathBuf>,
+    /// Certificate to show to a server that asks for one (PEM); else BLAZE_CLIENT_CERT, else that of the context
+    #[arg(long, value_name = "FILE", help_heading = "Server")]
+    pub client_cert: Option<PathBuf>,
+    /// Its private key (PEM), where it is not in the same file; with BLAZE_CLIENT_CERT it is BLAZE_CLIENT_KEY
+    #[arg(long, value_name = "FILE", requires = "client_cert", help_heading = "Server")]
+    pub client_key: Option<PathBuf>,
 }
 
 /// One document.

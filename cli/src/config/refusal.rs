@@ -114,7 +114,6 @@ impl Refusal {
                 .number("oldest_revision")
                 .map(|oldest| format!("what is kept of the history begins after revision {oldest}")),
             "signing_disabled" => Some("sign it yourself: --key-file FILE --alg ALG".to_owned()),
-            "already_exists" => Some("`blaze apply` replaces what exists".to_owned()),
             "rollout_active" => Some("`blaze get rollouts` shows it; promote or abort it first".to_owned()),
             "rate_limited" | "overloaded" => Some(after("try again later")),
             "store_unavailable" | "shutting_down" => Some(format!("nothing was changed; {}", after("try again later"))),

@@ -90,9 +90,11 @@ pub(super) async fn run(command: &RolloutCommand, format: Format) -> Result<Exit
         RolloutCommand::Start(options) => {
             let document = one_rollout(&options.file)?;
             let client = Client::of(&options.server)?;
+            let call = Call::post(collection_path(Kind::Rollout, None), &document);
             let answer = client
-                .send(&Call::post(collection_path(Kind::Rollout, None), &document))
-                .await?;
+                .send(&call)
+                .await
+                .map_err(|error| with_other_name(error, &document))?;
             show(&answer.body, format)
         }
         RolloutCommand::Status(options) => {
@@ -123,6 +125,19 @@ pub(super) async fn run(command: &RolloutCommand, format: Format) -> Result<Exit
             let body = json!({ "reason": options.reason });
             act(&options.server, &options.key, "abort", &body, format).await
         }
+    }
+}
+
+/// A roll-out that has begun is not replaced; what can be done instead.
+fn with_other_name(error: CliError, document: &Value) -> CliError {
+    match error {
+        CliError::Problem(refusal) if refusal.code() == "already_exists" => {
+            let name = member(document, "name");
+            CliError::Problem(Box::new(refusal.with_hint(format!(
+                "a roll-out that has begun is not replaced: give this one another name; or end that one with `blaze rollout promote {name}` or `blaze rollout abort {name}`, and delete it with `blaze delete rollout {name}`"
+            ))))
+        }
+        other => other,
     }
 }
 
@@ -160,12 +175,15 @@ fn show(document: &Value, format: Format) -> Result<Exit, CliError> {
 
 /// How a roll-out stands: phase, target, then its canary nodes.
 fn status(document: &Value) -> String {
-    let mut text = format!(
-        "{} is {}; it tries a change of {}\n",
-        member(document, "name"),
-        cell(document.pointer("/status/phase")),
-        tables::target(document)
-    );
+    let phase = cell(document.pointer("/status/phase"));
+    let target = tables::target(document);
+    let so = match phase.as_str() {
+        "canary" => format!("it tries a change of {target} on its canary nodes"),
+        "promoted" => format!("its change is part of {target}"),
+        "aborted" | "failed" => format!("its change of {target} is taken back"),
+        _ => format!("it is about {target}"),
+    };
+    let mut text = format!("{} is {phase}; {so}\n", member(document, "name"));
     let reason = document
         .get("status")
         .map(|status| member(status, "reason"))
@@ -200,6 +218,7 @@ fn status(document: &Value) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::stub::{Reply, Stub};
 
     #[test]
     fn a_status_says_phase_target_and_canaries() {
@@ -207,10 +226,41 @@ mod tests {
             "status": {"phase": "failed", "canaries": [{"node": "robot-1", "phase": "failed", "revision": 431, "reason": "unhealthy"}]}});
         assert_eq!(
             status(&document),
-            "slower is failed; it tries a change of service/slam\n\
+            "slower is failed; its change of service/slam is taken back\n\
              NODE     PHASE   REVISION  REASON\n\
              robot-1  failed       431  unhealthy\n"
         );
+        for (phase, expected) in [
+            (
+                "canary",
+                "slower is canary; it tries a change of service/slam on its canary nodes\n",
+            ),
+            ("promoted", "slower is promoted; its change is part of service/slam\n"),
+            (
+                "aborted",
+                "slower is aborted; its change of service/slam is taken back\n",
+            ),
+        ] {
+            let document = json!({"name": "slower", "spec": {"target": {"kind": "Service", "name": "slam"}},
+                "status": {"phase": phase, "canaries": []}});
+            assert_eq!(status(&document), expected);
+        }
+    }
+
+    #[tokio::test]
+    async fn one_that_exists_is_ended_or_the_new_one_has_another_name() {
+        let stub = Stub::start(|_, _| Reply::problem(409, "already_exists", "Rollout/slower exists")).await;
+        let document = json!({"kind": "Rollout", "name": "slower", "spec": {}});
+        let call = Call::post(collection_path(Kind::Rollout, None), &document);
+        let error = stub.client().send(&call).await.unwrap_err();
+        let error = with_other_name(error, &document);
+        assert_eq!(error.exit(), Exit::Conflict);
+        let text = error.to_string();
+        assert!(
+            text.contains("another name") && text.contains("`blaze rollout abort slower`"),
+            "{text}"
+        );
+        assert!(!text.contains("blaze apply"), "{text}");
     }
 
     #[test]

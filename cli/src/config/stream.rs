@@ -34,8 +34,27 @@ pub(crate) enum Told {
     Change(Value),
     /// Everything up to this revision was told.
     Bookmark(Value),
-    /// The history does not reach back to where the watch stands: list, then [`Watcher::resume`].
-    Relist,
+    /// The watch cannot go on from where it stands: list, then [`Watcher::resume`].
+    Relist(Lost),
+}
+
+/// Why a watch cannot go on from where it stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Lost {
+    /// The history does not reach back that far any more.
+    Trimmed,
+    /// The store is not there yet: another database, a restored backup, a slip in the number. With the store's revision.
+    Ahead(Option<u64>),
+}
+
+impl Lost {
+    fn of(refusal: &Refusal) -> Self {
+        if refusal.code() == "revision_unknown" {
+            Self::Ahead(refusal.number("revision"))
+        } else {
+            Self::Trimmed
+        }
+    }
 }
 
 /// A watch of the main service.
@@ -135,7 +154,7 @@ impl<'c> Watcher<'c> {
             }
             Err(CliError::Problem(refusal)) if refusal.status == 410 => {
                 self.reached = true;
-                Ok(Some(Told::Relist))
+                Ok(Some(Told::Relist(Lost::of(&refusal))))
             }
             Err(error) if self.reached && passes(&error) => {
                 self.failures = self.failures.saturating_add(1);
@@ -169,7 +188,7 @@ impl<'c> Watcher<'c> {
                 self.failures = self.failures.saturating_add(1);
                 let refusal = Refusal::of(self.client.server(), 0, data);
                 if matches!(refusal.code(), "revision_trimmed" | "revision_unknown") {
-                    return Ok(Some(Told::Relist));
+                    return Ok(Some(Told::Relist(Lost::of(&refusal))));
                 }
                 // A token that has run out may have been renewed in its file; if not, connecting says so.
                 let code = refusal.code().to_owned();

@@ -84,13 +84,25 @@ async fn what_is_trimmed_away_is_listed_anew() {
     let mut watcher = watcher(&client, Some(4));
     assert_eq!(watcher.next().await.unwrap(), told(5));
     // Once as an event, once as an answer.
-    assert_eq!(watcher.next().await.unwrap(), Told::Relist);
-    assert_eq!(watcher.next().await.unwrap(), Told::Relist);
+    assert_eq!(watcher.next().await.unwrap(), Told::Relist(Lost::Trimmed));
+    assert_eq!(watcher.next().await.unwrap(), Told::Relist(Lost::Trimmed));
     watcher.resume(100);
     assert_eq!(watcher.next().await.unwrap(), told(101));
     let last = stub.asked().pop().unwrap();
     assert_eq!(last.line(), "GET /api/v1/watch?kind=Node&since=100");
     assert_eq!(last.header("last-event-id"), None);
+}
+
+#[tokio::test]
+async fn a_watch_ahead_of_the_store_says_where_the_store_is() {
+    let stub = Stub::start(|_, _| {
+        let problem = json!({"code": "revision_unknown", "title": "t", "detail": "d", "status": 410, "revision": 12});
+        Reply::Full(410, Vec::new(), problem.to_string())
+    })
+    .await;
+    let client = stub.client();
+    let told = watcher(&client, Some(99_999)).next().await.unwrap();
+    assert_eq!(told, Told::Relist(Lost::Ahead(Some(12))));
 }
 
 #[tokio::test]

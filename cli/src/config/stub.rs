@@ -136,6 +136,7 @@ impl Stub {
         Client::new(Endpoint {
             url: parse_server(&self.url).unwrap(),
             ca_file: None,
+            client_certificate: None,
             token: token.map(|text| TokenSource::Variable(Token::of(text))),
         })
         .unwrap()

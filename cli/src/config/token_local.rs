@@ -11,6 +11,7 @@ use blaze_auth::{Algorithm, NewToken, Realm, generate_encryption_key, generate_k
 use blaze_domain::config::Timestamp;
 use serde_json::{Value, json};
 
+use super::files::small;
 use super::text::printable;
 use crate::exit::CliError;
 
@@ -33,7 +34,7 @@ pub(super) struct LocalToken<'a> {
 /// [`CliError::Failed`] when the file cannot be read, [`CliError::Invalid`] for a bad key or token.
 pub(super) fn sign(token: &LocalToken<'_>, now_ms: i64) -> Result<Value, CliError> {
     let place = token.key_file.display();
-    let key = std::fs::read(token.key_file).map_err(|error| CliError::Failed(format!("{place}: {error}")))?;
+    let key = small(token.key_file, "the key file")?;
     let id = random_id().map_err(CliError::Failed)?;
     let issued_s = now_ms.div_euclid(1_000);
     let expires_s = issued_s.saturating_add(token.expires_in_s);

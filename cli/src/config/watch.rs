@@ -12,7 +12,7 @@ use super::call::Call;
 use super::client::Client;
 use super::kinds::{self, BASE, Target, key_of, name_of};
 use super::options::ServerOptions;
-use super::stream::{Told, Watcher};
+use super::stream::{Lost, Told, Watcher};
 use super::text::{json_line, member, note};
 use super::yaml;
 use crate::exit::{CliError, Exit};
@@ -66,7 +66,7 @@ pub(crate) enum Shown {
     /// Everything up to this revision was told.
     Bookmark(Value),
     /// Something in between is lost: what exists follows, then the changes after it.
-    Relist,
+    Relist(Lost),
     /// What exists of a kind.
     Listed {
         kind: Kind,
@@ -111,11 +111,8 @@ pub(crate) async fn until_interrupted(
         if matches!(shown, Shown::Bookmark(_)) && !bookmarks {
             return Ok(());
         }
-        if shown == Shown::Relist {
-            note(
-                format,
-                "what happened in between is no longer kept; this is what there is",
-            );
+        if let Shown::Relist(lost) = &shown {
+            note(format, &reason(*lost));
         }
         let text = text(&shown, format)?;
         if text.is_empty() { Ok(()) } else { output::print(&text) }
@@ -123,6 +120,19 @@ pub(crate) async fn until_interrupted(
     tokio::select! {
         ended = follow(client, scope, since, format == Format::Table, &mut show) => ended.map(|()| Exit::Done),
         stopped = interrupted() => stopped.map(|()| Exit::Done),
+    }
+}
+
+/// Why everything is listed, for people.
+fn reason(lost: Lost) -> String {
+    match lost {
+        Lost::Trimmed => "what happened in between is no longer kept; this is what there is".to_owned(),
+        Lost::Ahead(revision) => {
+            let at = revision.map_or_else(String::new, |revision| format!(": it is at revision {revision}"));
+            format!(
+                "the store is not as far as that{at} (another database, a restored backup, or a slip in --since); this is what there is"
+            )
+        }
     }
 }
 
@@ -221,8 +231,8 @@ pub(crate) async fn follow(
                 }
             }
             Told::Bookmark(bookmark) => show(Shown::Bookmark(bookmark))?,
-            Told::Relist => {
-                show(Shown::Relist)?;
+            Told::Relist(lost) => {
+                show(Shown::Relist(lost))?;
                 floors.clear();
                 for (kind, revision, items) in scope.list(client).await? {
                     floors.insert(kind, revision);
@@ -253,7 +263,7 @@ fn text(shown: &Shown, format: Format) -> Result<String, CliError> {
     }
     let value = match shown {
         Shown::Commit(value) | Shown::Bookmark(value) => value.clone(),
-        Shown::Relist => json!({ "relist": true }),
+        Shown::Relist(_) => json!({ "relist": true }),
         Shown::Listed { kind, revision, items } => json!({ "kind": kind, "revision": revision, "items": items }),
     };
     match format {
@@ -286,7 +296,7 @@ fn lines(shown: &Shown) -> String {
         }
         Shown::Bookmark(bookmark) => format!("{:>8}  up to here\n", revision_of(bookmark)),
         // People are told on stderr.
-        Shown::Relist => String::new(),
+        Shown::Relist(_) => String::new(),
         Shown::Listed { revision, items, .. } => items.iter().map(|item| line(*revision, "exists", item, "")).collect(),
     }
 }

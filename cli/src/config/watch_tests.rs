@@ -61,7 +61,7 @@ async fn a_trimmed_watch_lists_and_goes_on_without_gap_or_repeat() {
     assert_eq!(
         shown,
         [
-            Shown::Relist,
+            Shown::Relist(Lost::Trimmed),
             empty(Kind::Layer),
             Shown::Listed {
                 kind: Kind::Node,
@@ -93,6 +93,7 @@ async fn one_document_is_listed_alone_also_when_it_is_gone() {
         ..Scope::default()
     };
     let shown = first(&stub.client(), &scope, Some(9_000), 3).await;
+    assert_eq!(shown[0], Shown::Relist(Lost::Ahead(None)));
     assert_eq!(
         shown[1],
         Shown::Listed {
@@ -115,7 +116,10 @@ fn each_line_is_one_object() {
     ));
     let text_of = |shown: &Shown, format| text(shown, format).unwrap();
     assert_eq!(text_of(&both, Format::Json).lines().count(), 1);
-    assert_eq!(text_of(&Shown::Relist, Format::Json), r#"{"relist":true}"#);
+    assert_eq!(
+        text_of(&Shown::Relist(Lost::Trimmed), Format::Json),
+        r#"{"relist":true}"#
+    );
     assert_eq!(
         text_of(&both, Format::Table),
         "     413  update  node/robot-1  by ops\n     413  update  layer/edge  by ops\n"
@@ -130,7 +134,10 @@ fn each_line_is_one_object() {
         r#"{"kind":"Node","revision":97,"items":[{"kind":"Node","name":"a"}]}"#
     );
     assert_eq!(text_of(&listed, Format::Table), "      97  exists  node/a\n");
-    assert_eq!(text_of(&Shown::Relist, Format::Yaml), "---\nrelist: true\n");
+    assert_eq!(
+        text_of(&Shown::Relist(Lost::Trimmed), Format::Yaml),
+        "---\nrelist: true\n"
+    );
 }
 
 #[test]
@@ -148,4 +155,15 @@ fn scopes_that_make_no_sense_are_refused() {
         ..Scope::default()
     };
     assert!(instances.check().is_ok());
+}
+
+#[test]
+fn why_all_is_listed_is_told_as_it_is() {
+    assert!(reason(Lost::Trimmed).contains("no longer kept"));
+    let ahead = reason(Lost::Ahead(Some(12)));
+    assert!(
+        ahead.contains("it is at revision 12") && !ahead.contains("kept"),
+        "{ahead}"
+    );
+    assert!(reason(Lost::Ahead(None)).contains("is not as far as that ("));
 }

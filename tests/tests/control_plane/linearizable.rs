@@ -37,7 +37,7 @@ enum Fault {
 impl Fault {
     fn of(seed: u64) -> Self {
         match seed % 4 {
-            0 => Self::Process(usize::from(seed % 8 == 0)),
+            0 => Self::Process(usize::from(seed.is_multiple_of(8))),
             2 => Self::Store,
             _ => Self::Nothing,
         }

@@ -8,7 +8,7 @@
 //!                          └▶ documents, history, apply, effective, system, tokens, watch ─▶ core
 //! ```
 //!
-//! The checks come in this order for every request; what a document may be is the core's matter. [`routes`] is the table
+//! The checks come in this order for every request; what a document may be is the core's matter. `routes` is the table
 //! of all operations, and the OpenAPI document is made from the same table.
 
 mod body;

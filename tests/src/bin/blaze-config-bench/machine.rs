@@ -27,6 +27,8 @@ pub(crate) struct Machine {
     /// To write 4 KiB in place and sync them, at the median.
     pub(crate) sync_ms: f64,
     pub(crate) etcd: String,
+    /// Programs that wanted a processor in the minute before.
+    pub(crate) load_average: f64,
     /// Whether this program, and so the rest of the workspace beside it, was built with optimisation.
     pub(crate) optimised: bool,
 }
@@ -50,8 +52,14 @@ pub(crate) fn describe(folder: &Path) -> anyhow::Result<Machine> {
         in_memory: IN_MEMORY.contains(&file_system),
         sync_ms: sync_ms(&folder)?,
         etcd: EtcdServer::version()?,
+        load_average: load_average().unwrap_or_default(),
         optimised: !cfg!(debug_assertions),
     })
+}
+
+fn load_average() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/loadavg").ok()?;
+    text.split(' ').next()?.parse().ok()
 }
 
 fn value_of(file: &str, name: &str) -> Option<String> {

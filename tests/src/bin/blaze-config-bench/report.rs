@@ -8,6 +8,9 @@ use super::figures::{Bar, Row};
 use super::machine::Machine;
 use super::subject::Subject;
 
+/// Load of a machine that does nothing else.
+const IDLE: f64 = 0.5;
+
 /// All that a run found.
 #[derive(Serialize)]
 pub(crate) struct Report {
@@ -58,6 +61,12 @@ impl Report {
             machine.sync_ms,
             machine.etcd
         );
+        if machine.load_average > IDLE {
+            println!(
+                "NOTE: others use this machine (load {:.1}): figures mean little",
+                machine.load_average
+            );
+        }
         if machine.in_memory {
             println!(
                 "NOTE: this file system is in memory, where syncing costs nothing: choose another one with --data"
