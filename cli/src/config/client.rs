@@ -83,6 +83,8 @@ impl Client {
             // What may be tried again is decided here, not below.
             .retry(reqwest::retry::never())
             .no_proxy()
+            // With HTTP/2, what the server said last of all is lost when it ends a connection: an alert of TLS says why.
+            .http1_only()
             .connect_timeout(CONNECT_TIMEOUT)
             .pool_idle_timeout(IDLE);
         let builder = match (&endpoint.ca_file, endpoint.is_tls()) {
@@ -260,7 +262,11 @@ impl Client {
         };
         let server = self.server().to_owned();
         if !unreached && !call.harmless {
-            return CliError::OutcomeUnknown { server, reason };
+            let lost = CliError::OutcomeUnknown { server, reason };
+            return match advice {
+                Some(advice) => lost.advised(advice),
+                None => lost,
+            };
         }
         let advice = advice.unwrap_or_else(|| {
             if !unreached && !self.endpoint.is_tls() {

@@ -212,16 +212,13 @@ fn question(keys: &[Key], along: &[Key]) -> String {
         keys => format!("{} would be deleted:\n{}", count(keys.len(), "document"), listed(keys)),
     };
     if !along.is_empty() {
-        let with = if text.ends_with('\n') {
-            "With them"
+        let (with, what) = if text.ends_with('\n') {
+            ("With them", "them")
         } else {
-            ", and with it"
+            (", and with it", "it")
         };
-        text.push_str(&format!(
-            "{with} what refers to it, {}:\n{}",
-            count(along.len(), "document"),
-            listed(along)
-        ));
+        let number = count(along.len(), "document");
+        text.push_str(&format!("{with} what refers to {what}, {number}:\n{}", listed(along)));
     }
     text.push_str(&format!("Delete all {}?", keys.len() + along.len()));
     text
@@ -313,7 +310,9 @@ mod tests {
             question(&two, &[]),
             "2 documents would be deleted:\n  node/a\n  layer/edge\nDelete all 2?"
         );
-        assert!(question(&two, &keys(&["ro/a"])).contains("\nWith them what refers to it, 1 document:\n  rollout/a\n"));
+        assert!(
+            question(&two, &keys(&["ro/a"])).contains("\nWith them what refers to them, 1 document:\n  rollout/a\n")
+        );
         let many: Vec<Key> = (0..MAX_LISTED + 3)
             .map(|number| {
                 kinds::parse_target(&format!("node/n{number}"))

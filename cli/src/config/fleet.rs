@@ -135,6 +135,12 @@ pub(super) async fn audit(options: &AuditOptions, format: Format) -> Result<Exit
             .items
             .retain(|entry| entry.get("service").and_then(Value::as_str) == Some(service.as_str()));
     }
+    if listing.items.is_empty() {
+        note(format, "nothing that was written down matches");
+        if format == Format::Table {
+            return Ok(Exit::Done);
+        }
+    }
     if listing.is_cut() {
         note(
             format,

@@ -58,8 +58,7 @@ impl GetOptions {
     fn check(&self, key: Option<&Key>, output: Output) -> Result<(), CliError> {
         let usage = |text: &str| Err(CliError::Usage(text.to_owned()));
         let kind = self.document.target.kind;
-        let filtered = self.selector.is_some() || self.layer.is_some() || self.node.is_some() || self.limit.is_some();
-        if key.is_some() && (filtered || self.service.is_some()) {
+        if key.is_some() && (self.is_filtered() || self.limit.is_some()) {
             return usage("a name and a filter: give one of them");
         }
         if self.service.is_some() && kind != Kind::Instance {
@@ -81,6 +80,11 @@ impl GetOptions {
             return usage("changes cannot be watched by node; --layer and -l can");
         }
         Ok(())
+    }
+
+    /// Whether only some of what there is is asked for.
+    fn is_filtered(&self) -> bool {
+        self.selector.is_some() || self.layer.is_some() || self.node.is_some() || self.service.is_some()
     }
 
     fn filter(&self) -> Filter {
@@ -126,7 +130,11 @@ pub(super) async fn run(options: &GetOptions, output: Output) -> Result<Exit, Cl
             if matches!(output, Output::Json | Output::Yaml) {
                 show_value(&listing.into_json(), output, options.watch)?;
             } else {
-                show_rows(kind, &listing.items, output)?;
+                if listing.items.is_empty() && output != Output::Name && options.is_filtered() {
+                    eprintln!("blaze: no {} match", kind.collection());
+                } else {
+                    show_rows(kind, &listing.items, output)?;
+                }
             }
             revision
         }

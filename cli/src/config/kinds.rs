@@ -94,6 +94,9 @@ pub(crate) fn parse_kind(word: &str) -> Result<Kind, String> {
 pub(crate) fn parse_key(kind: Kind, text: &str) -> Result<Key, String> {
     let (service, name) = match (kind, text.split_once('/')) {
         (Kind::Instance, Some((service, name))) => (Some(parse_service(service)?), name),
+        (Kind::Instance, None) if text.is_empty() => {
+            return Err("an instance is SERVICE/NAME, such as slam/0; `blaze get instances` lists all".to_owned());
+        }
         (Kind::Instance, None) => {
             return Err(format!(
                 "an instance is SERVICE/NAME, such as {text}/0; `blaze get instances --service {text}` lists those of {text}"
@@ -214,6 +217,7 @@ mod tests {
             ("node", None, "`blaze get nodes` lists them"),
             ("instance", None, "such as slam/0"),
             ("instance", Some("slam"), "such as slam/0"),
+            ("instance", Some(""), "such as slam/0"),
             ("node/a", Some("b"), "only one name"),
             ("node", Some("Robot_1"), "did you mean robot-1?"),
             ("node", Some("a/b"), "holds '/'"),

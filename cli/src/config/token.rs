@@ -14,7 +14,7 @@ use super::client::Client;
 use super::endpoint::{Surroundings, TokenSource, choose};
 use super::kinds::BASE;
 use super::options::ServerOptions;
-use super::text::{age, cell, now_ms, parse_duration, print};
+use super::text::{age, cell, note, now_ms, parse_duration, print};
 use super::token_local::{self, KeyUse, LocalToken, parse_algorithm};
 use crate::exit::{CliError, Exit};
 use crate::output::{Align, Format, render_table, terminal_width};
@@ -168,6 +168,10 @@ pub(super) async fn run(command: &TokenCommand, format: Format) -> Result<Exit, 
                 .get("items")
                 .and_then(Value::as_array)
                 .ok_or_else(|| client.odd("the tokens are no list"))?;
+            if items.is_empty() && format == Format::Table {
+                note(format, "no token was made by the server");
+                return Ok(Exit::Done);
+            }
             print(&answer, format, |_| table(items, now_ms(), terminal_width()))?;
         }
         TokenCommand::Revoke(options) => {

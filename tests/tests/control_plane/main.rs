@@ -35,6 +35,7 @@ mod sse;
 mod stage;
 mod stream;
 mod token;
+mod upgrade;
 mod watch;
 mod watcher;
 mod writer;

@@ -195,6 +195,12 @@ impl Main {
         }
     }
 
+    /// SIGTERM, and its exit code. Blocks the thread.
+    pub(crate) fn stop(&self) -> Option<i32> {
+        let mut process = self.process.lock().take().expect("it runs");
+        process.terminate(Duration::from_secs(20)).unwrap()
+    }
+
     /// Starts it again on the same store, with other ports; ready on return. Blocks the thread.
     pub(crate) fn start_again(&self) {
         let (process, addresses) = launch(&self.node_file, None).unwrap();
