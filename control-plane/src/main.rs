@@ -18,7 +18,8 @@ struct Arguments {
     /// The node file; else BLAZE_CONFIG, ./blaze.yaml, /etc/blaze/blaze.yaml (the last two not with --dev).
     #[arg(long, value_name = "FILE", global = true)]
     config: Option<PathBuf>,
-    /// Only check the configuration: every fault on stderr, exit code 0 or 64.
+    /// Only check the configuration, with the key and certificate files that it names: every fault on stderr, exit code 0
+    /// or 64. The store is not looked at.
     #[arg(long)]
     check: bool,
     /// text or json; else as the node file says.
@@ -90,7 +91,12 @@ fn main() -> ExitCode {
         dev: arguments.dev,
         in_memory: arguments.dev && !named && !names_store,
     };
-    if let Err(faults) = setup.check() {
+    let checked = if arguments.check {
+        setup.check_all()
+    } else {
+        setup.check()
+    };
+    if let Err(faults) = checked {
         faults.iter().for_each(|fault| say(format_args!("{fault}")));
         return ExitCode::from(exit_code::CONFIGURATION);
     }

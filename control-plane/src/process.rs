@@ -9,7 +9,7 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::{Arc, OnceLock};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use blaze_domain::node_file::{ControlPlaneSection, StoreSection};
@@ -79,10 +79,64 @@ impl Setup {
         if faults.is_empty() { Ok(()) } else { Err(faults) }
     }
 
+    /// The same, and whether every file with a key or a certificate can be used. The store is not looked at.
+    ///
+    /// # Errors
+    /// Every reason, one a line, with its place in the node file.
+    pub fn check_all(&self) -> Result<(), Vec<String>> {
+        install_crypto_provider();
+        let mut faults = self.check().err().unwrap_or_default();
+        for fault in Keys::read(&self.section).err().unwrap_or_default() {
+            // Some are seen both ways, in more words before.
+            if !faults.iter().any(|known| known.starts_with(&fault)) {
+                faults.push(fault);
+            }
+        }
+        if faults.is_empty() { Ok(()) } else { Err(faults) }
+    }
+
     async fn open(&self, supervisor: &Supervisor) -> Result<Arc<dyn FullStore>, StoreError> {
         match self.in_memory {
             true => store::in_memory(supervisor).await,
             false => store::open(&self.section.store, supervisor).await,
+        }
+    }
+}
+
+/// Everything that is read of files before the store is opened.
+struct Keys {
+    keyring: Keyring,
+    authenticator: Option<Authenticator>,
+    tls: Option<Tls>,
+}
+
+impl Keys {
+    /// # Errors
+    /// Every fault, with its place in the node file.
+    fn read(section: &ControlPlaneSection) -> Result<Self, Vec<String>> {
+        let authenticator = section.auth.as_ref().map(Authenticator::load).transpose();
+        let keyring = Keyring::load(&section.encryption);
+        match (authenticator, keyring, Tls::load(&section.tls)) {
+            (Ok(authenticator), Ok(keyring), Ok(tls)) => Ok(Self {
+                keyring,
+                authenticator,
+                tls,
+            }),
+            (authenticator, keyring, tls) => {
+                let faults = [authenticator.err(), keyring.err(), tls.err()];
+                Err(faults.into_iter().flatten().flatten().collect())
+            }
+        }
+    }
+
+    /// Reads the files again when they change.
+    fn watch(&self, supervisor: &Supervisor) {
+        self.keyring.watch(supervisor);
+        if let Some(authenticator) = &self.authenticator {
+            authenticator.watch(supervisor);
+        }
+        if let Some(tls) = &self.tls {
+            tls.watch(supervisor);
         }
     }
 }
@@ -172,8 +226,10 @@ async fn restore(supervisor: &Supervisor, setup: &Setup, path: PathBuf) -> anyho
     let context = || format!("{}", path.display());
     let file = std::fs::File::open(&path).with_context(context)?;
     let mut file = std::io::BufReader::new(file);
+    // Before the store: opening makes one that is not there.
+    backup::check(&mut file).with_context(context)?;
     let store = setup.open(supervisor).await?;
-    let restored = backup::restore(&*store, &mut file).await.with_context(context);
+    let restored = backup::restore_checked(&*store, &mut file).await.with_context(context);
     store.close().await;
     let restored = restored?;
     say(format_args!(
@@ -184,7 +240,7 @@ async fn restore(supervisor: &Supervisor, setup: &Setup, path: PathBuf) -> anyho
 }
 
 async fn reencrypt(supervisor: &Supervisor, setup: &Setup) -> anyhow::Result<()> {
-    let keyring = keyring(setup)?;
+    let keyring = Keyring::load(&setup.section.encryption).map_err(all_of)?;
     anyhow::ensure!(keyring.can_seal(), "control_plane.encryption.keys names no key");
     let store = setup.open(supervisor).await?;
     let failed = parking_lot::Mutex::new(Vec::new());
@@ -209,8 +265,9 @@ async fn reencrypt(supervisor: &Supervisor, setup: &Setup) -> anyhow::Result<()>
     Ok(())
 }
 
-fn keyring(setup: &Setup) -> anyhow::Result<Keyring> {
-    Keyring::load(&setup.section.encryption).map_err(|faults| anyhow::anyhow!(faults.join("; ")))
+#[expect(clippy::needless_pass_by_value, reason = "it stands in `map_err`")]
+fn all_of(faults: Vec<String>) -> anyhow::Error {
+    anyhow::anyhow!(faults.join("; "))
 }
 
 /// What runs once everything is built.
@@ -315,19 +372,83 @@ async fn admin(
     Ok(address)
 }
 
+/// Between two lines that say that nothing has changed.
+const STILL_WAITING: Duration = Duration::from_secs(60);
+
+/// What the log is told of a store that cannot be reached: each reason once.
+#[derive(Default)]
+struct Waiting {
+    /// The last reason without its numbers, and when something was told.
+    told: Option<(String, Instant)>,
+}
+
+#[derive(Debug, PartialEq, Eq)]
+enum News {
+    /// Another reason than before, with what to do about it if that is known.
+    Other(Option<&'static str>),
+    /// The same reason for long.
+    Still,
+    None,
+}
+
+impl Waiting {
+    fn news(&mut self, reason: &str, now: Instant) -> News {
+        let shape = without_numbers(reason);
+        match &mut self.told {
+            Some((told, at)) if *told == shape => {
+                if now.saturating_duration_since(*at) < STILL_WAITING {
+                    return News::None;
+                }
+                *at = now;
+                News::Still
+            }
+            told => {
+                *told = Some((shape, now));
+                News::Other(hint(reason))
+            }
+        }
+    }
+}
+
+/// Times and counters differ from one try to the next: `1.5 ms` and `820 µs` are the same.
+fn without_numbers(text: &str) -> String {
+    let part = |c: char| c.is_alphanumeric() || matches!(c, '.' | 'µ');
+    let mut out = String::new();
+    for word in text.split_inclusive(|c: char| !part(c)) {
+        if word.contains(|c: char| c.is_ascii_digit()) {
+            out.push('#');
+        } else if !matches!(word.trim_end_matches(|c: char| !part(c)), "ns" | "µs" | "ms" | "s") {
+            out.push_str(word);
+        }
+    }
+    out
+}
+
+/// MongoDB's driver tells the state of each member in words alone.
+fn hint(reason: &str) -> Option<&'static str> {
+    reason
+        .contains("RsGhost")
+        .then_some("a member says that its replica set was never initiated: run rs.initiate() once, on one member")
+}
+
 /// Opens the store, again and again while it cannot be reached.
 async fn open_store(
     supervisor: &Supervisor,
     setup: &Setup,
     readiness: &Readiness,
 ) -> anyhow::Result<Arc<dyn FullStore>> {
+    let mut waiting = Waiting::default();
     loop {
         let error = match setup.open(supervisor).await {
             Ok(store) => return Ok(store),
             Err(error) if error.is_transient() => error,
             Err(error) => return Err(error.into()),
         };
-        tracing::warn!(%error, "waiting for the store");
+        match waiting.news(&error.to_string(), Instant::now()) {
+            News::Other(hint) => tracing::warn!(%error, hint, "waiting for the store"),
+            News::Still => tracing::warn!("still waiting for the store, for the reason that was told before"),
+            News::None => tracing::debug!(%error, "waiting for the store"),
+        }
         readiness.set("store", CheckStatus::Failed, error.told());
         let pause = rand::rng().random_range(Duration::from_millis(100)..Duration::from_secs(2));
         tokio::time::sleep(pause).await;
@@ -341,21 +462,18 @@ async fn start(
     metrics: &Arc<ApiMetrics>,
 ) -> anyhow::Result<Running> {
     let section = &setup.section;
-    let keyring = keyring(setup)?;
-    keyring.watch(supervisor);
-    let authenticator = match &section.auth {
-        Some(auth) => {
-            let authenticator = Authenticator::load(auth).map_err(|faults| anyhow::anyhow!(faults.join("; ")))?;
-            authenticator.watch(supervisor);
-            Some(Arc::new(authenticator))
-        }
-        None => None,
-    };
+    let keys = Keys::read(section).map_err(all_of)?;
+    keys.watch(supervisor);
+    let Keys {
+        keyring,
+        authenticator,
+        tls,
+    } = keys;
     let store = open_store(supervisor, setup, readiness).await?;
     let told = Arc::clone(metrics);
     let options = CoreOptions {
         store: Arc::clone(&store) as Arc<dyn Store>,
-        authenticator,
+        authenticator: authenticator.map(Arc::new),
         dev: setup.dev,
         revocations: Revocations::new(),
         keyring: Arc::new(keyring),
@@ -385,10 +503,6 @@ async fn start(
             stopping: supervisor.stopping_token(),
         },
     );
-    let tls = Tls::load(&section.tls).map_err(|fault| anyhow::anyhow!("control_plane.tls: {fault}"))?;
-    if let Some(tls) = &tls {
-        tls.watch(supervisor);
-    }
     let listen = ListenLimits {
         // A watcher that stands still for a minute is told why it ends; see `watch_too_slow`.
         write_stall: Duration::from_secs(120),
@@ -405,4 +519,135 @@ async fn start(
         service,
         store,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use blaze_domain::node_file::{AuthSection, EncryptionKey, JwksSource, JwtAlgorithm, JwtKey};
+
+    use super::*;
+
+    fn setup(section: ControlPlaneSection) -> Setup {
+        Setup {
+            section,
+            dev: false,
+            in_memory: false,
+        }
+    }
+
+    #[test]
+    fn a_check_reads_all_files_and_names_their_places() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        std::fs::write(path("short.key"), "short").unwrap();
+        let key = |id: &str, algorithm, name: &str| JwtKey {
+            id: id.to_owned(),
+            algorithm,
+            file: path(name),
+            sign: false,
+        };
+        let mut section = ControlPlaneSection {
+            auth: Some(AuthSection {
+                issuer: String::new(),
+                audience: "blaze-config".to_owned(),
+                keys: vec![
+                    key("k0", JwtAlgorithm::Es256, "nope.key"),
+                    key("k1", JwtAlgorithm::Hs256, "short.key"),
+                    key("k2", JwtAlgorithm::Hs256, "nope.key"),
+                ],
+                jwks: Some(JwksSource::File(path("nope.json"))),
+            }),
+            ..ControlPlaneSection::default()
+        };
+        section.encryption.keys = vec![EncryptionKey {
+            id: "e1".to_owned(),
+            file: path("nope.enc"),
+        }];
+        section.tls.cert_file = Some(path("nope.pem"));
+        section.tls.key_file = Some(path("nope.pem"));
+        section.tls.client_ca_file = Some(path("nope.ca"));
+        let found = setup(section).check_all().unwrap_err();
+        for (place, part) in [
+            ("control_plane.auth.issuer: ", "empty"),
+            ("control_plane.auth.keys[0].alg: ", "ES256"),
+            ("control_plane.auth.keys[1].file: ", "short.key (key k1) holds 5 bytes"),
+            ("control_plane.auth.keys[2].file: ", "nope.key cannot be read"),
+            ("control_plane.auth.jwks.file: ", "nope.json cannot be read"),
+            ("control_plane.encryption.keys[0].file: ", "nope.enc cannot be read"),
+            ("control_plane.tls.cert_file: ", "nope.pem cannot be read"),
+            ("control_plane.tls.key_file: ", "nope.pem cannot be read"),
+            ("control_plane.tls.client_ca_file: ", "nope.ca cannot be read"),
+        ] {
+            let matching = found
+                .iter()
+                .filter(|fault| fault.starts_with(place) && fault.contains(part));
+            assert_eq!(matching.count(), 1, "{place}{part} in {found:#?}");
+        }
+        assert_eq!(found.len(), 9, "{found:#?}");
+    }
+
+    #[test]
+    fn what_is_seen_twice_is_told_once() {
+        let section = ControlPlaneSection {
+            auth: Some(AuthSection {
+                issuer: "blaze".to_owned(),
+                audience: "blaze-config".to_owned(),
+                keys: Vec::new(),
+                jwks: Some(JwksSource::Url {
+                    url: "http://example.org/jwks".to_owned().into(),
+                    refresh_s: 300,
+                }),
+            }),
+            ..ControlPlaneSection::default()
+        };
+        assert_eq!(setup(section).check_all().unwrap_err().len(), 1);
+    }
+
+    #[test]
+    fn a_reason_to_wait_is_told_once() {
+        let ghost = |rtt: &str| {
+            format!(
+                "MongoDB: Server selection timeout: No available servers. Topology: {{ Type: ReplicaSetNoPrimary, Servers: \
+                 [ {{ Address: 127.0.0.1:27017, Type: RsGhost, Average RTT: {rtt}, Last Update Time: 2026-11-23 9:12:33.5 }} ] }}"
+            )
+        };
+        let (mut waiting, start) = (Waiting::default(), Instant::now());
+        let News::Other(Some(hint)) = waiting.news(&ghost("1.2ms"), start) else {
+            panic!("the first reason is news");
+        };
+        assert!(hint.contains("rs.initiate()"));
+        assert_eq!(
+            waiting.news(&ghost("820µs"), start + Duration::from_secs(2)),
+            News::None
+        );
+        assert_eq!(
+            waiting.news(&ghost("2.5 ms"), start + Duration::from_secs(59)),
+            News::None
+        );
+        assert_eq!(
+            waiting.news(&ghost("2 ms"), start + Duration::from_secs(61)),
+            News::Still
+        );
+        assert_eq!(
+            waiting.news(&ghost("2 ms"), start + Duration::from_secs(63)),
+            News::None
+        );
+        let other = "MongoDB: connection refused";
+        assert_eq!(waiting.news(other, start + Duration::from_secs(64)), News::Other(None));
+        assert!(matches!(waiting.news(&ghost("1 s"), start), News::Other(Some(_))));
+    }
+
+    #[tokio::test]
+    async fn a_broken_backup_leaves_no_store_behind() {
+        let folder = tempfile::tempdir().unwrap();
+        let (backup, store) = (folder.path().join("backup"), folder.path().join("store.db"));
+        std::fs::write(&backup, "{}\n").unwrap();
+        let section = ControlPlaneSection {
+            store: StoreSection::Sqlite { path: store.clone() },
+            ..ControlPlaneSection::default()
+        };
+        let error = restore(&Supervisor::new("test"), &setup(section), backup).await;
+        assert!(format!("{:#}", error.unwrap_err()).contains("line 1"));
+        assert!(!store.exists());
+    }
 }

@@ -84,12 +84,12 @@ impl Keyring {
     /// Reads the key files: 32 bytes as base64 each.
     ///
     /// # Errors
-    /// Every fault, with the file that has it.
+    /// Every fault, with its place in the node file and the file that has it.
     pub fn load(section: &EncryptionSection) -> Result<Self, Vec<String>> {
         let mut faults = Vec::new();
         let mut keys = Vec::new();
-        for file in &section.keys {
-            match read_named(file) {
+        for (index, file) in section.keys.iter().enumerate() {
+            match read_named(index, file) {
                 Ok(key) => keys.push(key),
                 Err(fault) => faults.push(fault),
             }
@@ -263,7 +263,11 @@ impl NamedKey {
     }
 }
 
-fn read_named(file: &EncryptionKey) -> Result<NamedKey, String> {
+fn read_named(index: usize, file: &EncryptionKey) -> Result<NamedKey, String> {
+    read_key(file).map_err(|fault| format!("control_plane.encryption.keys[{index}].file: {fault}"))
+}
+
+fn read_key(file: &EncryptionKey) -> Result<NamedKey, String> {
     let wrong = |detail: &str| format!("{} (key {}) {detail}", file.file.display(), file.id);
     let text = read_file(&file.file)?;
     let decoded = STANDARD.decode(text.trim_ascii()).map(Zeroizing::new);
@@ -280,8 +284,8 @@ impl Shared {
         let _reading = self.reading.lock();
         let mut keys = Vec::clone(&self.keys.load());
         let mut faults = Vec::new();
-        for (file, held) in self.files.iter().zip(&mut keys) {
-            match read_named(file) {
+        for (index, (file, held)) in self.files.iter().zip(&mut keys).enumerate() {
+            match read_named(index, file) {
                 Ok(key) => *held = key,
                 Err(fault) => faults.push(fault),
             }

@@ -1,4 +1,5 @@
-//! What one client may take: requests at work, requests a second, refused tokens a second, open watches.
+//! What one client may take: requests at work, requests a second, refused tokens a second, open watches, bodies on their
+//! way.
 //!
 //! One value of [`ApiLimits`] serves REST and gRPC, so that a client cannot have twice as much by using both. Whatever is
 //! remembered about clients is bounded: the least recently seen are forgotten, with a full allowance.
@@ -10,11 +11,15 @@ use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::Instant;
 
+use axum::body::Body;
 use blaze_domain::config::{Code, Problem};
 use blaze_domain::node_file::LimitsSection;
 use lru::LruCache;
 use parking_lot::Mutex;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+use super::uploads::Uploads;
+pub(super) use super::uploads::refusal;
 
 /// Clients that are remembered per limit.
 const REMEMBERED: NonZeroUsize = NonZeroUsize::MIN.saturating_add(65_535);
@@ -47,6 +52,7 @@ impl Drop for WatchSlot {
 /// The limits of both interfaces.
 #[derive(Debug)]
 pub struct ApiLimits {
+    uploads: Arc<Uploads>,
     in_flight: Arc<Semaphore>,
     requests: Option<Buckets<String>>,
     failures: Option<Buckets<IpAddr>>,
@@ -60,6 +66,7 @@ impl ApiLimits {
     pub fn new(section: &LimitsSection) -> Self {
         let in_flight = usize::try_from(section.in_flight).unwrap_or(Semaphore::MAX_PERMITS);
         Self {
+            uploads: Arc::default(),
             in_flight: Arc::new(Semaphore::new(in_flight.min(Semaphore::MAX_PERMITS))),
             requests: (section.requests_per_s > 0).then(|| Buckets::new(section.requests_per_s)),
             failures: (section.auth_failures_per_s > 0).then(|| Buckets::new(section.auth_failures_per_s)),
@@ -68,7 +75,12 @@ impl ApiLimits {
         }
     }
 
-    /// A place among the requests at work.
+    /// The body of a request of a subject, bounded while it is on its way. When it fails by that, [`refusal`] finds why.
+    pub(super) fn metered(&self, subject: &str, body: Body) -> Body {
+        self.uploads.metered(subject, body)
+    }
+
+    /// A place among the requests at work, for one whose body is there.
     ///
     /// # Errors
     /// `overloaded` if all are taken.

@@ -54,6 +54,8 @@ struct Shared {
 }
 
 struct KeyFile {
+    /// Among the keys of the node file.
+    index: usize,
     id: String,
     algorithm: Algorithm,
     path: PathBuf,
@@ -79,12 +81,12 @@ impl Authenticator {
     /// Reads all key files. Keys from a URL come later, once [`Authenticator::watch`] runs.
     ///
     /// # Errors
-    /// Every fault, with the file that has it.
+    /// Every fault, with its place in the node file and the file that has it.
     pub fn load(section: &AuthSection) -> Result<Self, Vec<String>> {
         let mut faults = Vec::new();
         let mut files = Vec::new();
         for (index, key) in section.keys.iter().enumerate() {
-            match KeyFile::of(key) {
+            match KeyFile::of(index, key) {
                 Ok(file) => files.push(file),
                 Err(reason) => faults.push(format!("control_plane.auth.keys[{index}].alg: {reason}")),
             }
@@ -260,8 +262,9 @@ impl fmt::Debug for Authenticator {
 }
 
 impl KeyFile {
-    fn of(key: &JwtKey) -> Result<Self, String> {
+    fn of(index: usize, key: &JwtKey) -> Result<Self, String> {
         Ok(Self {
+            index,
             id: key.id.clone(),
             algorithm: startup::algorithm(key.algorithm)?,
             path: key.file.clone(),
@@ -270,6 +273,11 @@ impl KeyFile {
     }
 
     fn read(&self) -> Result<NamedKey, String> {
+        self.read_unplaced()
+            .map_err(|fault| format!("control_plane.auth.keys[{}].file: {fault}", self.index))
+    }
+
+    fn read_unplaced(&self) -> Result<NamedKey, String> {
         let bytes = read_file(&self.path)?;
         let key = read_key(self.algorithm, &bytes, self.sign)
             .map_err(|error| format!("{} (key {}) {error}", self.path.display(), self.id))?;
@@ -282,7 +290,11 @@ impl KeyFile {
 }
 
 fn read_jwks_file(path: &std::path::Path) -> Result<Jwks, String> {
-    read_jwks(&read_file(path)?).map_err(|reason| format!("{} {reason}", path.display()))
+    let read = read_file(path).and_then(|bytes| {
+        let keys = read_jwks(&bytes);
+        keys.map_err(|reason| format!("{} {reason}", path.display()))
+    });
+    read.map_err(|fault| format!("control_plane.auth.jwks.file: {fault}"))
 }
 
 impl Shared {

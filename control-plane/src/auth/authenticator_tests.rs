@@ -196,7 +196,13 @@ fn all_faulty_files_are_told() {
     let faults = Authenticator::load(&section(keys, Some(source)))
         .unwrap_err()
         .join("\n");
-    for part in ["(key k1) holds 5 bytes", "gone cannot be read", "ES256", "https://"] {
+    for part in [
+        "control_plane.auth.keys[0].file: ",
+        "(key k1) holds 5 bytes",
+        "gone cannot be read",
+        "ES256",
+        "https://",
+    ] {
         assert!(faults.contains(part), "{part} in {faults}");
     }
 }

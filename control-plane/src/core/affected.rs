@@ -2,43 +2,68 @@
 
 use std::collections::BTreeSet;
 
-use blaze_domain::config::{Key, Kind};
+use blaze_domain::config::selector::LabelSelector;
+use blaze_domain::config::{Document, Key, Kind};
 use blaze_domain::{LayerName, NodeName, ServiceName};
 
-use super::effective::{At, Sources};
+use super::effective::{At, Sources, canaries, is_canary};
 use super::placement::rollout_target;
 use super::state::State;
+use super::view::View;
 
 /// Places that are looked at for one request, at most: beyond it the answer would take longer than it is worth.
-const MAX_CANDIDATES: usize = 200_000;
+pub(crate) const MAX_CANDIDATES: usize = 200_000;
+/// The same for an answer that is kept with the commit: nobody can write while it is worked out.
+pub(crate) const MAX_KEPT_CANDIDATES: usize = 1000;
 
-/// Instances with a document, and services without an instance at the layers and nodes that treat them on their own.
-fn candidates(state: &State, keys: &[Key]) -> BTreeSet<At> {
-    let mut out = BTreeSet::new();
-    for key in keys {
-        if out.len() >= MAX_CANDIDATES {
-            break;
-        }
-        of_key(state, key, &mut out);
-    }
-    out
+/// A set of places that takes no more than so many.
+struct Places {
+    found: BTreeSet<At>,
+    limit: usize,
 }
 
-fn of_key(state: &State, key: &Key, out: &mut BTreeSet<At>) {
+impl Places {
+    fn is_full(&self) -> bool {
+        self.found.len() >= self.limit
+    }
+
+    fn add(&mut self, at: At) {
+        if !self.is_full() {
+            self.found.insert(at);
+        }
+    }
+}
+
+/// Instances with a document, and services without an instance at the layers and nodes that treat them on their own.
+fn candidates(state: &State, keys: &[Key], limit: usize) -> BTreeSet<At> {
+    let mut out = Places {
+        found: BTreeSet::new(),
+        limit,
+    };
+    for key in keys {
+        of_key(state, key, &mut out);
+    }
+    out.found
+}
+
+fn of_key(state: &State, key: &Key, out: &mut Places) {
+    if out.is_full() {
+        return;
+    }
     match key.kind() {
         Kind::Service => {
             let service = ServiceName::from(key.name());
-            for (_, held) in state.instances(&service) {
-                out.insert(Sources::placed(state, &service, &held.document));
+            for (_, held) in state.instances(&service).take(out.limit) {
+                out.add(Sources::placed(state, &service, &held.document));
             }
             for (layer, _) in state.of_kind(Kind::Layer, None) {
-                out.extend(at_layer(state, &service, &LayerName::from(layer.name())));
+                at_layer(state, &service, &LayerName::from(layer.name()), out);
             }
         }
         Kind::Layer => {
             let layer = LayerName::from(key.name());
             for service in services_of(state, key) {
-                out.extend(at_layer(state, &service, &layer));
+                at_layer(state, &service, &layer, out);
             }
             for placed in state.in_layer(&layer) {
                 of_placed(state, placed, out);
@@ -48,7 +73,7 @@ fn of_key(state: &State, key: &Key, out: &mut BTreeSet<At>) {
             let node = NodeName::from(key.name());
             let layer = state.get(key).and_then(|held| held.document.spec_layer()?.parse().ok());
             for service in services_of(state, key) {
-                out.insert(At {
+                out.add(At {
                     service: Some(service),
                     instance: None,
                     layer: layer.clone(),
@@ -70,11 +95,14 @@ fn of_key(state: &State, key: &Key, out: &mut BTreeSet<At>) {
 }
 
 /// A node's or an instance's own places.
-fn of_placed(state: &State, key: &Key, out: &mut BTreeSet<At>) {
+fn of_placed(state: &State, key: &Key, out: &mut Places) {
+    if out.is_full() {
+        return;
+    }
     match (key.kind(), key.service_name()) {
         (Kind::Instance, Some(service)) => {
             if let Some(held) = state.get(key) {
-                out.insert(Sources::placed(state, service, &held.document));
+                out.add(Sources::placed(state, service, &held.document));
             }
         }
         (Kind::Node, _) => {
@@ -99,13 +127,14 @@ fn services_of(state: &State, key: &Key) -> Vec<ServiceName> {
         .collect()
 }
 
-/// A service without instance in a layer: on no node, and on each node that has something of its own to say.
-fn at_layer(state: &State, service: &ServiceName, layer: &LayerName) -> Vec<At> {
+/// A service without instance in a layer: on no node, on each node that has something of its own to say, and on each where
+/// a roll-out tries a change of the service, the layer or the node.
+fn at_layer(state: &State, service: &ServiceName, layer: &LayerName, out: &mut Places) {
     let visible = state
         .get(&Key::service(service))
         .is_none_or(|held| held.document.is_for_layer(layer.as_str()));
-    if !visible {
-        return Vec::new();
+    if !visible || out.is_full() {
+        return;
     }
     let place = |node: Option<NodeName>| At {
         service: Some(service.clone()),
@@ -113,33 +142,50 @@ fn at_layer(state: &State, service: &ServiceName, layer: &LayerName) -> Vec<At> 
         layer: Some(layer.clone()),
         node,
     };
-    let own_word = |key: &&Key| {
-        let node = state.get(key).filter(|_| key.kind() == Kind::Node);
-        node.is_some_and(|held| {
-            let is_empty = |value: &serde_json::Value| value.as_object().is_some_and(serde_json::Map::is_empty);
-            held.document.config().is_some_and(|config| !is_empty(config))
-                || held
-                    .document
-                    .overrides(service.as_str())
-                    .is_some_and(|config| !is_empty(config))
-        })
+    out.add(place(None));
+    let is_empty = |value: &serde_json::Value| value.as_object().is_some_and(serde_json::Map::is_empty);
+    let own_word = |document: &Document| {
+        let overrides = document.overrides(service.as_str());
+        [document.config(), overrides]
+            .into_iter()
+            .flatten()
+            .any(|config| !is_empty(config))
     };
-    let nodes = state.in_layer(layer).filter(own_word);
-    let nodes = nodes.map(|key| place(Some(NodeName::from(key.name()))));
-    std::iter::once(place(None)).chain(nodes).collect()
+    let tried: Vec<LabelSelector> = [Key::service(service), Key::layer(layer)]
+        .iter()
+        .flat_map(|target| state.active_on(target))
+        .filter_map(|held| canaries(&held.document))
+        .collect();
+    for key in state.in_layer(layer) {
+        if out.is_full() {
+            return;
+        }
+        let Some(held) = state.get(key).filter(|_| key.kind() == Kind::Node) else {
+            continue;
+        };
+        let node = &held.document;
+        if own_word(node)
+            || tried.iter().any(|selector| selector.matches(&node.labels))
+            || state.active_on(key).any(|rollout| is_canary(&rollout.document, node))
+        {
+            out.add(place(Some(NodeName::from(key.name()))));
+        }
+    }
 }
 
-/// Places whose effective configuration may be another one after the change, in both states.
+/// Places whose effective configuration may be another one after the change.
 pub(crate) fn touched(state: &State, keys: &[Key]) -> BTreeSet<At> {
-    candidates(state, keys)
+    candidates(state, keys, MAX_CANDIDATES)
 }
 
-/// Places whose effective configuration is another one, in order.
-pub(crate) fn changed(before: &State, after: &State, keys: &[Key]) -> Vec<At> {
-    let mut places = candidates(before, keys);
-    places.extend(candidates(after, keys));
+/// Places whose effective configuration is another one, in order, as far as they are seen. Of each state at most `limit`
+/// are looked at.
+pub(crate) fn changed(before: &State, after: &State, keys: &[Key], view: &View, limit: usize) -> Vec<At> {
+    let mut places = candidates(before, keys, limit);
+    places.extend(candidates(after, keys, limit));
     places
         .into_iter()
+        .filter(|at| view.sees_place(before, at) || view.sees_place(after, at))
         .filter(|at| {
             let hash = |state: &State| exists(state, at).then(|| Sources::at(state, at).hash());
             hash(before) != hash(after)

@@ -20,10 +20,12 @@ use rand::RngExt as _;
 use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 use tokio::time::Instant;
 
+use super::affected::{MAX_CANDIDATES, MAX_KEPT_CANDIDATES};
 use super::evaluate::{Evaluator, Request};
 use super::log::Log;
 use super::report::{AnswerKind, Done};
 use super::state::State;
+use super::view::view;
 use crate::store::{AuditEntry, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError};
 
 /// Requests that may wait, at most.
@@ -34,6 +36,8 @@ const MAX_BATCH: usize = 256;
 pub(crate) const QUEUE_BYTES: usize = 64 * 1024 * 1024;
 /// Bytes of their bodies, at most, about.
 const MAX_BATCH_BYTES: usize = 4 * 1024 * 1024;
+/// Bytes of the bodies of a batch up to which it is worked out at once.
+const QUICK_BYTES: usize = 64 * 1024;
 /// How long one batch is tried.
 const DEADLINE: Duration = Duration::from_secs(10);
 /// Pause before a batch is tried again after another process was first, at most.
@@ -238,37 +242,32 @@ impl Committer {
 
     async fn try_batch(&mut self, batch: &[Queued]) -> Result<Vec<Tried>, Again> {
         let time = now();
-        let id = uuid::Uuid::now_v7().to_string();
-        let start = self.log.state();
-        let mut state = start.clone();
-        let mut records: Vec<CommitRecord> = Vec::new();
-        let mut tried = Vec::with_capacity(batch.len());
+        let mut work = Vec::with_capacity(batch.len());
         for queued in batch {
-            if let Some(found) = self.done_before(queued, time).await? {
-                tried.push(found);
-                continue;
-            }
-            let revision = state.revision() + 1;
-            match self.evaluator.evaluate(&state, &queued.request, revision, time) {
-                Err(problem) => tried.push(Tried::Refused(problem)),
-                Ok(evaluated) => {
-                    let before = state.clone();
-                    if !evaluated.changes.is_empty() {
-                        state.advance(revision, &evaluated.changes);
-                    }
-                    let done = Done {
-                        revision: state.revision(),
-                        before,
-                        after: state.clone(),
-                        evaluated,
-                    };
-                    if !done.evaluated.changes.is_empty() {
-                        records.push(record(queued, &done, &id, time));
-                    }
-                    tried.push(Tried::Done(Box::new(done)));
-                }
-            }
+            work.push(Work {
+                request: Arc::clone(&queued.request),
+                answer: queued.answer,
+                once: queued.once.clone(),
+                before: self.done_before(queued, time).await?,
+            });
         }
+        let start = self.log.state();
+        let is_long = batch.iter().map(|queued| queued.bytes).sum::<usize>() > QUICK_BYTES
+            || start.has_schemas()
+            || start.has_big()
+            || work.iter().any(Work::may_take_long);
+        let (records, tried) = if is_long {
+            // Beside the threads that serve, so that they go on meanwhile.
+            let (evaluator, start) = (Arc::clone(&self.evaluator), start.clone());
+            let worked = tokio::task::spawn_blocking(move || work_out(&evaluator, &start, work, time)).await;
+            worked.map_err(|error| {
+                tracing::error!(%error, "a change could not be worked out");
+                let detail = "the change could not be worked out; see the log of the service";
+                Again::Refuse(Problem::new(Code::Internal, detail))
+            })?
+        } else {
+            work_out(&self.evaluator, &start, work, time)
+        };
         if records.is_empty() {
             self.check_newest(&start).await?;
             return Ok(tried);
@@ -326,6 +325,65 @@ impl Committer {
     }
 }
 
+/// One request of a batch, without who waits for its answer.
+struct Work {
+    request: Arc<Request>,
+    answer: AnswerKind,
+    once: Option<Once>,
+    /// It was done before, or cannot be done.
+    before: Option<Tried>,
+}
+
+impl Work {
+    /// Whether it may take longer than its size says.
+    fn may_take_long(&self) -> bool {
+        self.request.has_schema() || self.request.cascade || self.request.prune.is_some() || {
+            self.once.is_some() && self.answer == AnswerKind::Report
+        }
+    }
+}
+
+/// Works out each request on the state after the ones before.
+fn work_out(evaluator: &Evaluator, start: &State, work: Vec<Work>, time: Timestamp) -> (Vec<CommitRecord>, Vec<Tried>) {
+    let id = uuid::Uuid::now_v7().to_string();
+    let mut state = start.clone();
+    let mut records: Vec<CommitRecord> = Vec::new();
+    let mut tried = Vec::with_capacity(work.len());
+    for one in work {
+        if let Some(found) = one.before {
+            tried.push(found);
+            continue;
+        }
+        let revision = state.revision() + 1;
+        match evaluator.evaluate(&state, &one.request, revision, time) {
+            Err(problem) => tried.push(Tried::Refused(problem)),
+            Ok(evaluated) => {
+                let before = state.clone();
+                if !evaluated.changes.is_empty() {
+                    state.advance(revision, &evaluated.changes);
+                }
+                let done = Done {
+                    revision: state.revision(),
+                    before,
+                    after: state.clone(),
+                    evaluated,
+                    view: view(&one.request.caller.claims),
+                    // The first answer and the kept one are the same.
+                    places: match one.once {
+                        Some(_) => MAX_KEPT_CANDIDATES,
+                        None => MAX_CANDIDATES,
+                    },
+                };
+                if !done.evaluated.changes.is_empty() {
+                    records.push(record(&one.request, one.answer, one.once.as_ref(), &done, &id, time));
+                }
+                tried.push(Tried::Done(Box::new(done)));
+            }
+        }
+    }
+    (records, tried)
+}
+
 enum Again {
     /// Read what others wrote, then again.
     Follow,
@@ -369,8 +427,14 @@ fn refuse(batch: Vec<Queued>, problem: &Problem) {
     }
 }
 
-fn record(queued: &Queued, done: &Done, batch: &str, time: Timestamp) -> CommitRecord {
-    let request = &queued.request;
+fn record(
+    request: &Request,
+    answer: AnswerKind,
+    once: Option<&Once>,
+    done: &Done,
+    batch: &str,
+    time: Timestamp,
+) -> CommitRecord {
     let changes = &done.evaluated.changes;
     let audit = changes.iter().map(|change| AuditEntry {
         id: uuid::Uuid::now_v7().to_string(),
@@ -389,12 +453,12 @@ fn record(queued: &Queued, done: &Done, batch: &str, time: Timestamp) -> CommitR
     });
     CommitRecord {
         audit: audit.collect(),
-        idempotency: queued.once.as_ref().map(|once| IdempotencyRecord {
+        idempotency: once.map(|once| IdempotencyRecord {
             id: once.id.clone(),
             body: once.body.clone(),
             expires: Timestamp::from_millis(time.as_millis() + IDEMPOTENCY),
             revision: done.revision,
-            answer: done.to_text(queued.answer),
+            answer: done.to_text(answer),
         }),
         commit: Arc::new(Commit {
             revision: done.revision,

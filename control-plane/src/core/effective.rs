@@ -2,12 +2,11 @@
 
 use blaze_domain::config::merge::{Part, Source};
 use blaze_domain::config::selector::LabelSelector;
-use blaze_domain::config::{Document, Key, Kind, canonical, merge, secret};
+use blaze_domain::config::{Document, Key, canonical, merge, secret};
 use blaze_domain::{DocumentName, LayerName, NodeName, ServiceName};
 use serde_json::Value;
 use std::sync::Arc;
 
-use super::placement::{is_active, rollout_target};
 use super::state::State;
 
 /// The documents whose configurations are merged, weakest first.
@@ -64,17 +63,17 @@ impl Sources {
 
     fn roll_out(&mut self, state: &State) {
         let Some(node) = self.node.clone() else { return };
-        for (_, held) in state.of_kind(Kind::Rollout, None) {
-            let rollout = &held.document;
-            if !is_active(rollout) || !is_canary(rollout, &node) {
-                continue;
-            }
-            let (Some(target), Some(patch)) = (rollout_target(rollout), rollout.spec_member("patch")) else {
+        let parts = [&mut self.service, &mut self.layer, &mut self.node, &mut self.instance];
+        for part in parts {
+            let Some(key) = part.as_ref().map(|document| document.key.clone()) else {
                 continue;
             };
-            let parts = [&mut self.service, &mut self.layer, &mut self.node, &mut self.instance];
-            for part in parts {
-                if let Some(document) = part.as_ref().filter(|document| document.key == target) {
+            for held in state.active_on(&key) {
+                let rollout = &held.document;
+                if let Some(patch) = rollout.spec_member("patch")
+                    && let Some(document) = part.as_ref()
+                    && is_canary(rollout, &node)
+                {
                     *part = Some(Arc::new(patched(document, patch)));
                     self.rollout = Some(rollout.key.name().clone());
                 }
@@ -159,18 +158,18 @@ impl Sources {
 
 /// Whether a node is one that a roll-out tries its change on.
 pub(crate) fn is_canary(rollout: &Document, node: &Document) -> bool {
-    let selector = rollout
-        .spec_member("canary")
-        .and_then(|canary| canary.get("node_selector"));
-    let selector = selector
-        .and_then(Value::as_str)
-        .and_then(|text| text.parse::<LabelSelector>().ok());
-    selector.is_some_and(|selector| selector.matches(&node.labels))
+    canaries(rollout).is_some_and(|selector| selector.matches(&node.labels))
+}
+
+/// The nodes that a roll-out tries its change on.
+pub(crate) fn canaries(rollout: &Document) -> Option<LabelSelector> {
+    let canary = rollout.spec_member("canary")?;
+    canary.get("node_selector")?.as_str()?.parse().ok()
 }
 
 /// A document with a roll-out's change in its spec. Secrets of the change were encrypted for the roll-out, so they are
 /// not carried over here: a roll-out may not change secrets.
-fn patched(document: &Document, patch: &Value) -> Document {
+pub(crate) fn patched(document: &Document, patch: &Value) -> Document {
     let mut out = document.clone();
     let mut spec = (*document.spec).clone();
     merge::merge_patch(&mut spec, patch);

@@ -12,14 +12,14 @@ use blaze_domain::config::{
 };
 use serde_json::{Map, Value, json};
 
-use super::effective::is_canary;
+use super::effective::{is_canary, patched};
 use super::placement::{is_active, phase, placement, rollout_target};
 use super::refs;
 use super::schema::Schemas;
 use super::secrets::Vault;
 use super::state::State;
 use super::types::{ApplyAction, Caller, DocumentInput, Precondition};
-use super::view::view;
+use super::view::{View, view};
 use crate::secrets::Keyring;
 use crate::store::{Change, Op};
 
@@ -27,6 +27,8 @@ use crate::store::{Change, Op};
 const PRUNE_FREELY: usize = 20;
 /// Referrers that are named in a refusal.
 const NAMED: usize = 5;
+/// The same that are counted.
+const COUNTED: usize = 1000;
 
 /// What one document is to become.
 #[derive(Debug, Clone)]
@@ -39,6 +41,8 @@ pub(crate) enum Content {
     Restore(Option<Arc<Document>>),
     /// Gone.
     Delete,
+    /// As it is.
+    Leave,
     /// The roll-out's change becomes its target's content.
     Promote,
     /// The roll-out ends without effect, for a reason.
@@ -96,6 +100,21 @@ pub(crate) struct Request {
     pub(crate) unchanged_since: BTreeMap<Key, u64>,
 }
 
+impl Request {
+    /// Whether it brings a schema, which is checked against whatever there is.
+    pub(crate) fn has_schema(&self) -> bool {
+        self.items.iter().any(|item| {
+            item.key.kind() == Kind::Service
+                && match &item.content {
+                    Content::Write(input) => is_set(input.spec.get("schema")),
+                    Content::Patch(patch) => is_set(patch.get("spec").and_then(|spec| spec.get("schema"))),
+                    Content::Restore(_) => true,
+                    Content::Delete | Content::Promote | Content::Abort(_) | Content::Leave => false,
+                }
+        })
+    }
+}
+
 /// What a request comes to.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Evaluated {
@@ -136,15 +155,6 @@ impl Evaluator {
         revision: u64,
         time: Timestamp,
     ) -> Result<Evaluated, Problem> {
-        self.work_out(state, request, revision, time).map_err(|mut problem| {
-            if matches!(problem.code.http_status(), Some(409 | 412 | 428)) {
-                problem.revision.get_or_insert(state.revision());
-            }
-            problem
-        })
-    }
-
-    fn work_out(&self, state: &State, request: &Request, revision: u64, time: Timestamp) -> Result<Evaluated, Problem> {
         let view = view(&request.caller.claims);
         for item in &request.items {
             view.check_named(state, &item.key, item.must_exist())?;
@@ -316,7 +326,26 @@ impl Evaluator {
         for change in changes {
             let key = &change.document.key;
             let (was, is) = (document(before, key), document(after, key));
-            view.check_write((before, was.as_deref()), (after, is.as_deref()))?;
+            let written = view.check_write((before, was.as_deref()), (after, is.as_deref()));
+            written.map_err(|problem| match request.items.iter().any(|item| item.key == *key) {
+                true => problem,
+                // It may be one that the token does not know of.
+                false => view.outside("a document that would change along"),
+            })?;
+        }
+        let begun = changes
+            .iter()
+            .filter(|change| change.op == Op::Create && change.document.key.kind() == Kind::Rollout);
+        for change in begun.clone() {
+            if let Some((target, patched)) = tried(after, &change.document) {
+                let written = view.check_write((after, Some(&target)), (after, Some(&patched)));
+                written.map_err(|_| view.outside(&format!("what {} makes of its target", change.document.key)))?;
+                for mut fault in refs::missing_of(after, &patched) {
+                    let within = fault.pointer.strip_prefix("/spec").unwrap_or_default();
+                    fault.pointer = format!("/spec/patch{within}");
+                    faults.add(index_of(&change.document.key), fault);
+                }
+            }
         }
         for change in changes.iter().filter(|change| change.op != Op::Delete) {
             let key = &change.document.key;
@@ -326,18 +355,20 @@ impl Evaluator {
         }
         faults.finish_invalid()?;
         let keys: Vec<Key> = changes.iter().map(|change| change.document.key.clone()).collect();
-        for fault in self.schemas.check_effective(after, &keys, &self.keyring) {
+        for fault in self.schemas.check_effective(after, &keys, &view) {
             faults.add(keys.first().map_or(0, index_of), fault);
         }
         faults.finish_invalid()?;
         for change in changes.iter().filter(|change| change.op == Op::Delete) {
             let key = &change.document.key;
-            let referrers = refs::referrers(after, key, NAMED + 1);
+            let referrers = refs::referrers(after, key, COUNTED);
             if !referrers.is_empty() {
-                faults.conflict(index_of(key), in_use(key, &referrers));
+                let mut problem = in_use(key, &referrers, after, &view);
+                problem.revision = change.previous;
+                faults.conflict(index_of(key), problem);
             }
         }
-        for change in changes.iter().filter(|change| change.op == Op::Create) {
+        for change in begun {
             if let Some(problem) = active_elsewhere(after, &change.document) {
                 faults.conflict(index_of(&change.document.key), problem);
             }
@@ -347,16 +378,16 @@ impl Evaluator {
                 "the store would hold {} documents, at most {MAX_DOCUMENTS} are allowed",
                 after.len()
             );
-            return Err(Problem::new(Code::LimitExceeded, detail));
+            return Err(Problem::new(Code::LimitExceeded, detail).at(before.revision()));
         }
-        faults.finish_conflicts(before.revision())
+        faults.finish_conflicts()
     }
 }
 
 /// What becomes of the document of one item, and of others that it changes along.
 fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key, Outcome, Op)>, Box<Problem>> {
     let current = state.get(&item.key).map(|held| &*held.document);
-    precondition(state, request, item, current)?;
+    precondition(request, item, current)?;
     let update = if current.is_some() { Op::Update } else { Op::Create };
     let one = |outcome, op| Ok(vec![(item.key.clone(), outcome, op)]);
     match &item.content {
@@ -373,6 +404,7 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
                 Op::Update,
             )
         }
+        Content::Leave => one(Outcome::Keep, Op::Update),
         Content::Delete => match current {
             Some(_) => one(Outcome::Remove, Op::Delete),
             None if request.form == Form::Many => one(Outcome::Keep, Op::Delete),
@@ -414,8 +446,11 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
     }
 }
 
-fn precondition(state: &State, request: &Request, item: &Item, current: Option<&Document>) -> Result<(), Box<Problem>> {
-    let fail = |problem: Problem| Err(Box::new(problem.at(current.map_or(state.revision(), |d| d.revision))));
+fn precondition(request: &Request, item: &Item, current: Option<&Document>) -> Result<(), Box<Problem>> {
+    let fail = |mut problem: Problem| {
+        problem.revision = current.map(|document| document.revision);
+        Err(Box::new(problem))
+    };
     let many = request.form == Form::Many;
     let rolls_back = matches!(item.content, Content::Restore(_) | Content::Promote | Content::Abort(_));
     if let Some(revision) = request.unchanged_since.get(&item.key)
@@ -523,6 +558,14 @@ fn patch_input(state: &State, key: &Key, patch: &Value) -> Result<DocumentInput,
         }
         own.insert(name.clone(), value.clone());
     }
+    let needed = ["kind", "name"]
+        .into_iter()
+        .chain(key.service_name().map(|_| "service"));
+    for name in needed {
+        if own.get(name).is_some_and(Value::is_null) {
+            return Err(vec![invalid(&format!("/{name}"), "cannot be taken away")]);
+        }
+    }
     merge::merge_patch(&mut whole, &Value::Object(own));
     let envelope = spec::parse_envelope(whole, Some(key))?;
     Ok(DocumentInput {
@@ -531,6 +574,26 @@ fn patch_input(state: &State, key: &Key, patch: &Value) -> Result<DocumentInput,
         annotations: envelope.annotations,
         spec: envelope.spec,
     })
+}
+
+/// Refuses a roll-out whose target would have another size than a document may have.
+fn too_large(target: &Document, patched: &Value) -> Result<(), Box<Problem>> {
+    let bytes = spec::document_size(&target.labels, &target.annotations, patched);
+    if bytes <= MAX_DOCUMENT_BYTES {
+        return Ok(());
+    }
+    let detail = format!(
+        "the patch makes of {} a document of {bytes} bytes, at most {MAX_DOCUMENT_BYTES} are allowed",
+        target.key
+    );
+    Err(Box::new(Problem::new(Code::PayloadTooLarge, detail)))
+}
+
+/// The target of a roll-out, and what its patch makes of it.
+fn tried(state: &State, rollout: &Document) -> Option<(Arc<Document>, Document)> {
+    let target = Arc::clone(&state.get(&rollout_target(rollout)?)?.document);
+    let patched = patched(&target, rollout.spec_member("patch")?);
+    Some((target, patched))
 }
 
 fn begin_rollout(state: &State, input: &DocumentInput) -> Result<Value, Box<Problem>> {
@@ -575,6 +638,7 @@ fn begin_rollout(state: &State, input: &DocumentInput) -> Result<Value, Box<Prob
             merge::merge_patch(&mut patched, patch);
         }
         let document = &target.document;
+        too_large(document, &patched)?;
         let faults = spec::check(&document.key, &document.labels, &document.annotations, &patched);
         if let Some(fault) = faults.first() {
             return refuse(
@@ -601,7 +665,9 @@ fn canary_phase(state: &State, key: &Key) -> Result<Arc<Document>, Box<Problem>>
         "{key} is {}; only one in phase canary can be promoted or aborted",
         phase(&held.document)
     );
-    Err(Box::new(Problem::new(Code::RolloutState, detail).at(state.revision())))
+    Err(Box::new(
+        Problem::new(Code::RolloutState, detail).at(held.document.revision),
+    ))
 }
 
 fn with_phase(rollout: &Document, phase: &str, reason: &str) -> Outcome {
@@ -631,12 +697,9 @@ fn promote(state: &State, key: &Key) -> Result<Vec<(Key, Outcome, Op)>, Box<Prob
     if let Some(patch) = rollout.spec_member("patch") {
         merge::merge_patch(&mut spec, patch);
     }
-    let faults = spec::check(
-        &target,
-        &held.document.labels,
-        &held.document.annotations,
-        &secret::redact(&spec),
-    );
+    let shown = secret::redact(&spec);
+    too_large(&held.document, &shown)?;
+    let faults = spec::check(&target, &held.document.labels, &held.document.annotations, &shown);
     if !faults.is_empty() {
         return Err(Box::new(Problem::faults(faults)));
     }
@@ -659,20 +722,13 @@ fn abort(state: &State, key: &Key, reason: &str) -> Result<Vec<(Key, Outcome, Op
 }
 
 fn active_elsewhere(after: &State, rollout: &Document) -> Option<Problem> {
-    if rollout.key.kind() != Kind::Rollout {
-        return None;
-    }
     let target = rollout_target(rollout)?;
-    let other = after.of_kind(Kind::Rollout, None).find(|(key, held)| {
-        **key != rollout.key && is_active(&held.document) && rollout_target(&held.document).as_ref() == Some(&target)
-    });
-    other.map(|(other, _)| {
-        let detail = format!(
-            "{target} has the roll-out {} already: promote or abort it first",
-            other.name()
-        );
-        Problem::new(Code::RolloutActive, detail)
-    })
+    let other = after.active_on(&target).find(|held| held.document.key != rollout.key)?;
+    let detail = format!(
+        "{target} has the roll-out {} already: promote or abort it first",
+        other.document.key.name()
+    );
+    Some(Problem::new(Code::RolloutActive, detail).at(other.document.revision))
 }
 
 fn prune_into(
@@ -699,7 +755,7 @@ fn prune_into(
             gone.len(),
             gone.len()
         );
-        return Err(Problem::new(Code::LimitExceeded, detail));
+        return Err(Problem::new(Code::LimitExceeded, detail).at(state.revision()));
     }
     for key in gone {
         order.push(key.clone());
@@ -759,11 +815,28 @@ fn same_spec(one: &Value, other: &Value) -> bool {
     };
     let covered = |one: &Map<String, Value>, other: &Map<String, Value>| {
         one.iter().all(|(name, value)| match other.get(name) {
-            Some(found) => found == value,
+            Some(found) => same_value(found, value),
             None => is_default(name, value),
         })
     };
     covered(one, other) && covered(other, one)
+}
+
+/// `1` and `1.0` are the same number, as they are in the canonical text.
+fn same_value(one: &Value, other: &Value) -> bool {
+    match (one, other) {
+        (Value::Number(one), Value::Number(other)) => one == other || one.as_f64() == other.as_f64(),
+        (Value::Array(one), Value::Array(other)) => {
+            one.len() == other.len() && one.iter().zip(other).all(|(one, other)| same_value(one, other))
+        }
+        (Value::Object(one), Value::Object(other)) => {
+            one.len() == other.len()
+                && one
+                    .iter()
+                    .all(|(name, value)| other.get(name).is_some_and(|found| same_value(value, found)))
+        }
+        (one, other) => one == other,
+    }
 }
 
 fn is_set(value: Option<&Value>) -> bool {
@@ -787,11 +860,23 @@ fn not_found(key: &Key) -> Problem {
     Problem::new(Code::NotFound, format!("there is no {key}"))
 }
 
-fn in_use(key: &Key, referrers: &[Key]) -> Problem {
-    let named: Vec<String> = referrers.iter().take(NAMED).map(ToString::to_string).collect();
-    let more = if referrers.len() > NAMED { " and more" } else { "" };
+fn in_use(key: &Key, referrers: &[Key], state: &State, view: &View) -> Problem {
+    let is_seen = |key: &&Key| {
+        state
+            .get(key)
+            .is_some_and(|held| view.sees_document(state, &held.document))
+    };
+    let seen = referrers.iter().filter(is_seen).take(NAMED);
+    let mut named: Vec<String> = seen.map(ToString::to_string).collect();
+    let others = referrers.len() - named.len();
+    match others {
+        0 => {}
+        1 => named.push("1 other".to_owned()),
+        _ if referrers.len() == COUNTED => named.push(format!("{others} or more others")),
+        _ => named.push(format!("{others} others")),
+    }
     let detail = format!(
-        "{key} is referred to by {}{more}: delete those first, or use cascade=true",
+        "{key} is referred to by {}: delete those first, or use cascade=true",
         named.join(", ")
     );
     Problem::new(Code::InUse, detail)
@@ -844,12 +929,11 @@ impl Faults {
         Err(Problem::faults(std::mem::take(&mut self.invalid)))
     }
 
-    fn finish_conflicts(&mut self, revision: u64) -> Result<(), Problem> {
+    fn finish_conflicts(&mut self) -> Result<(), Problem> {
         let Some((_, first)) = self.conflicts.first() else {
             return Ok(());
         };
         let mut problem = first.clone();
-        problem.revision.get_or_insert(revision);
         if self.form == Form::Many {
             let fault = |(index, problem): &(usize, Problem)| FieldFault {
                 pointer: String::new(),

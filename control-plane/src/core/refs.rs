@@ -1,15 +1,21 @@
 //! Which documents refer to which.
 
-use blaze_domain::config::{Code, FieldFault, Key, Kind, spec};
+use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, spec};
 use blaze_domain::{LayerName, NodeName, ServiceName};
 
-use super::placement::{is_active, rollout_target};
 use super::state::State;
 
 /// References of a document to what does not exist.
 pub(crate) fn missing(state: &State, key: &Key) -> Vec<FieldFault> {
-    let Some(held) = state.get(key) else { return Vec::new() };
-    spec::references(&held.document)
+    state
+        .get(key)
+        .map(|held| missing_of(state, &held.document))
+        .unwrap_or_default()
+}
+
+/// The same of a document that need not be part of the state.
+pub(crate) fn missing_of(state: &State, document: &Document) -> Vec<FieldFault> {
+    spec::references(document)
         .into_iter()
         .filter(|(_, target)| state.get(target).is_none())
         .map(|(pointer, target)| FieldFault {
@@ -56,10 +62,8 @@ pub(crate) fn referrers(state: &State, key: &Key, limit: usize) -> Vec<Key> {
         }
         Kind::Instance | Kind::Rollout => {}
     }
-    let rollouts = state.of_kind(Kind::Rollout, None);
-    let aimed =
-        rollouts.filter(|(_, held)| is_active(&held.document) && rollout_target(&held.document).as_ref() == Some(key));
-    out.extend(aimed.take(limit).map(|(key, _)| key.clone()));
+    let rollouts = state.active_on(key).take(limit);
+    out.extend(rollouts.map(|held| held.document.key.clone()));
     out.sort();
     out.truncate(limit);
     out

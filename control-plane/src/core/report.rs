@@ -12,6 +12,7 @@ use super::effective::At;
 use super::evaluate::Evaluated;
 use super::state::State;
 use super::types::{ApplyAction, ApplyReport, ApplyResult, Place, Written};
+use super::view::View;
 
 /// Places that are named in an answer.
 const MAX_AFFECTED: usize = 1000;
@@ -26,6 +27,10 @@ pub(crate) struct Done {
     pub(crate) before: State,
     pub(crate) after: State,
     pub(crate) evaluated: Evaluated,
+    /// Who asked, as far as the answer may tell.
+    pub(crate) view: View,
+    /// Places of each state that are looked at for `affected`, at most.
+    pub(crate) places: usize,
 }
 
 /// What kind of answer a request gets.
@@ -82,7 +87,7 @@ impl Done {
             .iter()
             .map(|change| change.document.key.clone())
             .collect();
-        let affected = affected::changed(&self.before, &self.after, &keys);
+        let affected = affected::changed(&self.before, &self.after, &keys, &self.view, self.places);
         ApplyReport {
             dry_run,
             revision: if dry_run { self.before.revision() } else { self.revision },

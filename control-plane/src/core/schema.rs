@@ -1,13 +1,14 @@
 //! JSON Schemas of services: whether they are sound, and whether effective configurations match them.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
 use blaze_domain::ServiceName;
 use blaze_domain::config::spec::NODE_FILE_SECTIONS;
-use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_DEPTH, MAX_EFFECTIVE_BYTES};
-use jsonschema::{Draft, PatternOptions, Validator};
+use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_DEPTH, MAX_EFFECTIVE_BYTES, canonical, secret};
+use jsonschema::error::ValidationErrorKind;
+use jsonschema::{Draft, Keyword, PatternOptions, ValidationError, Validator};
 use lru::LruCache;
 use parking_lot::Mutex;
 use serde_json::{Map, Value};
@@ -15,9 +16,8 @@ use sha2::{Digest as _, Sha256};
 
 use super::affected::touched;
 use super::effective::{At, Sources};
-use super::secrets::as_text;
 use super::state::State;
-use crate::secrets::Keyring;
+use super::view::View;
 
 /// Compiled schemas that are kept.
 const CACHED: NonZeroUsize = NonZeroUsize::MIN.saturating_add(511);
@@ -29,6 +29,11 @@ const PATTERN_BYTES: usize = 1 << 20;
 const MAX_STEPS: u64 = 10_000;
 /// How many of them may lie within each other: each takes a part of the stack.
 const MAX_NESTING: usize = 512;
+
+/// Subschemas that `uniqueItems` counts as: it looks at all that a list holds.
+const UNIQUE_STEPS: u64 = 50;
+/// The dialect that schemas are in.
+const DIALECT: &str = "https://json-schema.org/draft/2020-12/schema";
 
 /// A schema, in full and without `required`.
 struct Compiled {
@@ -66,6 +71,11 @@ impl Schemas {
                 "$ref {reference:?} leads out of the schema; only #… is followed"
             ));
         }
+        if let Some(dialect) = foreign_dialect(schema) {
+            return Err(format!(
+                "$schema {dialect:?} is another dialect; only {DIALECT} is taken"
+            ));
+        }
         let build = |schema: &Value| {
             let patterns = PatternOptions::regex()
                 .size_limit(PATTERN_BYTES)
@@ -74,6 +84,7 @@ impl Schemas {
                 .with_draft(Draft::Draft202012)
                 .offline()
                 .with_pattern_options(patterns)
+                .with_keyword("uniqueItems", unique_items)
                 .build(schema)
                 .map_err(|error| error.to_string().chars().take(500).collect::<String>())
         };
@@ -85,14 +96,16 @@ impl Schemas {
         estimate(schema)?;
         let compiled = Arc::new(Compiled {
             full: build(schema)?,
-            partial: build(&without_required(schema))?,
+            // What refers into a keyword that goes leads nowhere: then only the full form can be judged.
+            partial: build(&without_required(schema)).or_else(|_| build(&Value::Bool(true)))?,
         });
         self.cache.lock().put(id, Arc::clone(&compiled));
         Ok(compiled)
     }
 
-    /// Checks every effective configuration that changed documents can concern: its size, and its service's schema.
-    pub(crate) fn check_effective(&self, state: &State, keys: &[Key], keyring: &Keyring) -> Vec<FieldFault> {
+    /// Checks every effective configuration that changed documents can concern: its size, and its service's schema. Of
+    /// what is outside the view no more is told than that it would not do.
+    pub(crate) fn check_effective(&self, state: &State, keys: &[Key], view: &View) -> Vec<FieldFault> {
         let any_schema = |service: &ServiceName| schema_of(state, service).is_some();
         // Most writes concern no schema at all; to find the places that they touch would cost more than the write.
         let matters = |key: &&Key| {
@@ -105,6 +118,7 @@ impl Schemas {
         };
         let keys: Vec<Key> = keys.iter().filter(matters).cloned().collect();
         let mut faults = Vec::new();
+        let mut is_refused_outside = false;
         for at in touched(state, &keys) {
             if faults.len() >= MAX_FAULTS {
                 break;
@@ -114,26 +128,35 @@ impl Schemas {
             if !has_schema && !state.has_big() {
                 continue;
             }
+            let is_seen = view.sees_place(state, &at);
+            if is_refused_outside && !is_seen {
+                continue;
+            }
             let sources = Sources::at(state, &at);
+            let mut found = Vec::new();
             if state.has_big() && sources.size_bound() > MAX_EFFECTIVE_BYTES {
-                faults.extend(size_fault(&sources, &at));
+                found.extend(size_fault(&sources, &at));
             }
             if has_schema && let Some(document) = schema_of(state, service) {
-                self.check_one(&document, &sources, &at, keyring, &mut faults);
+                self.check_one(&document, &sources, &at, MAX_FAULTS - faults.len(), &mut found);
+            }
+            if is_seen {
+                faults.append(&mut found);
+            } else if !found.is_empty() {
+                is_refused_outside = true;
+                faults.push(FieldFault {
+                    pointer: "/spec".to_owned(),
+                    code: Code::SchemaMismatch,
+                    detail: "a service outside the token's layer does not take this".to_owned(),
+                    document: None,
+                });
             }
         }
         faults.truncate(MAX_FAULTS);
         faults
     }
 
-    fn check_one(
-        &self,
-        service: &Document,
-        sources: &Sources,
-        at: &At,
-        keyring: &Keyring,
-        faults: &mut Vec<FieldFault>,
-    ) {
+    fn check_one(&self, service: &Document, sources: &Sources, at: &At, limit: usize, faults: &mut Vec<FieldFault>) {
         let Some(schema) = service.spec_member("schema") else {
             return;
         };
@@ -142,7 +165,7 @@ impl Schemas {
             tracing::warn!(service = %service.key, "the stored schema cannot be compiled; it is not checked");
             return;
         };
-        let mut config = sources.merged_with(|document, value| as_text(keyring, document, value));
+        let (mut config, secrets) = with_placeholders(sources.merged());
         if let Value::Object(members) = &mut config {
             members.retain(|name, _| !NODE_FILE_SECTIONS.contains(&name.as_str()));
         }
@@ -151,10 +174,14 @@ impl Schemas {
         } else {
             &compiled.partial
         };
-        for error in validator
-            .iter_errors(&config)
-            .take(MAX_FAULTS - faults.len().min(MAX_FAULTS))
-        {
+        let errors = validator.iter_errors(&config).filter(|error| {
+            !secrets.contains(error.instance_path().as_str())
+                || matches!(
+                    error.kind(),
+                    ValidationErrorKind::Type { .. } | ValidationErrorKind::FalseSchema
+                )
+        });
+        for error in errors.take(limit) {
             let found: String = error.masked().to_string().chars().take(300).collect();
             faults.push(FieldFault {
                 pointer: format!("/spec/config{}", error.instance_path().as_str()),
@@ -164,6 +191,66 @@ impl Schemas {
             });
         }
     }
+}
+
+/// A configuration with a text in place of each secret that says nothing of it, and where they are. Whether a text has a
+/// length or matches a pattern would tell it, one try after the other, to who may not read it. The texts differ, as
+/// secrets may.
+fn with_placeholders(mut config: Value) -> (Value, HashSet<String>) {
+    let mut found = HashSet::new();
+    if secret::contains(&config) {
+        secret::map(&mut config, &mut |pointer, _| {
+            found.insert(pointer.to_owned());
+            Some(Value::from(format!("secret {}", found.len())))
+        });
+    }
+    (config, found)
+}
+
+/// `uniqueItems` in the time that it takes to write the list: to compare each item with each other takes for ever.
+struct UniqueItems(bool);
+
+impl UniqueItems {
+    fn holds(&self, instance: &Value) -> bool {
+        let Some(items) = instance.as_array().filter(|_| self.0) else {
+            return true;
+        };
+        let mut seen = HashSet::with_capacity(items.len());
+        items.iter().all(|item| seen.insert(canonical::to_string(item)))
+    }
+}
+
+impl<'i> Keyword<'i> for UniqueItems {
+    fn validate(&self, instance: &'i Value) -> Result<(), ValidationError<'i>> {
+        match self.holds(instance) {
+            true => Ok(()),
+            false => Err(ValidationError::custom("two items of the list are equal")),
+        }
+    }
+
+    fn is_valid(&self, instance: &'i Value) -> bool {
+        self.holds(instance)
+    }
+}
+
+#[allow(
+    clippy::unnecessary_wraps,
+    clippy::result_large_err,
+    reason = "the form of jsonschema"
+)]
+fn unique_items<'a>(
+    _parent: &'a Map<String, Value>,
+    schema: &'a Value,
+    _path: jsonschema::paths::Location,
+) -> Result<Box<dyn for<'i> Keyword<'i>>, ValidationError<'a>> {
+    Ok(Box::new(UniqueItems(schema.as_bool().unwrap_or(false))))
+}
+
+/// The dialect that a schema says it is in, if it is not the one that is taken.
+fn foreign_dialect(schema: &Value) -> Option<&Value> {
+    let dialect = schema.get("$schema")?;
+    let text = dialect.as_str().map(|text| text.strip_suffix('#').unwrap_or(text));
+    (text != Some(DIALECT)).then_some(dialect)
 }
 
 fn schema_of(state: &State, service: &ServiceName) -> Option<Arc<Document>> {
@@ -225,27 +312,118 @@ const NAMED: &[&str] = &[
     "properties",
 ];
 
-/// The same schema with the keyword `required` taken out wherever it is a keyword (a property may be called so).
+/// Keywords that can come to hold because something below them fails: with `required` below they cannot be judged without
+/// it, so they go whole. What stands beside them has no meaning then.
+const TURNING: &[(&str, &[&str])] = &[
+    ("contains", &["contains", "minContains", "maxContains"]),
+    ("if", &["if", "then", "else"]),
+    ("not", &["not"]),
+    ("oneOf", &["oneOf"]),
+];
+
+/// The same schema with the keyword `required` taken out wherever it is a keyword (a property may be called so), and with
+/// it what cannot be judged without it.
 pub(crate) fn without_required(schema: &Value) -> Value {
+    let mut anchors = HashMap::new();
+    // What has faults is refused elsewhere.
+    let _ = find_anchors(schema, true, &mut anchors);
+    let mut strip = Strip {
+        root: schema,
+        anchors,
+        is_any_dropped: false,
+    };
+    let out = strip.stripped(schema);
+    // What is left over depends on what was looked at, which is less now.
+    if strip.is_any_dropped {
+        without_unevaluated(&out)
+    } else {
+        out
+    }
+}
+
+struct Strip<'s> {
+    root: &'s Value,
+    anchors: HashMap<&'s str, &'s Value>,
+    is_any_dropped: bool,
+}
+
+impl<'s> Strip<'s> {
+    fn stripped(&mut self, schema: &'s Value) -> Value {
+        let Value::Object(members) = schema else {
+            return schema.clone();
+        };
+        let mut dropped: Vec<&str> = vec!["required"];
+        for (name, with) in TURNING {
+            if members
+                .get(*name)
+                .is_some_and(|below| self.requires(below, &mut HashSet::new()))
+            {
+                dropped.extend(*with);
+                self.is_any_dropped = true;
+            }
+        }
+        let kept = members.iter().filter(|(name, _)| !dropped.contains(&name.as_str()));
+        let kept = kept.map(|(name, value)| (name.clone(), subschemas(name, value, &mut |one| self.stripped(one))));
+        Value::Object(kept.collect())
+    }
+
+    /// Whether `required` is in a subschema, in one of a list of them, or in what they refer to.
+    fn requires(&self, schema: &'s Value, seen: &mut HashSet<*const Value>) -> bool {
+        let members = match schema {
+            Value::Object(members) => members,
+            Value::Array(list) => return list.iter().any(|one| self.requires(one, seen)),
+            Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => return false,
+        };
+        if !seen.insert(std::ptr::from_ref(schema)) {
+            return false;
+        }
+        members.iter().any(|(name, value)| match (name.as_str(), value) {
+            ("required", _) => true,
+            ("$ref" | "$dynamicRef", Value::String(target)) => {
+                let target = resolve(self.root, &self.anchors, target);
+                target.is_some_and(|target| self.requires(target, seen))
+            }
+            (name, value) if ONE.contains(&name) || LIST.contains(&name) => self.requires(value, seen),
+            (name, Value::Object(named)) if NAMED.contains(&name) && !matches!(name, "$defs" | "definitions") => {
+                named.values().any(|one| self.requires(one, seen))
+            }
+            _ => false,
+        })
+    }
+}
+
+/// The value of a keyword with each subschema in it changed.
+fn subschemas<'s>(name: &str, value: &'s Value, change: &mut dyn FnMut(&'s Value) -> Value) -> Value {
+    match value {
+        value if ONE.contains(&name) => change(value),
+        Value::Array(list) if LIST.contains(&name) => list.iter().map(change).collect(),
+        Value::Object(named) if NAMED.contains(&name) => named
+            .iter()
+            .map(|(name, value)| (name.clone(), change(value)))
+            .collect::<Map<_, _>>()
+            .into(),
+        _ => value.clone(),
+    }
+}
+
+fn without_unevaluated(schema: &Value) -> Value {
     let Value::Object(members) = schema else {
         return schema.clone();
     };
-    let mut out = Map::new();
-    for (name, value) in members {
-        let kept = match (name.as_str(), value) {
-            ("required", _) => continue,
-            (name, value) if ONE.contains(&name) => without_required(value),
-            (name, Value::Array(list)) if LIST.contains(&name) => list.iter().map(without_required).collect(),
-            (name, Value::Object(named)) if NAMED.contains(&name) => named
-                .iter()
-                .map(|(name, value)| (name.clone(), without_required(value)))
-                .collect::<Map<_, _>>()
-                .into(),
-            _ => value.clone(),
-        };
-        out.insert(name.clone(), kept);
+    let kept = members
+        .iter()
+        .filter(|(name, _)| !matches!(name.as_str(), "unevaluatedItems" | "unevaluatedProperties"));
+    let kept = kept.map(|(name, value)| (name.clone(), subschemas(name, value, &mut without_unevaluated)));
+    Value::Object(kept.collect())
+}
+
+/// What a reference within a schema leads to.
+fn resolve<'s>(root: &'s Value, anchors: &HashMap<&str, &'s Value>, reference: &str) -> Option<&'s Value> {
+    let fragment = reference.strip_prefix('#').unwrap_or(reference);
+    match fragment.is_empty() || fragment.starts_with('/') {
+        true => root.pointer(fragment),
+        false => anchors.get(fragment).copied(),
     }
-    Value::Object(out)
 }
 
 /// A `$ref` that is not within the document.
@@ -372,6 +550,9 @@ impl<'s> Estimate<'s> {
             // To know what is left over, everything is looked at once more.
             here = here.and(here);
         }
+        if members.get("uniqueItems").and_then(Value::as_bool) == Some(true) {
+            here.steps = here.steps.saturating_add(UNIQUE_STEPS);
+        }
         let within = here.and(below);
         let effort = Effort {
             steps: within.steps.saturating_add(1),
@@ -385,12 +566,7 @@ impl<'s> Estimate<'s> {
     }
 
     fn target(&self, reference: &str) -> Result<&'s Value, String> {
-        let fragment = reference.strip_prefix('#').unwrap_or(reference);
-        let found = match fragment.is_empty() || fragment.starts_with('/') {
-            true => self.root.pointer(fragment),
-            false => self.anchors.get(fragment).copied(),
-        };
-        found.ok_or_else(|| {
+        resolve(self.root, &self.anchors, reference).ok_or_else(|| {
             let known = "#, #/… (without percent-encoding) or #anchor";
             format!("$ref {reference:?} leads nowhere; it is {known}")
         })
@@ -507,6 +683,67 @@ mod tests {
         ] {
             assert_eq!(schemas.check(&schema), Ok(()), "{schema}");
         }
+    }
+
+    #[test]
+    fn what_turns_on_required_goes_with_it() {
+        let required = || json!({ "required": ["a"], "type": "object" });
+        let schema = json!({
+            "not": required(), "if": { "properties": { "x": required() } }, "then": { "type": "object" }, "else": false,
+            "oneOf": [true, { "$ref": "#/$defs/d" }], "contains": required(), "maxContains": 1,
+            "properties": { "y": { "not": { "type": "null" }, "if": true, "then": required() } },
+            "unevaluatedProperties": false, "$defs": { "d": { "allOf": [{ "$ref": "#e" }] }, "e": { "$anchor": "e", "required": [] } },
+        });
+        let expected = json!({
+            "properties": { "y": { "not": { "type": "null" }, "if": true, "then": { "type": "object" } } },
+            "$defs": { "d": { "allOf": [{ "$ref": "#e" }] }, "e": { "$anchor": "e" } },
+        });
+        assert_eq!(without_required(&schema), expected);
+        // What refers into a part that goes leads nowhere: then the partial form takes all.
+        let schemas = Schemas::default();
+        let into = json!({ "not": required(), "properties": { "x": { "$ref": "#/not" } } });
+        let compiled = schemas.compiled(&into).unwrap();
+        assert!(compiled.partial.is_valid(&json!({ "x": 1 })) && !compiled.full.is_valid(&json!({ "x": 1 })));
+    }
+
+    #[test]
+    fn another_dialect_is_refused() {
+        let schemas = Schemas::default();
+        for good in [DIALECT.to_owned(), format!("{DIALECT}#")] {
+            assert_eq!(schemas.check(&json!({ "$schema": good, "type": "object" })), Ok(()));
+        }
+        for bad in [
+            json!("http://json-schema.org/draft-07/schema#"),
+            json!("https://example.org/meta"),
+            json!(7),
+        ] {
+            let error = schemas.check(&json!({ "$schema": bad })).unwrap_err();
+            assert!(error.contains("another dialect"), "{error}");
+        }
+        assert_eq!(
+            schemas.check(&json!({ "properties": { "$schema": { "type": "string" } } })),
+            Ok(())
+        );
+    }
+
+    #[test]
+    fn equal_items_are_found_whatever_their_form() {
+        let schemas = Schemas::default();
+        let unique = schemas.compiled(&json!({ "uniqueItems": true })).unwrap();
+        for (list, expected) in [
+            (json!([1, "1", true, [1], { "a": 1 }, null]), true),
+            (json!([{ "a": 1, "b": 2 }, { "b": 2, "a": 1.0 }]), false),
+            (json!([1, 1.0]), false),
+            (json!([]), true),
+            (json!("text"), true),
+        ] {
+            assert_eq!(unique.full.is_valid(&list), expected, "{list}");
+        }
+        let any = schemas.compiled(&json!({ "uniqueItems": false })).unwrap();
+        assert!(any.full.is_valid(&json!([1, 1])));
+        // At one value it may be asked for so often only.
+        let often: Vec<Value> = (0..300).map(|_| json!({ "uniqueItems": true })).collect();
+        assert!(schemas.check(&json!({ "allOf": often })).is_err());
     }
 
     #[test]

@@ -1,7 +1,9 @@
 //! From secrets as users write them to secrets as they are stored.
 
+use std::collections::HashMap;
+
 use blaze_domain::config::secret::{self, Secret};
-use blaze_domain::config::{Code, Document, FieldFault, Key};
+use blaze_domain::config::{Code, Document, FieldFault, Key, canonical, json};
 use serde_json::Value;
 use zeroize::Zeroizing;
 
@@ -22,6 +24,26 @@ pub(crate) struct Vault<'a> {
     pub(crate) revision: u64,
 }
 
+/// What a part of a document is now.
+#[derive(Clone, Copy)]
+enum Counterpart<'c> {
+    /// This.
+    Is(&'c Value),
+    /// It is new.
+    Nothing,
+    /// One of several; which one cannot be told.
+    Unclear,
+}
+
+impl Counterpart<'_> {
+    fn member(self, name: &str) -> Self {
+        match self {
+            Self::Is(value) => value.get(name).map_or(Self::Nothing, Self::Is),
+            Self::Nothing | Self::Unclear => self,
+        }
+    }
+}
+
 impl Vault<'_> {
     /// The spec with every secret encrypted. One whose text is the same as now stays as it is.
     pub(crate) fn store(&self, spec: &mut Value) -> Result<(), Vec<FieldFault>> {
@@ -29,28 +51,140 @@ impl Vault<'_> {
             return Ok(());
         }
         let mut faults = Vec::new();
-        secret::map(spec, &mut |pointer, value| match self.one(pointer, value) {
-            Ok(stored) => stored,
-            Err((code, detail)) => {
-                faults.push(FieldFault {
+        let now = self
+            .current
+            .map_or(Counterpart::Nothing, |document| Counterpart::Is(&document.spec));
+        self.fill("", spec, now, &mut faults);
+        if faults.is_empty() { Ok(()) } else { Err(faults) }
+    }
+
+    /// Walks what is written along with what is there now: members by name, items as [`counterparts`] says.
+    fn fill(&self, pointer: &str, value: &mut Value, now: Counterpart<'_>, faults: &mut Vec<FieldFault>) {
+        if secret::is_secret(value) {
+            match self.one(value, now) {
+                Ok(Some(stored)) => *value = stored,
+                Ok(None) => {}
+                Err((code, detail)) => faults.push(FieldFault {
                     pointer: format!("/spec{pointer}"),
                     code,
                     detail,
                     document: None,
-                });
-                None
+                }),
             }
-        });
-        if faults.is_empty() { Ok(()) } else { Err(faults) }
+            return;
+        }
+        match value {
+            Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => {}
+            Value::Array(items) => {
+                let found = match now {
+                    Counterpart::Is(Value::Array(current)) => self.counterparts(items, current),
+                    Counterpart::Is(_) | Counterpart::Nothing => vec![Counterpart::Nothing; items.len()],
+                    Counterpart::Unclear => vec![Counterpart::Unclear; items.len()],
+                };
+                for (index, (item, now)) in items.iter_mut().zip(found).enumerate() {
+                    if secret::contains(item) {
+                        self.fill(&format!("{pointer}/{index}"), item, now, faults);
+                    }
+                }
+            }
+            Value::Object(members) => {
+                for (name, member) in members {
+                    if secret::contains(member) {
+                        self.fill(&json::push(pointer, name), member, now.member(name), faults);
+                    }
+                }
+            }
+        }
     }
 
-    fn one(&self, pointer: &str, value: &Value) -> Result<Option<Value>, (Code, String)> {
-        let now = self.current.and_then(|document| document.spec.pointer(pointer));
-        let stored_now = now.filter(|value| matches!(Secret::of(value), Some(Ok(Secret::Stored { .. }))));
+    /// Which item of a list as it is now each item of the list as it is written stands for. An item has no name, so it is
+    /// known by what it holds: a secret must not go to another item because the items before it went away.
+    ///
+    /// ```text
+    /// equal to one item as it is shown      that one
+    /// equal to several                      any, if their secrets are the same; in order, if there are as many as there
+    ///                                       were; at the same place, if the list is as long as it was and none moved
+    /// equal to none, so it was edited       at the same place, if the list is as long as it was and none moved
+    /// otherwise                             nobody knows
+    /// ```
+    fn counterparts<'c>(&self, items: &[Value], current: &'c [Value]) -> Vec<Counterpart<'c>> {
+        let shown = |item: &Value| canonical::to_string(&secret::redact(item));
+        let mut places: HashMap<String, Vec<usize>> = HashMap::new();
+        for (index, item) in current.iter().enumerate() {
+            places.entry(shown(item)).or_default().push(index);
+        }
+        let texts: Vec<String> = items.iter().map(shown).collect();
+        let mut written: HashMap<&str, usize> = HashMap::new();
+        for text in &texts {
+            *written.entry(text).or_default() += 1;
+        }
+        let is_in_place = items.len() == current.len()
+            && texts
+                .iter()
+                .enumerate()
+                .all(|(index, text)| places.get(text).is_none_or(|found| found.contains(&index)));
+        let at = |index: usize| current.get(index).map_or(Counterpart::Unclear, Counterpart::Is);
+        let mut met: HashMap<&str, usize> = HashMap::new();
+        let mut out = Vec::with_capacity(items.len());
+        for (index, (item, text)) in items.iter().zip(&texts).enumerate() {
+            let equal = places.get(text).map_or(&[][..], Vec::as_slice);
+            let before = met.entry(text).or_default();
+            let nth = *before;
+            *before += 1;
+            out.push(match equal {
+                _ if !secret::contains(item) => Counterpart::Nothing,
+                [only] => at(*only),
+                [first, ..] if self.same_texts(equal, current) => at(*first),
+                [_, ..] if written.get(text.as_str()) == Some(&equal.len()) => at(equal[nth]),
+                _ if is_in_place => at(index),
+                _ => Counterpart::Unclear,
+            });
+        }
+        out
+    }
+
+    /// Whether these items hold the same secrets.
+    fn same_texts(&self, indices: &[usize], current: &[Value]) -> bool {
+        let uid = self.current.map_or("", |document| document.uid.as_str());
+        let texts = |index: usize| {
+            let mut out: Option<Vec<Zeroizing<String>>> = Some(Vec::new());
+            secret::walk(current.get(index)?, &mut |_, value| {
+                if let Some(texts) = &mut out {
+                    match self.keyring.open(self.key, uid, value) {
+                        Ok(text) => texts.push(text),
+                        Err(_) => out = None,
+                    }
+                }
+            });
+            out
+        };
+        let Some(first) = indices.first().and_then(|index| texts(*index)) else {
+            return false;
+        };
+        indices
+            .iter()
+            .skip(1)
+            .all(|index| texts(*index).as_ref() == Some(&first))
+    }
+
+    fn one(&self, value: &Value, now: Counterpart<'_>) -> Result<Option<Value>, (Code, String)> {
+        let stored_now = match now {
+            Counterpart::Is(now) => Some(now),
+            Counterpart::Nothing | Counterpart::Unclear => None,
+        };
+        let stored_now = stored_now.filter(|value| matches!(Secret::of(value), Some(Ok(Secret::Stored { .. }))));
         let text = match Secret::of(value) {
             Some(Ok(Secret::Redacted { .. })) => {
                 let kept = stored_now.ok_or_else(|| {
-                    let detail = "there is no stored secret here to keep; write its text";
+                    let detail = match now {
+                        Counterpart::Unclear => {
+                            "it is not clear whose stored secret this item of a list keeps, for items were changed and moved \
+                             at once; write its text, or change the list in two steps"
+                        }
+                        Counterpart::Is(_) | Counterpart::Nothing => {
+                            "there is no stored secret here to keep; write its text"
+                        }
+                    };
                     (Code::SecretUnknown, detail.to_owned())
                 })?;
                 return self.keep(kept).map(Some);
@@ -102,14 +236,6 @@ pub(crate) fn unreadable(keyring: &Keyring, document: &Document) -> Option<OpenE
         }
     });
     found
-}
-
-/// A value with its secrets as text in place of the secret objects: what a service gets. What cannot be decrypted
-/// becomes empty.
-pub(crate) fn as_text(keyring: &Keyring, document: &Document, value: &Value) -> Value {
-    replaced(keyring, document, value, |text, _| {
-        Value::from(text.unwrap_or_default())
-    })
 }
 
 /// A value with its secrets as `{"$secret":{"text","version"}}`. What cannot be decrypted stays redacted: an empty

@@ -36,6 +36,10 @@ pub use read::DiffReport;
 
 /// Refusals that wait to be written to the audit, at most.
 const DENIED_QUEUE: usize = 1024;
+/// Dry runs that are worked out at once: each takes a processor.
+const DRY_RUNNING: usize = 2;
+/// Dry runs that run or wait for others, at most.
+const DRY_WAITING: usize = 64;
 /// How long a read waits for a revision that is yet to come.
 const WAIT_FOR_REVISION: Duration = Duration::from_secs(5);
 
@@ -83,6 +87,10 @@ struct Inner {
     running: RunningKeys,
     /// Bytes that may still be queued.
     room: Arc<Semaphore>,
+    /// Dry runs that may still begin.
+    dry_running: Arc<Semaphore>,
+    /// Dry runs that may still wait.
+    dry_waiting: Semaphore,
     denied: mpsc::Sender<AuditEntry>,
     denials: Mutex<token::DenialLimit>,
 }
@@ -139,6 +147,8 @@ impl ConfigService {
                 keep_versions: options.history.keep_versions,
                 running: RunningKeys::default(),
                 room: Arc::new(Semaphore::new(QUEUE_BYTES)),
+                dry_running: Arc::new(Semaphore::new(DRY_RUNNING)),
+                dry_waiting: Semaphore::new(DRY_WAITING),
                 denied,
                 denials: Mutex::default(),
             }),

@@ -1,5 +1,10 @@
 //! The core from outside, on a store in memory.
 
+mod rollouts;
+mod secrets;
+mod views;
+mod writes;
+
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 use std::time::Duration;
@@ -783,20 +788,7 @@ async fn a_bound_token_sees_and_changes_its_own_layer_alone() {
         Code::PermissionDenied
     );
     assert!(patch("Node/robot-1", json!({ "type": "mobile" })).await.is_ok());
-    // An instance that runs elsewhere says nothing here.
     w.put("Node/server", json!({ "layer": "fog" })).await;
-    w.put(
-        "Instance/slam/far",
-        json!({ "node": "server", "config": { "of": "fog" } }),
-    )
-    .await;
-    let far = Place {
-        instance: Some("far".parse().unwrap()),
-        layer: Some("edge".parse().unwrap()),
-        ..slam()
-    };
-    let far = w.service.effective(&bound, &far, false, &read).await;
-    assert_eq!(code(far), Code::PermissionDenied);
     // Of many documents, those outside are refused before anything is told of them.
     let apply = async |name: &str, spec: Value, revision: Option<u64>, delete: bool| {
         let items = vec![ApplyItem {
@@ -960,4 +952,42 @@ async fn many_writers_with_preconditions_lose_nothing() {
     futures::future::join_all((0..8).map(one)).await;
     assert_eq!(w.get("Service/counter").await.unwrap().spec["config"]["n"], 200);
     assert_eq!(w.service.revision(), 201);
+}
+
+#[tokio::test]
+async fn a_watch_ends_in_time_although_there_is_more_to_tell() {
+    let w = world().await;
+    for number in 0..5 {
+        w.put(&format!("Layer/l{number}"), json!({ "kind": "fog" })).await;
+    }
+    let query = WatchQuery {
+        since: Some(0),
+        timeout_s: Some(1),
+        ..WatchQuery::default()
+    };
+    let mut stream = w.service.watch(&w.admin, &query).await.unwrap().value;
+    assert_eq!(next(&mut stream).await.0, 1);
+    tokio::time::pause();
+    tokio::time::advance(Duration::from_secs(2)).await;
+    assert!(matches!(stream.next().await, Some(WatchItem::Bookmark(1))));
+    assert!(matches!(stream.next().await, Some(WatchItem::End(None))));
+    assert!(stream.next().await.is_none());
+}
+
+#[tokio::test]
+async fn a_watch_begins_at_the_revision_that_is_waited_for() {
+    let w = world().await;
+    let read = ReadOptions {
+        cached: true,
+        min_revision: Some(2),
+        ..ReadOptions::default()
+    };
+    let query = WatchQuery::default();
+    let writes = async {
+        for name in ["Layer/a", "Layer/b"] {
+            w.put(name, json!({ "kind": "fog" })).await;
+        }
+    };
+    let (watch, ()) = tokio::join!(w.service.watch_with(&w.admin, &query, &read), writes);
+    assert_eq!(watch.unwrap().revision, 2);
 }

@@ -9,7 +9,7 @@ use blaze_domain::config::{Document, Key, Kind, secret};
 use blaze_domain::{DocumentName, LayerName, NodeName, ServiceName};
 use imbl::{OrdMap, OrdSet};
 
-use super::placement::{Placement, placement, rollout_target};
+use super::placement::{Placement, is_active, placement, rollout_target};
 use crate::store::{Change, Commit, Op};
 
 /// Documents larger than this make an effective configuration that is too large possible (four documents are merged).
@@ -66,6 +66,10 @@ pub(crate) struct State {
     in_layer: OrdSet<(DocumentName, Key)>,
     /// Instances placed on a node.
     on_node: OrdSet<(DocumentName, Key)>,
+    /// Roll-outs by what they change, also those that have ended.
+    aimed: OrdSet<(Key, Key)>,
+    /// The same, those that are on their canaries now.
+    active: OrdSet<(Key, Key)>,
     /// Documents that are large enough to matter for the size of effective configurations.
     big: usize,
     /// Services with a schema.
@@ -152,6 +156,16 @@ impl State {
         indexed(&self.on_node, node.into())
     }
 
+    /// Roll-outs of a document, also those that have ended.
+    fn aimed_at<'a>(&'a self, target: &Key) -> impl Iterator<Item = &'a Key> + use<'a> {
+        of_target(&self.aimed, target.clone())
+    }
+
+    /// Roll-outs of a document that are on their canaries now.
+    pub(crate) fn active_on<'a>(&'a self, target: &Key) -> impl Iterator<Item = &'a Arc<Held>> + use<'a> {
+        of_target(&self.active, target.clone()).filter_map(|key| self.documents.get(key))
+    }
+
     /// Whether an effective configuration can be too large at all.
     pub(crate) fn has_big(&self) -> bool {
         self.big > 0
@@ -169,6 +183,12 @@ impl State {
         for (index, entry) in index_entries(&held.document) {
             self.index(index).insert(entry);
         }
+        if let Some(entry) = aim(&held.document) {
+            if is_active(&held.document) {
+                self.active.insert(entry.clone());
+            }
+            self.aimed.insert(entry);
+        }
         self.big += usize::from(held.is_big());
         self.schemas += usize::from(held.has_schema());
         self.documents.insert(held.document.key.clone(), held);
@@ -179,6 +199,10 @@ impl State {
         let held = self.documents.remove(key)?;
         for (index, entry) in index_entries(&held.document) {
             self.index(index).remove(&entry);
+        }
+        if let Some(entry) = aim(&held.document) {
+            self.active.remove(&entry);
+            self.aimed.remove(&entry);
         }
         self.big -= usize::from(held.is_big());
         self.schemas -= usize::from(held.has_schema());
@@ -279,6 +303,22 @@ enum Index {
     Node,
 }
 
+/// A roll-out with what it changes.
+fn aim(document: &Document) -> Option<(Key, Key)> {
+    if document.key.kind() != Kind::Rollout {
+        return None;
+    }
+    Some((rollout_target(document)?, document.key.clone()))
+}
+
+fn of_target(index: &OrdSet<(Key, Key)>, target: Key) -> impl Iterator<Item = &Key> + use<'_> {
+    let start = (target.clone(), first_key(Kind::Layer));
+    index
+        .range(start..)
+        .take_while(move |(found, _)| *found == target)
+        .map(|(_, key)| key)
+}
+
 fn index_entries(document: &Document) -> Vec<(Index, (DocumentName, Key))> {
     let entry = |index, name: Option<&str>| {
         let name: DocumentName = name?.parse().ok()?;
@@ -336,21 +376,9 @@ fn moved_with(before: &State, after: &State, commit: &Commit) -> Vec<Key> {
             Kind::Layer | Kind::Instance | Kind::Rollout => {}
         }
     }
-    if !out.is_empty()
-        || commit
-            .changes
-            .iter()
-            .any(|change| change.document.key.kind() != Kind::Rollout)
-    {
-        let moved: BTreeSet<&Key> = out.iter().collect();
-        let touched = |target: &Key| keys.contains(target) || moved.contains(target);
-        let rollouts: Vec<Key> = after
-            .of_kind(Kind::Rollout, None)
-            .filter(|(_, held)| rollout_target(&held.document).is_some_and(|target| touched(&target)))
-            .map(|(key, _)| key.clone())
-            .collect();
-        out.extend(rollouts);
-    }
+    let touched = keys.iter().copied().chain(&out);
+    let rollouts: BTreeSet<Key> = touched.flat_map(|target| after.aimed_at(target)).cloned().collect();
+    out.extend(rollouts);
     out.retain(|key| !keys.contains(key));
     out.sort();
     out.dedup();

@@ -3,6 +3,7 @@
 use blaze_domain::LayerName;
 use blaze_domain::config::{Code, Document, Key, Kind, Problem};
 
+use super::effective::At;
 use super::placement::{Placement, placement, rollout_target};
 use super::state::State;
 use crate::auth::{Claims, Right, Role, allowed, unbound};
@@ -65,6 +66,24 @@ impl View {
     /// Whether a document is seen.
     pub(crate) fn sees_document(&self, state: &State, document: &Document) -> bool {
         self.layer.is_none() || self.sees(&placement(state, document))
+    }
+
+    /// Whether the effective configuration at a place may be told of: that of a service or instance that is seen, in the
+    /// layer itself or nowhere in particular.
+    pub(crate) fn sees_place(&self, state: &State, at: &At) -> bool {
+        let Some(layer) = &self.layer else { return true };
+        let sees = |key: &Key| {
+            state
+                .get(key)
+                .is_some_and(|held| self.sees_document(state, &held.document))
+        };
+        let Some(service) = &at.service else {
+            return at.layer.as_ref() == Some(layer);
+        };
+        match &at.instance {
+            Some(instance) => sees(&Key::instance(service.clone(), instance.clone())),
+            None => at.layer.as_ref().is_none_or(|at| at == layer) && sees(&Key::service(service)),
+        }
     }
 
     /// Refuses a layer that is not the token's own.

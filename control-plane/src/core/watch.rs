@@ -193,7 +193,9 @@ struct Watcher {
     caller: Caller,
     /// Everything up to here was told or is no business of this watcher.
     cursor: u64,
-    /// The last commit that was told, or where it began.
+    /// Everything up to here was given out.
+    told: u64,
+    /// The last commit that is to be told, or where it began.
     previous: u64,
     /// Commits to tell, with their bytes, about.
     pending: VecDeque<(Arc<WatchCommit>, usize)>,
@@ -230,6 +232,7 @@ impl Watches {
             filter,
             caller: caller.clone(),
             cursor: since,
+            told: since,
             previous: since,
             pending: VecDeque::new(),
             pending_bytes: 0,
@@ -265,13 +268,22 @@ impl Watcher {
             if let Some(problem) = self.trouble() {
                 return Some(self.finish(Some(problem)));
             }
+            // Also while there is always more to tell: then it ends where it has come to.
+            if Instant::now() >= self.end && !self.pending.is_empty() {
+                self.pending.clear();
+                self.pending_bytes = 0;
+                self.stage = Stage::Closing;
+                return Some(WatchItem::Bookmark(self.told));
+            }
             if let Err(problem) = self.read().await {
                 return Some(self.finish(Some(problem)));
             }
             if let Some((commit, bytes)) = self.pending.pop_front() {
                 self.pending_bytes -= bytes;
+                self.told = commit.revision;
                 return Some(WatchItem::Commit(commit));
             }
+            self.told = self.cursor;
             let is_behind = self.rebuilt.is_some() || self.cursor < self.shared.log.revision();
             if is_behind && Instant::now() < self.end {
                 continue;

@@ -26,8 +26,12 @@ use tower::Service as _;
 use super::activity::{Activity, Trouble, WatchedBody};
 use super::counters::Outcome;
 use super::stall::StallGuard;
+use super::unread::{Patience, ReadOn};
 use super::{ListenCounters, ListenLimits, Peer, Protocols};
 
+/// Lines of a head of HTTP/1.1; one with more is answered 431 by the library, without a body. What has fewer lines and too
+/// many bytes reaches the router.
+const MAX_HEADER_LINES: usize = 1024;
 /// When all requests have ended, what they answered gets this long to reach the client.
 const LINGER: Duration = Duration::from_secs(5);
 
@@ -78,17 +82,20 @@ impl Connection {
     {
         let activity = Activity::new();
         let (requests, router) = (Arc::clone(&activity), self.router.clone());
+        let streams = OwnStreams(StreamTasks::new(Arc::clone(&self.counters)));
+        let (tasks, patience) = (streams.0.clone(), self.patience());
         let service = service_fn(move |mut request: Request<Incoming>| {
             let running = requests.begin();
             request.extensions_mut().insert(ConnectInfo(peer.address));
             request.extensions_mut().insert(peer);
-            let answer = router.clone().call(request);
+            let (parts, body) = request.into_parts();
+            let body = ReadOn::new(body, &parts.headers, patience, tasks.clone());
+            let answer = router.clone().call(Request::from_parts(parts, body));
             async move {
                 let answer = answer.await?;
                 Ok::<_, Infallible>(answer.map(|body| WatchedBody::new(body, running)))
             }
         });
-        let streams = OwnStreams(StreamTasks::new(Arc::clone(&self.counters)));
         let builder = self.builder(&streams);
         let connection = builder.serve_connection(TokioIo::new(stream), service);
         tokio::pin!(connection);
@@ -118,6 +125,13 @@ impl Connection {
         }
     }
 
+    fn patience(&self) -> Patience {
+        Patience {
+            bytes: self.limits.unread_bytes,
+            time: self.limits.unread_time,
+        }
+    }
+
     fn builder(&self, streams: &OwnStreams) -> Builder<StreamTasks> {
         let limits = &self.limits;
         let mut builder = Builder::new(streams.0.clone());
@@ -125,6 +139,7 @@ impl Connection {
             .http1()
             .timer(TokioTimer::new())
             .header_read_timeout(limits.head_timeout)
+            .max_headers(MAX_HEADER_LINES)
             .max_buf_size(limits.head_bytes.max(8192));
         // A head that does not end holds up the answer to a PING: the keep-alive is its limit of time.
         builder
@@ -187,9 +202,9 @@ fn is_stall(error: &(dyn Error + 'static)) -> bool {
     false
 }
 
-/// Runs the requests of a connection of HTTP/2.
+/// Runs the requests of a connection of HTTP/2, and reads on what was left of bodies.
 #[derive(Clone)]
-struct StreamTasks {
+pub(super) struct StreamTasks {
     tasks: Arc<Mutex<JoinSet<()>>>,
     counters: Arc<ListenCounters>,
 }

@@ -16,6 +16,7 @@ mod stall;
 #[cfg(test)]
 mod tests;
 mod tls;
+mod unread;
 
 use std::io;
 use std::net::SocketAddr;
@@ -68,6 +69,10 @@ pub struct ListenLimits {
     pub keep_alive_interval: Duration,
     /// HTTP/2: for the answer to a PING.
     pub keep_alive_timeout: Duration,
+    /// Bytes that are still read of a body whose request was answered without it.
+    pub unread_bytes: usize,
+    /// For how long.
+    pub unread_time: Duration,
     /// For open requests when the port stops.
     pub drain_timeout: Duration,
 }
@@ -87,6 +92,9 @@ impl Default for ListenLimits {
             stream_buffer_bytes: 128 * 1024,
             keep_alive_interval: Duration::from_secs(20),
             keep_alive_timeout: Duration::from_secs(10),
+            // Twice the largest body.
+            unread_bytes: 16 * 1024 * 1024,
+            unread_time: Duration::from_secs(5),
             drain_timeout: Duration::from_secs(30),
         }
     }

@@ -60,7 +60,9 @@ fn router(began: &Arc<Notify>, go: &Arc<Notify>) -> Router {
             panic!("handler")
         }
     };
+    let refuse = || async { StatusCode::PAYLOAD_TOO_LARGE };
     Router::new()
+        .route("/refuse", axum::routing::post(refuse))
         .route("/", get(peer))
         .route("/wait", get(wait))
         .route("/endless", get(endless))
@@ -224,6 +226,101 @@ async fn large_heads_reach_the_router_and_larger_ones_are_431() {
         assert!(expected, "{bytes}: {answer}");
     }
     served.counted(Outcome::Malformed, 1).await;
+    served.end().await;
+}
+
+#[tokio::test]
+async fn many_small_lines_of_a_head_reach_the_router() {
+    let served = serve(ListenLimits::default()).await;
+    for (lines, status) in [(1_000, "200"), (1_100, "431")] {
+        let head = format!(
+            "GET / HTTP/1.1\r\nhost: x\r\nconnection: close\r\n{}\r\n",
+            "x: y\r\n".repeat(lines)
+        );
+        let answer = ask(&mut served.connect().await, head.as_bytes()).await;
+        assert!(answer.starts_with(&format!("HTTP/1.1 {status}")), "{lines}: {answer}");
+    }
+    served.end().await;
+}
+
+/// Twelve times what fits into the buffers of a connection, as far as it is taken.
+const LARGE: usize = 12 * 1024 * 1024;
+
+#[tokio::test]
+async fn who_sends_everything_first_gets_its_answer() {
+    let served = serve(ListenLimits::default()).await;
+    let mut stream = served.connect().await;
+    let head = format!("POST /refuse HTTP/1.1\r\nhost: x\r\ncontent-length: {LARGE}\r\n\r\n");
+    stream.write_all(head.as_bytes()).await.unwrap();
+    stream.write_all(&vec![b'x'; LARGE]).await.unwrap();
+    // The same connection takes the next request.
+    stream.write_all(GET).await.unwrap();
+    let answer = read_all(&mut stream).await;
+    assert!(answer.starts_with("HTTP/1.1 413"), "{answer}");
+    assert!(answer.contains("HTTP/1.1 200"), "{answer}");
+    served.end().await;
+}
+
+#[tokio::test]
+async fn a_stream_that_was_refused_early_is_not_reset_while_its_body_comes() {
+    let served = serve(ListenLimits::default()).await;
+    let (mut sender, connection) = http2::handshake(TokioExecutor::new(), TokioIo::new(served.connect().await))
+        .await
+        .unwrap();
+    served.supervisor.spawn("client", TaskPolicy::MayEnd, async move {
+        let _ = connection.await;
+    });
+    // The end of the body is taken only after all of it was: a reset would drop it before.
+    let (whole, sent) = tokio::sync::oneshot::channel::<()>();
+    let parts = stream::unfold((0, Some(whole)), |(at, whole)| async move {
+        if at == LARGE {
+            whole.map(|whole| whole.send(()));
+            return None;
+        }
+        Some((
+            Ok::<_, Infallible>(Bytes::from(vec![b'x'; 65_536])),
+            (at + 65_536, whole),
+        ))
+    });
+    let request = Request::post("http://localhost/refuse")
+        .body(Body::from_stream(parts))
+        .unwrap();
+    let answer = sender.send_request(request).await.unwrap();
+    assert_eq!(answer.status(), StatusCode::PAYLOAD_TOO_LARGE);
+    tokio::time::timeout(SOON, sent).await.unwrap().unwrap();
+    drop((answer, sender));
+    served.end().await;
+}
+
+#[tokio::test]
+async fn a_body_that_does_not_end_is_not_read_for_ever() {
+    let limits = ListenLimits {
+        unread_bytes: 1024 * 1024,
+        unread_time: SHORT,
+        ..ListenLimits::default()
+    };
+    let served = serve(limits).await;
+    let mut slow = served.connect().await;
+    slow.write_all(b"POST /refuse HTTP/1.1\r\nhost: x\r\ncontent-length: 9\r\n\r\nx")
+        .await
+        .unwrap();
+    assert!(read_all(&mut slow).await.starts_with("HTTP/1.1 413"));
+    let mut large = served.connect().await;
+    let head = b"POST /refuse HTTP/1.1\r\nhost: x\r\ncontent-length: 999999999\r\n\r\n";
+    large.write_all(head).await.unwrap();
+    let part = vec![b'x'; 65_536];
+    let cut = async { while large.write_all(&part).await.is_ok() {} };
+    tokio::time::timeout(SOON, cut).await.unwrap();
+    served.end().await;
+}
+
+#[tokio::test]
+async fn who_waits_to_be_asked_for_a_body_is_not_asked() {
+    let served = serve(ListenLimits::default()).await;
+    let mut stream = served.connect().await;
+    let head = b"POST /refuse HTTP/1.1\r\nhost: x\r\nexpect: 100-continue\r\ncontent-length: 9\r\n\r\n";
+    let answer = ask(&mut stream, head).await;
+    assert!(answer.starts_with("HTTP/1.1 413"), "{answer}");
     served.end().await;
 }
 
@@ -599,8 +696,9 @@ fn faulty_files_are_named() {
             "server.key",
         ),
     ] {
-        let fault = Tls::load(&section).unwrap_err();
-        assert!(fault.contains(named), "{fault}");
+        let faults = Tls::load(&section).unwrap_err();
+        assert!(faults.len() == 1 && faults[0].contains(named), "{faults:?}");
+        assert!(faults[0].starts_with("control_plane.tls."), "{faults:?}");
     }
     install_crypto_provider();
     install_crypto_provider();

@@ -9,6 +9,7 @@ use blaze_domain::node_file::TlsSection;
 use blaze_runtime::Supervisor;
 use rustls::crypto::aws_lc_rs::default_provider;
 use rustls::server::WebPkiClientVerifier;
+use rustls::server::danger::ClientCertVerifier;
 use rustls::{RootCertStore, ServerConfig};
 use rustls_pki_types::pem::PemObject as _;
 use rustls_pki_types::{CertificateDer, PrivateKeyDer};
@@ -48,8 +49,8 @@ impl Tls {
     /// Reads the files; `None` without a certificate.
     ///
     /// # Errors
-    /// Which file is wrong, and how.
-    pub fn load(section: &TlsSection) -> Result<Option<Self>, String> {
+    /// Every fault, with its place in the node file and the file that has it.
+    pub fn load(section: &TlsSection) -> Result<Option<Self>, Vec<String>> {
         let (Some(certificate), Some(key)) = (&section.cert_file, &section.key_file) else {
             return Ok(None);
         };
@@ -83,7 +84,7 @@ impl Tls {
                     shared.now.store(Arc::new(configs));
                     Vec::new()
                 }
-                Err(fault) => vec![fault],
+                Err(faults) => faults,
             }
         });
     }
@@ -109,40 +110,62 @@ impl std::fmt::Debug for Tls {
 }
 
 impl Files {
-    fn read(&self) -> Result<Configs, String> {
-        let provider = Arc::new(default_provider());
-        let builder = ServerConfig::builder_with_provider(Arc::clone(&provider))
-            .with_safe_default_protocol_versions()
-            .map_err(|error| format!("TLS cannot be set up: {error}"))?;
-        let builder = match &self.client_authorities {
-            None => builder.with_no_client_auth(),
-            Some(path) => {
-                let mut roots = RootCertStore::empty();
-                for certificate in certificates(path)? {
-                    let added = roots.add(certificate);
-                    added.map_err(|error| format!("{}: no certificate of an authority: {error}", path.display()))?;
-                }
-                let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
-                builder.with_client_cert_verifier(verifier.map_err(|error| format!("{}: {error}", path.display()))?)
-            }
+    fn read(&self) -> Result<Configs, Vec<String>> {
+        let at = |name: &str| {
+            let place = format!("control_plane.tls.{name}: ");
+            move |fault: String| place.clone() + &fault
         };
-        let chain = certificates(&self.certificate)?;
-        let key = private_key(&self.key)?;
-        let mut both = builder.with_single_cert(chain, key).map_err(|error| {
-            format!(
-                "{} and {} do not go together: {error}",
-                self.certificate.display(),
-                self.key.display()
-            )
-        })?;
-        let mut http2 = both.clone();
-        both.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
-        http2.alpn_protocols = vec![b"h2".to_vec()];
-        Ok(Configs {
-            both: Arc::new(both),
-            http2: Arc::new(http2),
-        })
+        let chain = certificates(&self.certificate).map_err(at("cert_file"));
+        let key = private_key(&self.key).map_err(at("key_file"));
+        let authorities = self.client_authorities.as_deref().map(authorities).transpose();
+        match (chain, key, authorities.map_err(at("client_ca_file"))) {
+            (Ok(chain), Ok(key), Ok(clients)) => {
+                build(chain, key, clients).map_err(|fault| vec![at("cert_file")(self.told(&fault))])
+            }
+            (chain, key, clients) => Err([chain.err(), key.err(), clients.err()].into_iter().flatten().collect()),
+        }
     }
+
+    fn told(&self, fault: &str) -> String {
+        let (certificate, key) = (self.certificate.display(), self.key.display());
+        format!("{certificate} and {key} do not go together: {fault}")
+    }
+}
+
+fn build(
+    chain: Vec<CertificateDer<'static>>,
+    key: PrivateKeyDer<'static>,
+    clients: Option<Arc<dyn ClientCertVerifier>>,
+) -> Result<Configs, String> {
+    let builder = ServerConfig::builder_with_provider(Arc::new(default_provider()))
+        .with_safe_default_protocol_versions()
+        .map_err(|error| error.to_string())?;
+    let builder = match clients {
+        None => builder.with_no_client_auth(),
+        Some(verifier) => builder.with_client_cert_verifier(verifier),
+    };
+    let mut both = builder
+        .with_single_cert(chain, key)
+        .map_err(|error| error.to_string())?;
+    let mut http2 = both.clone();
+    both.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
+    http2.alpn_protocols = vec![b"h2".to_vec()];
+    Ok(Configs {
+        both: Arc::new(both),
+        http2: Arc::new(http2),
+    })
+}
+
+/// Who may sign certificates of clients.
+fn authorities(path: &Path) -> Result<Arc<dyn ClientCertVerifier>, String> {
+    let mut roots = RootCertStore::empty();
+    for certificate in certificates(path)? {
+        let added = roots.add(certificate);
+        added.map_err(|error| format!("{}: no certificate of an authority: {error}", path.display()))?;
+    }
+    let provider = Arc::new(default_provider());
+    let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
+    verifier.map_err(|error| format!("{}: {error}", path.display()))
 }
 
 /// At least one.

@@ -147,6 +147,17 @@ impl<'a> Lines<'a> {
 /// [`BackupError`]; then the store is as empty as before.
 pub async fn restore<R: BufRead + Seek + Send>(store: &dyn Upkeep, file: &mut R) -> Result<Restored, BackupError> {
     check(file)?;
+    restore_checked(store, file).await
+}
+
+/// As [`restore`], for a file that [`check`] has read to its end and found good.
+///
+/// # Errors
+/// As [`restore`].
+pub async fn restore_checked<R: BufRead + Seek + Send>(
+    store: &dyn Upkeep,
+    file: &mut R,
+) -> Result<Restored, BackupError> {
     file.seek(SeekFrom::Start(0))?;
     let (sender, receiver) = mpsc::channel(QUEUE);
     let (read, imported) = tokio::join!(read_pieces(file, sender), store.import(receiver));

@@ -4,6 +4,8 @@
 //! bytes ──[parse]──▶ Value            refused: members given twice, integers outside ±(2^53 - 1), numbers that are not
 //! Value ──[check]──▶ ()               finite, nesting deeper than 32, text after the value, bytes that are not UTF-8
 //! ```
+//!
+//! A float beyond ±(2^53 - 1) is whole, so it counts as an integer: `1e300` is refused as `10000000000000000` is.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -15,8 +17,8 @@ use super::{MAX_DEPTH, MAX_INTEGER};
 
 /// Longest pointer that a fault repeats, in bytes.
 const MAX_SHOWN_BYTES: usize = 512;
-/// Digits from which on an integer may not fit 64 bits, so that the parser below hands it on as a float.
-const WIDE_DIGITS: usize = 19;
+/// The same bound for a number that was written as a float. Beyond it every float is whole.
+const MAX_WHOLE: f64 = 9_007_199_254_740_991.0;
 const NOT_FINITE: &str = "is a number too large to hold";
 
 /// Why a text is not taken as JSON.
@@ -62,7 +64,6 @@ pub fn parse_within(bytes: &[u8], max_depth: usize) -> Result<Value, JsonFault> 
     let mut reading = Reading {
         path: Vec::new(),
         max_depth,
-        has_wide_integer: has_wide_integer(bytes),
         refused: None,
     };
     let mut source = serde_json::Deserializer::from_slice(bytes);
@@ -117,7 +118,7 @@ fn check_number(number: &Number) -> Result<(), String> {
     let exact = match (number.as_i64(), number.as_u64(), number.as_f64()) {
         (Some(value), _, _) => is_exact(value.unsigned_abs()),
         (_, Some(value), _) => is_exact(value),
-        (_, _, Some(value)) if value.is_finite() => true,
+        (_, _, Some(value)) if value.is_finite() => value.abs() <= MAX_WHOLE,
         _ => return Err(NOT_FINITE.to_owned()),
     };
     if exact { Ok(()) } else { Err(too_wide()) }
@@ -194,38 +195,6 @@ fn without_place(error: &serde_json::Error) -> String {
     text[..end].to_owned()
 }
 
-/// Whether the text holds an integer that may not fit 64 bits. Texts are skipped; what is no JSON is found later.
-fn has_wide_integer(bytes: &[u8]) -> bool {
-    let mut rest = bytes;
-    while let Some((first, behind)) = rest.split_first() {
-        rest = match first {
-            b'"' => behind_text(behind),
-            b'0'..=b'9' => {
-                let part_of_number = |byte: &u8| matches!(byte, b'0'..=b'9' | b'.' | b'e' | b'E' | b'+' | b'-');
-                let end = rest.iter().position(|byte| !part_of_number(byte)).unwrap_or(rest.len());
-                let (number, behind) = rest.split_at(end);
-                if number.len() >= WIDE_DIGITS && number.iter().all(u8::is_ascii_digit) {
-                    return true;
-                }
-                behind
-            }
-            _ => behind,
-        };
-    }
-    false
-}
-
-fn behind_text(mut rest: &[u8]) -> &[u8] {
-    while let Some((first, behind)) = rest.split_first() {
-        match first {
-            b'"' => return behind,
-            b'\\' => rest = behind.get(1..).unwrap_or_default(),
-            _ => rest = behind,
-        }
-    }
-    rest
-}
-
 enum Segment {
     Name(String),
     Index(usize),
@@ -247,8 +216,6 @@ struct Reading {
     /// Where the value stands that is read now. It stays there when reading fails.
     path: Vec<Segment>,
     max_depth: usize,
-    /// Floats beyond 64 bits may be integers in the text; they are refused if there is such an integer at all.
-    has_wide_integer: bool,
     /// Why reading was ended, if it was not the text's form.
     refused: Option<String>,
 }
@@ -310,8 +277,7 @@ impl<'de> Visitor<'de> for Seed<'_> {
     }
 
     fn visit_f64<E: Error>(self, value: f64) -> Result<Value, E> {
-        // Every float from 2^63 on is whole: only the text tells whether it was written as an integer.
-        if self.0.has_wide_integer && value.abs() >= 9.0e18 {
+        if value.is_finite() && value.abs() > MAX_WHOLE {
             return Err(self.0.refuse(too_wide()));
         }
         match Number::from_f64(value) {

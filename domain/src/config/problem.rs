@@ -85,7 +85,7 @@ impl Problem {
     pub fn faults(errors: Vec<FieldFault>) -> Self {
         let first = errors
             .first()
-            .map(|fault| (fault.code, format!("{}: {}", fault.pointer, fault.detail)));
+            .map(|fault| (fault.code, told(&fault.pointer, &fault.detail)));
         let (code, mut detail) = first.unwrap_or((Code::ValidationFailed, String::new()));
         if errors.len() > 1 {
             detail.push_str(&format!(" (and {} more)", errors.len() - 1));
@@ -156,6 +156,14 @@ impl Problem {
     }
 }
 
+/// A fault with its place; that of the whole document is empty.
+fn told(pointer: &str, detail: &str) -> String {
+    match pointer {
+        "" => detail.to_owned(),
+        pointer => format!("{pointer}: {detail}"),
+    }
+}
+
 fn fault_json(fault: &FieldFault) -> Value {
     let mut out = Map::new();
     out.insert("pointer".to_owned(), fault.pointer.as_str().into());
@@ -174,3 +182,26 @@ impl fmt::Display for Problem {
 }
 
 impl std::error::Error for Problem {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_fault_stands_for_all() {
+        let fault = |pointer: &str, detail: &str| FieldFault {
+            pointer: pointer.to_owned(),
+            code: Code::ReferenceNotFound,
+            detail: detail.to_owned(),
+            document: None,
+        };
+        let whole = Problem::faults(vec![fault("", "expected an object")]);
+        assert_eq!(
+            (whole.code, whole.detail.as_str()),
+            (Code::ReferenceNotFound, "expected an object")
+        );
+        let two = Problem::faults(vec![fault("/spec/layer", "no layer edge"), fault("", "x")]);
+        assert_eq!(two.detail, "/spec/layer: no layer edge (and 1 more)");
+        assert_eq!(Problem::faults(Vec::new()).code, Code::ValidationFailed);
+    }
+}

@@ -1,7 +1,8 @@
 //! YAML text to trees of values, with the line of every value or fault.
 //!
-//! The core schema of YAML 1.2 (so `on` and `off` are texts). Anchors, aliases, duplicate keys and tags other than `!!str`
-//! are refused with their line: they make a file mean something else than it seems to say.
+//! The core schema of YAML 1.2 (so `on` and `off` are texts). Anchors, aliases, duplicate keys, tags (but `!!str` in the
+//! configuration of a process) and directives other than `%YAML 1.2` are refused with their line: they make a text mean
+//! something else than it seems to say.
 //!
 //! ```text
 //! a file of one document ──[parse]──▶ tree, place of every value, faults        (the configuration of a process)
@@ -73,8 +74,8 @@ pub(super) fn parse(text: &str, origin: &Origin, root: &str) -> Parsed {
 /// are lines of the text.
 ///
 /// # Errors
-/// Every fault of form: what is no YAML, repeated keys, anchors, aliases, tags, nesting deeper than 32, numbers that cannot
-/// be held. More than `max_documents` are one fault ([`LocatedFault::is_too_many_documents`]).
+/// Every fault of form: what is no YAML, repeated keys, anchors, aliases, tags, directives other than `%YAML 1.2`, nesting
+/// deeper than 32, numbers that cannot be held. More than `max_documents` are one fault ([`LocatedFault::is_too_many_documents`]).
 pub fn yaml_documents(text: &str, max_documents: usize) -> Result<Vec<Value>, Vec<LocatedFault>> {
     let documents = Documents::Many {
         limit: max_documents,
@@ -91,6 +92,58 @@ pub fn yaml_documents(text: &str, max_documents: usize) -> Result<Vec<Value>, Ve
 
 /// The text cannot be read further.
 struct Stop;
+
+/// Finds directives, which the parser follows and does not tell of. They stand between two documents.
+struct Directives<'a> {
+    /// Where it has come to.
+    rest: &'a str,
+    /// Number of the line that begins there.
+    line: usize,
+    /// The line of the end of the last document.
+    end: usize,
+}
+
+impl<'a> Directives<'a> {
+    fn of(text: &'a str) -> Self {
+        Self {
+            rest: text,
+            line: 1,
+            end: 1,
+        }
+    }
+
+    /// Lines of directives that are not taken, before a document that begins.
+    fn refused(&mut self, event: &Event<'_>, span: Span) -> Vec<usize> {
+        let mut refused = Vec::new();
+        match event {
+            Event::DocumentEnd => self.end = span.start.line(),
+            Event::DocumentStart(true) => {
+                while self.line < span.start.line() && !self.rest.is_empty() {
+                    let (number, line) = (self.line, self.next_line());
+                    let directive = line.split(" #").next().unwrap_or_default();
+                    let is_known = directive.split_whitespace().eq(["%YAML", "1.2"]);
+                    if number >= self.end && line.starts_with('%') && !is_known {
+                        refused.push(number);
+                    }
+                }
+            }
+            _ => {}
+        }
+        refused
+    }
+
+    /// Lines end as YAML has it: with line feed, carriage return, or both.
+    fn next_line(&mut self) -> &'a str {
+        let end = self.rest.find(['\n', '\r']).unwrap_or(self.rest.len());
+        let (line, rest) = self.rest.split_at(end);
+        self.rest = rest
+            .strip_prefix("\r\n")
+            .or_else(|| rest.strip_prefix(['\n', '\r']))
+            .unwrap_or_default();
+        self.line += 1;
+        line
+    }
+}
 
 /// A collection that is still open.
 enum Open {
@@ -150,9 +203,16 @@ impl<'a> Builder<'a> {
     /// Reads a text; whether to its end.
     fn read(&mut self, text: &str) -> bool {
         let mut parser = Parser::new_from_str(text);
+        let mut directives = Directives::of(text);
         while let Some(event) = parser.next_event() {
             let step = match event {
-                Ok((event, span)) => self.event(event, span),
+                Ok((event, span)) => {
+                    for line in directives.refused(&event, span) {
+                        let detail = "directives other than %YAML 1.2 are not allowed";
+                        self.fault(line, self.root.to_owned(), detail);
+                    }
+                    self.event(event, span)
+                }
                 Err(error) => {
                     let detail = format!("is not YAML: {}", error.info());
                     self.fault(error.marker().line(), self.root.to_owned(), detail);
@@ -184,6 +244,7 @@ impl<'a> Builder<'a> {
             Event::Scalar(text, style, anchor, tag) => {
                 self.refuse_anchor(anchor, line);
                 if self.wants_key() {
+                    self.refuse_tag(tag.as_deref(), line);
                     return self.key(text.into_owned(), line);
                 }
                 let line = self.line_of_value(line);
@@ -313,6 +374,17 @@ impl<'a> Builder<'a> {
         }
     }
 
+    /// Of scalars and keys.
+    fn refuse_tag(&mut self, tag: Option<&Tag>, line: usize) {
+        let Some(tag) = tag else { return };
+        let detail = match self.documents {
+            Documents::One if tag.is_yaml_core_schema() && tag.suffix == "str" => return,
+            Documents::One => "tags other than !!str are not allowed",
+            Documents::Many { .. } => "tags are not allowed",
+        };
+        self.fault(line, self.here(), detail);
+    }
+
     /// The path of what is read now. It is put together only where it is needed, for it may be long.
     fn here(&self) -> String {
         let mut path = self.root.to_owned();
@@ -365,11 +437,9 @@ impl<'a> Builder<'a> {
     }
 
     fn scalar(&mut self, text: &str, style: ScalarStyle, tag: Option<&Tag>, line: usize) -> Value {
-        let text_tag = tag.is_some_and(|tag| tag.is_yaml_core_schema() && tag.suffix == "str");
-        if tag.is_some() && !text_tag {
-            self.fault(line, self.here(), "tags other than !!str are not allowed");
-        }
-        if text_tag || style != ScalarStyle::Plain {
+        let has_tag = tag.is_some();
+        self.refuse_tag(tag, line);
+        if has_tag || style != ScalarStyle::Plain {
             return Value::String(text.to_owned());
         }
         core_schema(text).unwrap_or_else(|detail| {

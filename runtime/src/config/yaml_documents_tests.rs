@@ -48,7 +48,7 @@ fn faults_have_the_line_of_the_text() {
             "line 5: spec.b: is given twice",
             "line 7: c: anchors (&name) are not allowed: write the value out",
             "line 8: d: aliases (*name) are not allowed: write the value out",
-            "line 9: e: tags other than !!str are not allowed",
+            "line 9: e: tags are not allowed",
             "line 10: f: is not a number",
         ]
     );
@@ -60,6 +60,51 @@ fn faults_have_the_line_of_the_text() {
     assert_eq!(
         faults("list:\n- a: {b: .inf}\n"),
         ["line 2: list[0].a.b: is not a finite number"]
+    );
+}
+
+#[test]
+fn no_tag_is_taken() {
+    for tag in ["!!str", "!!int", "!", "!own", "!<tag:yaml.org,2002:str>"] {
+        for text in [format!("a: {tag} 1\n"), format!("{tag} a: 1\n"), format!("{tag} 1\n")] {
+            assert!(
+                faults(&text)
+                    .iter()
+                    .any(|fault| fault.ends_with("tags are not allowed")),
+                "{text}: {:?}",
+                faults(&text)
+            );
+        }
+    }
+    for text in ["a: !!seq [1]\n", "!!map {a: 1}\n", "- !!map {a: 1}\n"] {
+        assert!(faults(text)[0].ends_with("tags are not allowed"), "{text}");
+    }
+}
+
+#[test]
+fn directives_say_nothing_but_the_version() {
+    let refused = "directives other than %YAML 1.2 are not allowed";
+    for (text, line) in [
+        ("%YAML 1.1\n---\na: on\n", 1),
+        ("%TAG !e! tag:example.org,2026:\n---\na: 1\n", 1),
+        ("%TAG ! tag:yaml.org,2002:\r\n---\r\na: !str 1\r\n", 1),
+        ("# first\n%TAG !e! tag:example.org,2026:\n---\na: 1\n", 2),
+        ("a: 1\n...\n%YAML 1.1\n---\nb: 1\n", 3),
+        ("a: 1\r...\r%YAML 1.1\r---\rb: 1\r", 3),
+        ("%OTHER x\n---\na: 1\n", 1),
+    ] {
+        assert_eq!(faults(text)[0], format!("line {line}: {refused}"), "{text:?}");
+    }
+    for text in [
+        "%YAML 1.2\n---\na: \"%YAML 1.1\"\n",
+        "%YAML 1.2 # of 2009\n---\na: \"%YAML 1.1\"\n",
+        "a: |-\n  %YAML 1.1\n",
+    ] {
+        assert_eq!(read(text), [json!({ "a": "%YAML 1.1" })], "{text:?}");
+    }
+    assert_eq!(
+        read("--- |\n%TAG x y\n---\na: 1\n"),
+        [json!("%TAG x y\n"), json!({ "a": 1 })]
     );
 }
 

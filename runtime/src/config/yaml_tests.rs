@@ -61,6 +61,14 @@ fn what_misleads_is_refused_with_its_line() {
         ]
     );
     assert_eq!(
+        faults("!!int 1: a\n!!str b: 1\n"),
+        ["f:1: tags other than !!str are not allowed"]
+    );
+    assert_eq!(
+        faults("%YAML 1.1\n---\na: off\n"),
+        ["f:1: directives other than %YAML 1.2 are not allowed"]
+    );
+    assert_eq!(
         faults("a: 1\n---\nb: 2\n"),
         ["f:2: holds a second document; one is allowed"]
     );

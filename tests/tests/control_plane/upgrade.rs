@@ -72,17 +72,30 @@ async fn two_processes_are_replaced_one_by_one_under_load() {
         "{} writes, {turned} went to the other process, {unknown} had to be read back; watches were resumed {seen:?} times",
         written.load(Ordering::Relaxed)
     );
-    for (index, outcome) in outcomes.iter().enumerate() {
-        for client in both(index) {
-            let (_, config) = client.get(&format!("w{index}")).await.unwrap().unwrap();
-            assert_eq!(config, json!({ "n": outcome.number }), "{:?} {:?}", client.via, client.main);
+    for outcome in &outcomes {
+        for index in 0..4 {
+            let [client, _] = both(index);
+            let (revision, config) = client.get(&outcome.name).await.unwrap().unwrap();
+            let found = (revision, config["n"].as_u64());
+            assert_eq!(
+                found,
+                (outcome.last, Some(outcome.number)),
+                "{:?} {:?}",
+                client.via,
+                client.main
+            );
         }
     }
-    assert!(seen.iter().all(|resumed| *resumed > 0), "every watch was ended by a process that left");
+    assert!(
+        seen.iter().all(|resumed| *resumed > 0),
+        "every watch was ended by a process that left"
+    );
 }
 
 /// What a writer has done.
 struct Outcome {
+    /// Its service.
+    name: String,
     /// What its service says in the end.
     number: u64,
     /// Revision of its last write.
@@ -96,6 +109,7 @@ struct Outcome {
 /// Counts up in a service of its own, at one process as long as it takes writes, then at the other.
 async fn write(clients: [Client; 2], name: String, over: Arc<AtomicBool>, written: Arc<AtomicUsize>) -> Outcome {
     let mut outcome = Outcome {
+        name: name.clone(),
         number: 0,
         last: 0,
         unknown: 0,
@@ -181,7 +195,9 @@ async fn all_are_at(mains: &[Arc<Main>; 2]) {
     let admins = mains.clone().map(|main| main.admin());
     blocking(move || {
         let open = || {
-            let open = admins.iter().filter_map(|admin| admin.metric("blaze_config_watchers", &[]));
+            let open = admins
+                .iter()
+                .filter_map(|admin| admin.metric("blaze_config_watchers", &[]));
             open.sum::<f64>()
         };
         let all_are_open = || open() == WATCHERS as f64;

@@ -1,14 +1,14 @@
 //! Before and after every call of `ConfigService`: who asks, whether it may, for how long, and what became of it.
 //!
 //! ```text
-//! head ─▶ --dev ─▶ address ─▶ token ─▶ rate ─▶ method ─▶ right ─▶ time ─▶ in flight ─▶ message ─▶ call
-//!           7         8         16       8       12        7       3          14                    │
+//! head ─▶ --dev ─▶ address ─▶ token ─▶ rate ─▶ method ─▶ right ─▶ time ─▶ message ─▶ in flight ─▶ call
+//!           7         8         16       8       12        7       3         3, 8        14         │
 //! response ◀─ x-request-id, traceparent, blaze-revision, details for the library's own refusals ◀───┘
 //! ```
 //!
 //! The numbers are the codes of gRPC of the refusals.
 //!
-//! Everything above is decided by the head alone, so nobody without a token makes the service read a message. The caller
+//! Everything before the message is decided by the head alone, so nobody without a token makes the service read one. The caller
 //! goes to the call as a [`Call`] in the request; a call without one is refused, so that none can be served around this
 //! gate.
 
@@ -28,8 +28,8 @@ use tonic::Status;
 use tracing::Instrument as _;
 
 use super::methods::{self, Method};
-use super::{MAX_MESSAGE_BYTES, status};
-use crate::api::limits::{ApiLimits, InFlight};
+use super::{MAX_MESSAGE_BYTES, MAX_OPEN_BYTES, status};
+use crate::api::limits::{ApiLimits, refusal};
 use crate::api::request;
 use crate::auth::Claims;
 use crate::core::{Caller, ConfigService};
@@ -85,7 +85,7 @@ pub(super) async fn gate(State(gate): State<Arc<Gate>>, request: Request, next: 
     let span = tracing::info_span!("grpc", operation, request_id = %head.id, traceparent);
 
     let mut response = gate.answer(&head, request, next).instrument(span.clone()).await;
-    let code = explain(&mut response, &head.id);
+    let code = explain(&mut response, &head.id, MAX_MESSAGE_BYTES);
     if let Ok(id) = HeaderValue::from_str(&head.id) {
         response.headers_mut().insert(REQUEST_ID, id);
     }
@@ -105,13 +105,15 @@ impl Gate {
             Err(problem) => return self.refuse(head, None, &problem, "authenticate"),
         };
         let mut response = match self.admit(head, &claims, request.headers()) {
-            Ok((method, time, place)) => {
+            Ok((method, time)) => {
                 let caller = Caller {
                     claims,
                     request_id: head.id.clone(),
                     address: head.address,
                 };
-                serve(Call::new(caller, method), time, place, request, next).await
+                let limits = &self.limits;
+                let request = request.map(|body| limits.metered(&caller.claims.subject, body));
+                serve(Call::new(caller, method), time, request, next).await
             }
             Err(problem) => {
                 let action = head.method.map_or(NO_METHOD, |method| method.action);
@@ -141,19 +143,13 @@ impl Gate {
         claims
     }
 
-    /// Which method, how long it may take, and a place to work on it.
-    fn admit(
-        &self,
-        head: &Head,
-        claims: &Claims,
-        headers: &HeaderMap,
-    ) -> Result<(&'static Method, Duration, InFlight), Problem> {
+    /// Which method, and how long it may take.
+    fn admit(&self, head: &Head, claims: &Claims, headers: &HeaderMap) -> Result<(&'static Method, Duration), Problem> {
         self.limits.count_request(&claims.subject)?;
         let none = || Problem::new(Code::MethodNotAllowed, "blaze.v1.ConfigService has no such method");
         let method = head.method.ok_or_else(none)?;
         self.core.authorize(claims, method.right)?;
-        let time = call_time(headers)?;
-        Ok((method, time, self.limits.enter()?))
+        Ok((method, call_time(headers)?))
     }
 
     fn refuse(&self, head: &Head, claims: Option<&Claims>, problem: &Problem, action: &str) -> Response {
@@ -183,13 +179,11 @@ pub(super) fn is_denial(problem: &Problem) -> bool {
     matches!(problem.code, Code::Unauthenticated | Code::PermissionDenied)
 }
 
-async fn serve(call: Call, time: Duration, place: InFlight, mut request: Request, next: Next) -> Response {
+async fn serve(call: Call, time: Duration, mut request: Request, next: Next) -> Response {
     let (id, writes) = (call.caller.request_id.clone(), call.method.writes);
     let begun = Arc::clone(&call.begun);
     request.extensions_mut().insert(call);
     let served = tokio::time::timeout(time, next.run(request)).await;
-    // The stream of a watch has begun by now and needs no place any more.
-    drop(place);
     served.unwrap_or_else(|_| {
         let problem = Problem::new(
             Code::DeadlineExceeded,
@@ -233,32 +227,53 @@ fn parse_timeout(text: &str) -> Option<Duration> {
 }
 
 /// Gives the code of a response for metrics, and a refusal by the library the details that ours have.
-fn explain(response: &mut Response, request_id: &str) -> &'static str {
-    let Some(found) = response.extensions().get::<Status>() else {
+fn explain(response: &mut Response, request_id: &str, most_bytes: usize) -> &'static str {
+    let held = response.extensions().get::<Status>().cloned();
+    let Some(found) = held.or_else(|| Status::from_header_map(response.headers())) else {
         return "ok";
     };
-    if let Some(code) = status::code_of(found) {
+    if found.code() == tonic::Code::Ok {
+        return "ok";
+    }
+    if let Some(code) = status::code_of(&found) {
         return code.as_str();
     }
-    let problem = match found.code() {
-        // The message is not in the compression that the client said, or in one that is not offered.
-        tonic::Code::Unimplemented => return Code::MethodNotAllowed.as_str(),
-        tonic::Code::OutOfRange | tonic::Code::ResourceExhausted => {
-            let detail = format!("a message may have {MAX_MESSAGE_BYTES} bytes");
-            Problem::new(Code::PayloadTooLarge, detail)
-        }
-        _ => Problem::new(
-            Code::InvalidRequest,
-            format!("the message cannot be read: {}", found.message()),
-        ),
-    };
-    let code = problem.code.as_str();
-    let revision = response.headers().get(REVISION).cloned();
-    *response = status::from_problem(&problem, request_id).into_http::<Body>();
-    if let Some(revision) = revision {
-        response.headers_mut().insert(REVISION, revision);
+    let problem = as_problem(&found, most_bytes);
+    let old = std::mem::replace(response, status::from_problem(&problem, request_id).into_http::<Body>());
+    for (name, value) in old.headers() {
+        response.headers_mut().entry(name).or_insert_with(|| value.clone());
     }
-    code
+    problem.code.as_str()
+}
+
+/// What the library refused, in our words.
+fn as_problem(found: &Status, most_bytes: usize) -> Problem {
+    if let Some(problem) = refusal(found) {
+        return problem.clone();
+    }
+    match (found.code(), found.message()) {
+        (tonic::Code::Unimplemented, "") => {
+            Problem::new(Code::MethodNotAllowed, "there is no such service or method here")
+        }
+        // The message is not in the compression that the client said, or in one that is not offered.
+        (tonic::Code::Unimplemented, message) => Problem::new(Code::MethodNotAllowed, message),
+        (tonic::Code::NotFound, message) => Problem::new(Code::NotFound, message),
+        (tonic::Code::OutOfRange | tonic::Code::ResourceExhausted, _) => {
+            Problem::new(Code::PayloadTooLarge, format!("a message may have {most_bytes} bytes"))
+        }
+        (_, message) => Problem::new(Code::InvalidRequest, format!("the message cannot be read: {message}")),
+    }
+}
+
+/// The middleware of what needs no token, and of what is not there.
+pub(super) async fn open(request: Request, next: Next) -> Response {
+    let id = request::request_id(request.headers());
+    let mut response = next.run(request).await;
+    explain(&mut response, &id, MAX_OPEN_BYTES);
+    if let Ok(id) = HeaderValue::from_str(&id) {
+        response.headers_mut().insert(REQUEST_ID, id);
+    }
+    response
 }
 
 #[cfg(test)]

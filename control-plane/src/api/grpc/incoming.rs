@@ -10,6 +10,7 @@ use serde_json::{Map, Value};
 use sha2::{Digest as _, Sha256};
 
 use super::MAX_APPLY_BYTES;
+use crate::api::DEFAULT_TOKEN_LIFE_S;
 use crate::core::{
     ApplyItem, ApplyRequest, DocumentInput, Idempotency, ListQuery, Place, Precondition, ReadOptions, WatchQuery,
 };
@@ -43,6 +44,22 @@ fn text(text: String) -> Option<String> {
 
 fn number(number: u64) -> Option<u64> {
     (number > 0).then_some(number)
+}
+
+/// A revision that must be said.
+pub(super) fn revision(member: &str, number: u64) -> Result<u64, Problem> {
+    match number {
+        0 => Err(invalid(format!("{member} is missing: revisions begin with 1"))),
+        number => Ok(number),
+    }
+}
+
+/// Life of a token, in seconds.
+pub(super) fn life(expires_in_s: u32) -> u32 {
+    match expires_in_s {
+        0 => DEFAULT_TOKEN_LIFE_S,
+        seconds => seconds,
+    }
 }
 
 /// What a request is about.

@@ -81,6 +81,18 @@ fn zero_and_empty_mean_not_said() {
 }
 
 #[test]
+fn a_revision_that_must_be_said_is_above_zero() {
+    assert_eq!(revision("from_revision", 7), Ok(7));
+    let problem = revision("from_revision", 0).unwrap_err();
+    assert_eq!(problem.code, Code::InvalidRequest);
+    assert!(
+        problem.detail.starts_with("from_revision is missing"),
+        "{}",
+        problem.detail
+    );
+}
+
+#[test]
 fn only_instances_have_a_service() {
     let list = |kind: v1::Kind| {
         list(v1::ListRequest {

@@ -86,7 +86,9 @@ pub fn router(service: ConfigService, options: GrpcOptions) -> Router {
     } else {
         open
     };
-    open.into_axum_router().merge(config)
+    open.into_axum_router()
+        .layer(middleware::from_fn(gate::open))
+        .merge(config)
 }
 
 fn with_reflection(routes: Routes) -> Routes {

@@ -110,10 +110,11 @@ impl Operations {
 
     pub(super) async fn diff(&self, call: &mut Call, request: v1::DiffRequest) -> Done<v1::DiffResponse> {
         let key = call.about(incoming::key(request.r#ref.as_ref())?);
+        let from = incoming::revision("from_revision", request.from_revision)?;
         let to = (request.to_revision > 0).then_some(request.to_revision);
         let answer = self
             .core
-            .diff(&call.caller, &key, request.from_revision, to, &ReadOptions::default())
+            .diff(&call.caller, &key, from, to, &ReadOptions::default())
             .await?;
         Ok(map(answer, |diff, _| v1::DiffResponse {
             changes: diff.changes.iter().map(outgoing::delta).collect(),
@@ -123,10 +124,11 @@ impl Operations {
     pub(super) async fn rollback(&self, call: &mut Call, request: v1::RollbackRequest) -> Done<v1::Document> {
         let idempotency = incoming::idempotency(call.method.name, &request.request_id, &request)?;
         let key = call.about(incoming::key(request.r#ref.as_ref())?);
+        let revision = incoming::revision("revision", request.revision)?;
         let precondition = incoming::precondition(request.precondition)?;
         let answer = self
             .core
-            .rollback(&call.caller, &key, request.revision, precondition, idempotency)
+            .rollback(&call.caller, &key, revision, precondition, idempotency)
             .await?;
         Ok(map(answer, |written, _| outgoing::written(&written)))
     }
@@ -184,7 +186,7 @@ impl Operations {
             subject: request.subject,
             roles: request.roles,
             layer: (!request.layer.is_empty()).then_some(request.layer),
-            expires_in_s: request.expires_in_s,
+            expires_in_s: incoming::life(request.expires_in_s),
         };
         let answer = self.core.create_token(&call.caller, request).await?;
         Ok(map(answer, |(record, text), _| outgoing::token(record, text)))
@@ -224,10 +226,8 @@ impl Operations {
     }
 
     pub(super) async fn revert(&self, call: &mut Call, request: v1::RevertRequest) -> Done<v1::ApplyResponse> {
-        let answer = self
-            .core
-            .revert(&call.caller, request.revision, request.force, None)
-            .await?;
+        let revision = incoming::revision("revision", request.revision)?;
+        let answer = self.core.revert(&call.caller, revision, request.force, None).await?;
         Ok(map(answer, |report, _| outgoing::applied(&report)))
     }
 }

@@ -12,7 +12,7 @@ use tonic::{Request, Response, Status};
 use super::gate::{self, Call};
 use super::operations::{Done, Operations};
 use super::{MAX_MESSAGE_BYTES, incoming, status, watch};
-use crate::api::limits::ApiLimits;
+use crate::api::limits::{ApiLimits, InFlight};
 use crate::core::{Answer, ConfigService, ReadOptions};
 use crate::metrics::ApiMetrics;
 
@@ -52,6 +52,15 @@ impl Call {
 }
 
 impl Service {
+    /// The caller that the gate let through, the message, and a place to work on it.
+    fn open<T>(&self, request: Request<T>) -> Result<(Call, T, InFlight), Status> {
+        let (call, message) = Call::open(request)?;
+        match self.limits.enter() {
+            Ok(place) => Ok((call, message, place)),
+            Err(problem) => Err(self.refuse(&call, &problem)),
+        }
+    }
+
     pub(super) fn new(core: ConfigService, limits: Arc<ApiLimits>, metrics: Arc<ApiMetrics>) -> Self {
         Self {
             operations: Operations { core },
@@ -122,7 +131,7 @@ macro_rules! methods {
         #[tonic::async_trait]
         impl config_service_server::ConfigService for Service {
             $(async fn $name(&self, request: Request<v1::$request>) -> Result<Response<v1::$response>, Status> {
-                let (mut call, message) = Call::open(request)?;
+                let (mut call, message, _place) = self.open(request)?;
                 let done = self.operations.$name(&mut call, message).await;
                 self.close(&call, done)
             })+
@@ -130,7 +139,8 @@ macro_rules! methods {
             type WatchStream = watch::Responses;
 
             async fn watch(&self, request: Request<v1::WatchRequest>) -> Result<Response<watch::Responses>, Status> {
-                let (call, message) = Call::open(request)?;
+                // Its stream needs no place any more.
+                let (call, message, _place) = self.open(request)?;
                 let opened = self.open_watch(&call, message).await;
                 opened.map(respond).map_err(|problem| self.refuse(&call, &problem))
             }

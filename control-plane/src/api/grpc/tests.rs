@@ -19,7 +19,7 @@ use tonic_reflection::pb::v1::{
 };
 use tonic_types::StatusExt as _;
 
-use self::fixture::{Fixture, code, create, exactly, layer, reference};
+use self::fixture::{Fixture, code, create, exactly, layer, now_s, reference};
 use super::methods::{METHODS, PATH};
 use super::{CONFIG_DESCRIPTORS, MAX_MESSAGE_BYTES};
 use crate::auth::Right;
@@ -370,6 +370,85 @@ async fn what_cannot_be_read_is_refused_with_details() {
         let posted = fixture.post(&format!("{PATH}{method}"), &[], &message).await;
         assert_eq!(code(&posted.status), expected, "{method} {:?}", posted.status);
     }
+}
+
+#[tokio::test]
+async fn revision_zero_is_none() {
+    let fixture = Fixture::open().await;
+    let mut client = fixture.client();
+    client.create(create("edge", "")).await.unwrap();
+    let edge = || reference(v1::Kind::Layer, "edge");
+    let diff = client.diff(v1::DiffRequest {
+        r#ref: edge(),
+        ..Default::default()
+    });
+    let diff = diff.await.unwrap_err();
+    let rollback = client.rollback(v1::RollbackRequest {
+        r#ref: edge(),
+        ..Default::default()
+    });
+    let rollback = rollback.await.unwrap_err();
+    let revert = client.revert(v1::RevertRequest::default()).await.unwrap_err();
+    for refused in [diff, rollback, revert] {
+        assert_eq!(
+            (refused.code(), code(&refused)),
+            (tonic::Code::InvalidArgument, Code::InvalidRequest)
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_token_lives_a_day_unless_more_is_said() {
+    let fixture = Fixture::open().await;
+    let request = |expires_in_s| v1::CreateTokenRequest {
+        subject: "ops".into(),
+        roles: vec!["viewer".into()],
+        expires_in_s,
+        ..Default::default()
+    };
+    let mut client = fixture.client();
+    let mut life = async |expires_in_s| {
+        let before = now_s();
+        let made = client.create_token(request(expires_in_s)).await.unwrap().into_inner();
+        made.expire_time.unwrap().seconds - before
+    };
+    assert!((86_399..86_460).contains(&life(0).await));
+    assert!((59..120).contains(&life(60).await));
+}
+
+#[tokio::test]
+async fn what_is_not_there_is_told_like_other_refusals() {
+    let fixture = Fixture::open().await;
+    for path in [
+        "/blaze.v1.NoSuchService/Get",
+        "/blaze.v1.ConfigService/NoSuchMethod",
+        "/grpc.health.v1.Health/NoSuchMethod",
+        "/",
+    ] {
+        let posted = fixture.post(path, &[("x-request-id", "from-a-test")], &[]).await;
+        assert_eq!(
+            (posted.status.code(), code(&posted.status)),
+            (tonic::Code::Unimplemented, Code::MethodNotAllowed),
+            "{path}"
+        );
+        let info = posted.status.get_details_error_info().unwrap();
+        assert_eq!(
+            (info.reason.as_str(), info.metadata["request_id"].as_str()),
+            ("METHOD_NOT_ALLOWED", "from-a-test"),
+            "{path}"
+        );
+        assert_eq!(posted.headers["x-request-id"], "from-a-test", "{path}");
+    }
+    let unknown = HealthCheckRequest {
+        service: "blaze.v1.Other".into(),
+    };
+    let posted = fixture
+        .post("/grpc.health.v1.Health/Check", &[], &unknown.encode_to_vec())
+        .await;
+    assert_eq!(
+        (posted.status.code(), code(&posted.status)),
+        (tonic::Code::NotFound, Code::NotFound)
+    );
 }
 
 #[tokio::test]

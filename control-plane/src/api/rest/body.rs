@@ -9,6 +9,7 @@ use http_body_util::{BodyExt, LengthLimitError, Limited};
 use serde_json::Value;
 
 use super::routes::Payload;
+use crate::api::limits::refusal;
 
 /// Largest body (1 MiB).
 const MAX_BODY: usize = 1024 * 1024;
@@ -57,7 +58,7 @@ impl Payload {
 /// Reads a body: `None` where the route has none.
 ///
 /// # Errors
-/// `payload_too_large`, `unsupported_media_type`, and `invalid_request` if it breaks off.
+/// `payload_too_large`, `unsupported_media_type`, `invalid_request` if it breaks off, and what the limits of bodies refuse.
 pub(super) async fn read(payload: Payload, headers: &HeaderMap, body: Body) -> Result<Option<(Media, Bytes)>, Problem> {
     if payload == Payload::None {
         return Ok(None);
@@ -73,7 +74,10 @@ pub(super) async fn read(payload: Payload, headers: &HeaderMap, body: Body) -> R
     match Limited::new(body, limit).collect().await {
         Ok(collected) => Ok(Some((media, collected.to_bytes()))),
         Err(error) if error.is::<LengthLimitError>() => Err(too_large(limit)),
-        Err(_) => Err(Problem::new(Code::InvalidRequest, "the body broke off")),
+        Err(error) => {
+            let broke_off = || Problem::new(Code::InvalidRequest, "the body broke off");
+            Err(refusal(&*error).cloned().unwrap_or_else(broke_off))
+        }
     }
 }
 

@@ -1,5 +1,7 @@
 //! The verbs that all five collections share, and the two of roll-outs alone.
 
+use std::sync::Arc;
+
 use axum::http::StatusCode;
 use axum::http::header::ETAG;
 use axum::response::Response;
@@ -13,7 +15,8 @@ use super::operation::Call;
 use super::query::Param;
 use super::reply;
 use crate::api::json;
-use crate::core::{ApplyItem, DocumentInput, ListQuery, Precondition, ReadOptions};
+use crate::auth::Claims;
+use crate::core::{ApplyItem, Caller, DocumentInput, ListQuery, Precondition, ReadOptions};
 
 /// Longest reason of an aborted roll-out, in characters.
 pub(super) const MAX_REASON: usize = 1000;
@@ -146,16 +149,41 @@ pub(super) fn apply_item(value: Value) -> Result<ApplyItem, Vec<FieldFault>> {
 /// The order of checks has preconditions before faults of the document; the core sees only documents without faults, so
 /// that what comes first is looked up here.
 async fn precondition_first(call: &Call, key: &Key, precondition: &Precondition, faults: Problem) -> Problem {
-    let current = match call.service().get(&call.caller, key, &ReadOptions::default()).await {
+    let read = |caller: Caller| async move { call.service().get(&caller, key, &ReadOptions::default()).await };
+    let mut found = read(call.caller.clone()).await;
+    if let Err(refused) = &found
+        && refused.code == Code::PermissionDenied
+        && may_create(key, precondition)
+    {
+        // A token bound to a layer may make what does not exist; whether it does, the token's own view does not say.
+        let whole = Claims {
+            layer: None,
+            ..(*call.caller.claims).clone()
+        };
+        let caller = Caller {
+            claims: Arc::new(whole),
+            ..call.caller.clone()
+        };
+        match read(caller).await {
+            Err(problem) if problem.code == Code::NotFound => found = Err(problem),
+            Ok(_) | Err(_) => {}
+        }
+    }
+    let current = match found {
         Ok(answer) => Some(answer.value.revision),
         Err(problem) if problem.code == Code::NotFound => None,
         Err(problem) => return problem,
     };
-    judge(key, precondition, current).unwrap_or(faults)
+    judge(key, precondition, current, call.service().revision()).unwrap_or(faults)
 }
 
-/// What a precondition says of the present revision, if it refuses.
-fn judge(key: &Key, precondition: &Precondition, current: Option<u64>) -> Option<Problem> {
+/// Whether a token bound to a layer may write what does not exist. Services belong to all layers.
+fn may_create(key: &Key, precondition: &Precondition) -> bool {
+    key.kind() != Kind::Service && matches!(precondition, Precondition::None | Precondition::Absent)
+}
+
+/// What a precondition says of the present revision, if it refuses; of what is missing, that of the store is told.
+fn judge(key: &Key, precondition: &Precondition, current: Option<u64>, store: u64) -> Option<Problem> {
     let (code, detail) = match (precondition, current) {
         (Precondition::None, Some(_)) => {
             let detail = format!("{key} exists: say which revision you change with If-Match (its ETag), or * for any");
@@ -174,11 +202,7 @@ fn judge(key: &Key, precondition: &Precondition, current: Option<u64>) -> Option
             return None;
         }
     };
-    let problem = Problem::new(code, detail);
-    Some(match current {
-        Some(revision) => problem.at(revision),
-        None => problem,
-    })
+    Some(Problem::new(code, detail).at(current.unwrap_or(store)))
 }
 
 #[cfg(test)]
@@ -190,7 +214,7 @@ mod tests {
     #[test]
     fn preconditions_are_judged_as_the_core_does() {
         let key: Key = "Node/robot-1".parse().unwrap();
-        let code = |precondition, current| judge(&key, &precondition, current).map(|problem| problem.code);
+        let code = |precondition, current| judge(&key, &precondition, current, 9).map(|problem| problem.code);
         assert_eq!(code(Precondition::None, None), None);
         assert_eq!(code(Precondition::None, Some(7)), Some(Code::PreconditionRequired));
         assert_eq!(code(Precondition::Any, Some(7)), None);
@@ -206,7 +230,9 @@ mod tests {
         );
         assert_eq!(code(Precondition::Absent, None), None);
         assert_eq!(code(Precondition::Absent, Some(7)), Some(Code::PreconditionFailed));
-        assert_eq!(judge(&key, &Precondition::None, Some(7)).unwrap().revision, Some(7));
+        let revision = |precondition, current| judge(&key, &precondition, current, 9).unwrap().revision;
+        assert_eq!(revision(Precondition::None, Some(7)), Some(7));
+        assert_eq!(revision(Precondition::Any, None), Some(9));
     }
 
     #[test]

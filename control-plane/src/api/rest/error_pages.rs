@@ -22,7 +22,7 @@ fn words(code: Code) -> (&'static str, &'static str) {
         ),
         Code::InvalidHeader => (
             "A header has a value that cannot be used: an If-Match without quotes, an Idempotency-Key that is too \
-             long, a Last-Event-ID that is no revision.",
+             long, a Last-Event-ID that is no revision, a Host that comes twice or not at all.",
             "Send ETags as they came, with their quotes: If-Match: \"412\". An Idempotency-Key is 1 to 128 visible \
              ASCII characters.",
         ),
@@ -159,12 +159,13 @@ fn words(code: Code) -> (&'static str, &'static str) {
             "Send If-Match with the ETag of the document, or If-Match: * to overwrite whatever is there.",
         ),
         Code::RateLimited => (
-            "There were too many requests of this subject, too many refused tokens from this address, or too many \
-             open watches of this subject.",
+            "There were too many requests of this subject, too many refused tokens from this address, too many open \
+             watches of this subject, or too much of it that is on its way and not whole yet.",
             "Wait as long as Retry-After says. The limits are in control_plane.limits of the node file.",
         ),
         Code::HeadersTooLarge => (
-            "The headers have more than 32 KiB.",
+            "The headers have more than 32 KiB. Beyond 64 KiB, or 1,024 lines over HTTP/1.1, the connection is closed \
+             with a bare 431.",
             "Look for a cookie or a token that has grown.",
         ),
         Code::WatchTooSlow => (
@@ -195,7 +196,7 @@ fn words(code: Code) -> (&'static str, &'static str) {
             "Connect again: to another process, or to this one once it is back. A watch goes on with Last-Event-ID.",
         ),
         Code::DeadlineExceeded => (
-            "There was no answer within 30 seconds.",
+            "There was no answer within 30 seconds, or the body did not come to its end in that time.",
             "Read before trying a write again: applied says unknown where it may have taken effect.",
         ),
     }

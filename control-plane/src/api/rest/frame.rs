@@ -3,7 +3,7 @@
 use std::net::IpAddr;
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::Request;
@@ -111,7 +111,7 @@ fn record(rest: &Rest, response: &Response, visit: &Visit, method: &Method, star
     let internal = refused
         .and_then(|refused| refused.internal.as_deref())
         .unwrap_or_default();
-    let (request_id, duration_ms) = (&*visit.request_id, took.as_secs_f64() * 1000.0);
+    let (request_id, duration_ms) = (&*visit.request_id, millis(took));
     let trace = response
         .headers()
         .get(TRACEPARENT)
@@ -133,6 +133,11 @@ fn record(rest: &Rest, response: &Response, visit: &Visit, method: &Method, star
     }
 }
 
+/// Milliseconds with three decimals.
+fn millis(took: Duration) -> f64 {
+    took.as_micros() as f64 / 1000.0
+}
+
 /// `WWW-Authenticate` of a 401: with an error only if a token was sent.
 pub(super) fn challenge(response: &mut Response, sent: bool) {
     let value = if sent {
@@ -146,4 +151,15 @@ pub(super) fn challenge(response: &mut Response, sent: bool) {
 /// `Allow` of a 405.
 pub(super) fn allow(response: &mut Response, methods: &str) {
     reply::set(response, ALLOW, methods);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_time_in_the_log_has_three_decimals() {
+        assert_eq!(millis(Duration::from_nanos(92_132)).to_string(), "0.092");
+        assert_eq!(millis(Duration::from_micros(12_345_678)).to_string(), "12345.678");
+    }
 }

@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use axum::Router;
 use axum::extract::{MatchedPath, Request};
-use axum::http::{HeaderMap, Uri};
+use axum::http::header::HOST;
+use axum::http::{HeaderMap, Uri, Version};
 use axum::response::Response;
 use blaze_domain::config::{Code, Problem};
 use tower::ServiceExt;
@@ -22,7 +23,7 @@ pub(super) struct Known(pub(super) Arc<Claims>);
 /// Lets a request through to where its path leads, or refuses it.
 pub(super) async fn pass(rest: &Rest, api: Router, pages: Router, visit: &Visit, request: Request) -> Response {
     let refuse = |problem: &Problem| reply::problem(problem, &visit.path, &visit.request_id);
-    if let Err(problem) = sizes(&request) {
+    if let Err(problem) = sizes(&request).and_then(|()| one_host(&request)) {
         return refuse(&problem);
     }
     if rest.options.dev
@@ -72,8 +73,6 @@ async fn within_limits(
     mut request: Request,
 ) -> Result<Response, Problem> {
     rest.options.limits.count_request(&claims.subject)?;
-    // Held until the answer begins; what streams has a limit of its own.
-    let _place = rest.options.limits.enter()?;
     request.extensions_mut().insert(Known(Arc::clone(claims)));
     Ok(route(api, request).await)
 }
@@ -96,6 +95,17 @@ fn sizes(request: &Request) -> Result<(), Problem> {
     if uri > MAX_URI_BYTES {
         let detail = format!("path and query have {uri} bytes, at most {MAX_URI_BYTES} are allowed");
         return Err(Problem::new(Code::UriTooLong, detail));
+    }
+    Ok(())
+}
+
+/// Two parties between client and service must not take different hosts for the one that is meant (RFC 9112, 3.2).
+fn one_host(request: &Request) -> Result<(), Problem> {
+    let hosts = request.headers().get_all(HOST).iter().count();
+    // HTTP/2 has it in `:authority`, HTTP/1.0 knows none.
+    if hosts > 1 || (hosts == 0 && request.version() == Version::HTTP_11) {
+        let detail = format!("the request has {hosts} Host headers; it needs one");
+        return Err(Problem::new(Code::InvalidHeader, detail));
     }
     Ok(())
 }
@@ -188,6 +198,25 @@ mod tests {
             sized(&format!("/{}", "a".repeat(MAX_URI_BYTES)), too_many),
             Some(Code::HeadersTooLarge)
         );
+    }
+
+    #[test]
+    fn a_request_has_one_host() {
+        let code = |version, hosts: &[&str]| {
+            let mut request = Request::builder().version(version);
+            for host in hosts {
+                request = request.header(HOST, *host);
+            }
+            let request = request.body(Body::empty()).unwrap();
+            one_host(&request).err().map(|problem| problem.code)
+        };
+        assert_eq!(code(Version::HTTP_11, &["a"]), None);
+        assert_eq!(code(Version::HTTP_11, &[]), Some(Code::InvalidHeader));
+        assert_eq!(code(Version::HTTP_11, &["a", "a"]), Some(Code::InvalidHeader));
+        assert_eq!(code(Version::HTTP_10, &[]), None);
+        assert_eq!(code(Version::HTTP_10, &["a", "b"]), Some(Code::InvalidHeader));
+        assert_eq!(code(Version::HTTP_2, &[]), None);
+        assert_eq!(code(Version::HTTP_2, &["a", "b"]), Some(Code::InvalidHeader));
     }
 
     #[test]

@@ -2,9 +2,9 @@
 //!
 //! ```text
 //! request ─▶ frame     request id, time, panic, log, metrics, headers of every answer
-//!              └▶ gate      431, 414, --dev's 403 ┬─ outside /api/ ─▶ pages       livez … docs, else 404
+//!              └▶ gate      431, 414, Host, --dev's 403 ┬─ outside /api/ ─▶ pages       livez … docs, else 404
 //!                           429, 401, limits      └─ routes ─▶ 404, 405, else
-//!                   └▶ operation  name 404, 406, 403, body 413/415, 400
+//!                   └▶ operation  name 404, 406, 403, body 413/415, 400, a place among those at work
 //!                          └▶ documents, history, apply, effective, system, tokens, watch ─▶ core
 //! ```
 //!

@@ -193,6 +193,7 @@ async fn answer(
     negotiate::check(request.headers(), route.action)?;
     rest.service.authorize(&caller.claims, route.right)?;
     let (parts, body) = request.into_parts();
+    let body = rest.options.limits.metered(&caller.claims.subject, body);
     let read = body::read(route.payload, &parts.headers, body);
     let body = timeout_at(visit.deadline, read).await.map_err(|_| too_late(false))??;
     let call = Call {
@@ -205,6 +206,8 @@ async fn answer(
         headers: parts.headers,
         body,
     };
+    // Held until the answer begins; what streams has a limit of its own.
+    let _place = rest.options.limits.enter()?;
     match timeout_at(visit.deadline, perform(&call, route.action)).await {
         Ok(answer) => answer,
         // The core goes on with a write whose caller has left.

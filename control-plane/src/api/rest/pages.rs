@@ -9,6 +9,7 @@ use axum::body::Body;
 use axum::extract::Request;
 use axum::http::StatusCode;
 use axum::http::header::{CONTENT_SECURITY_POLICY, CONTENT_TYPE};
+use axum::middleware::{self, Next};
 use axum::response::Response;
 use axum::routing::get;
 use blaze_domain::config::{Code, Problem};
@@ -17,7 +18,8 @@ use serde_json::{Value, json};
 use utoipa::openapi::OpenApi;
 use utoipa_swagger_ui::Config;
 
-use super::frame::{Visit, allow, note};
+use super::frame::{Served, Visit, allow, note};
+use super::query::Query;
 use super::{Rest, error_pages, gate, openapi, reply};
 
 /// Pages with a look of their own, and nothing else.
@@ -60,6 +62,7 @@ pub(super) fn router(rest: &Arc<Rest>, document: &OpenApi) -> Router {
         .route("/docs/ui/{file}", get(ui_file))
         .route("/docs/errors", get(|| ready(html(error_pages::index(), PAGE_POLICY))))
         .route("/docs/errors/{code}", get(error_page))
+        .route_layer(middleware::from_fn(without_query))
         .fallback(gate::unknown)
         .method_not_allowed_fallback(wrong_method)
 }
@@ -130,6 +133,26 @@ async fn error_page(request: Request) -> Response {
         Ok(code) => html(error_pages::page(code), PAGE_POLICY),
         Err(_) => gate::unknown(request).await,
     }
+}
+
+/// No page takes a parameter; that there is no such page, or not with this method, comes first.
+async fn without_query(request: Request, next: Next) -> Response {
+    let Err(problem) = Query::parse(&[], request.uri().query()) else {
+        return next.run(request).await;
+    };
+    let visit = request.extensions().get::<Visit>().cloned();
+    let response = next.run(request).await;
+    let missed = [StatusCode::NOT_FOUND, StatusCode::METHOD_NOT_ALLOWED];
+    let (Some(visit), false) = (visit, missed.contains(&response.status())) else {
+        return response;
+    };
+    let operation = response
+        .extensions()
+        .get::<Served>()
+        .and_then(|served| served.operation);
+    let mut refused = reply::problem(&problem, &visit.path, &visit.request_id);
+    note(&mut refused, |served| served.operation = operation);
+    refused
 }
 
 async fn wrong_method(request: Request) -> Response {

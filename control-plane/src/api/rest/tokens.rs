@@ -9,7 +9,7 @@ use serde_json::Value;
 use super::fields::Fields;
 use super::operation::Call;
 use super::reply;
-use crate::api::json;
+use crate::api::{DEFAULT_TOKEN_LIFE_S, json};
 use crate::auth::Role;
 use crate::core::{Page, TokenRequest};
 
@@ -17,8 +17,6 @@ use crate::core::{Page, TokenRequest};
 pub(super) const MAX_SUBJECT: usize = 256;
 /// Longest life of a token, in seconds: a year.
 pub(super) const MAX_LIFE_S: u64 = 31_536_000;
-/// Life of a token that does not ask for another one, in seconds: a day.
-pub(super) const DEFAULT_LIFE_S: u64 = 86_400;
 
 /// `GET /tokens`
 pub(super) async fn list(call: &Call) -> Result<Response, Problem> {
@@ -55,7 +53,7 @@ fn request(body: &Value) -> Result<TokenRequest, Problem> {
     let subject = fields.text("subject", MAX_SUBJECT);
     let roles = fields.words("roles", &known);
     let layer = fields.optional_text("layer", 63);
-    let expires_in_s = fields.number("expires_in_s", 1, MAX_LIFE_S, DEFAULT_LIFE_S);
+    let expires_in_s = fields.number("expires_in_s", 1, MAX_LIFE_S, DEFAULT_TOKEN_LIFE_S.into());
     if let Some(layer) = &layer
         && let Err(error) = layer.parse::<LayerName>()
     {
@@ -85,7 +83,7 @@ mod tests {
             ("ops", None, 60)
         );
         let short = request(&json!({ "subject": "ops", "roles": ["viewer"] })).unwrap();
-        assert_eq!(u64::from(short.expires_in_s), DEFAULT_LIFE_S);
+        assert_eq!(short.expires_in_s, DEFAULT_TOKEN_LIFE_S);
         for (body, pointer) in [
             (json!({ "subject": "", "roles": ["viewer"] }), "/subject"),
             (json!({ "subject": "ops", "roles": ["root"] }), "/roles/0"),

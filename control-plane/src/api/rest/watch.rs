@@ -27,7 +27,7 @@ use super::query::Param;
 use super::reply;
 use crate::api::json as answers;
 use crate::api::limits::WatchSlot;
-use crate::core::{ListQuery, ReadOptions, WatchItem, WatchQuery};
+use crate::core::{WatchItem, WatchQuery};
 use crate::metrics::OpenWatch;
 
 /// Tells reverse proxies to hand on every event at once.
@@ -45,10 +45,7 @@ pub(super) async fn open(call: &Call) -> Result<Response, Problem> {
     let query = query(call)?;
     let read = call.query.read_options()?;
     let slot = call.rest().options.limits.open_watch(&call.caller.claims.subject)?;
-    if read.min_revision.is_some() {
-        wait(call, &read).await?;
-    }
-    let answer = call.service().watch(&call.caller, &query).await?;
+    let answer = call.service().watch_with(&call.caller, &query, &read).await?;
     let events = Events {
         items: answer.value,
         visit: call.visit.clone(),
@@ -86,16 +83,6 @@ fn query(call: &Call) -> Result<WatchQuery, Problem> {
         label_selector: query.text(Param::LabelSelector).map(str::to_owned),
         timeout_s: timeout_s.and_then(|seconds| u32::try_from(seconds).ok()),
     })
-}
-
-/// `min_revision` of a watch: what begins now begins at that revision or later.
-async fn wait(call: &Call, read: &ReadOptions) -> Result<(), Problem> {
-    let nothing = ListQuery {
-        kind: Some(Kind::Layer),
-        limit: Some(1),
-        ..ListQuery::default()
-    };
-    call.service().list(&call.caller, &nothing, read).await.map(drop)
 }
 
 /// The bytes of one watch.

@@ -159,7 +159,7 @@ impl ConfigService {
         let state = self.read_state(read).await?;
         view(&caller.claims).check_key(&state, key)?;
         if let Some(revision) = read.at_revision {
-            let version = self.version_at(&state, key, revision).await?;
+            let version = self.seen_version(caller, &state, key, revision).await?;
             let document = self.shown(caller, &version.change.document, read.reveal).await?;
             return Ok(answer(&state, document));
         }
@@ -169,6 +169,22 @@ impl ConfigService {
             false => Arc::clone(&held.shown),
         };
         Ok(answer(&state, document))
+    }
+
+    /// The same, refused where what it held then is outside of the token's view.
+    pub(super) async fn seen_version(
+        &self,
+        caller: &Caller,
+        state: &State,
+        key: &Key,
+        revision: u64,
+    ) -> Result<Version, Problem> {
+        let version = self.version_at(state, key, revision).await?;
+        let view = view(&caller.claims);
+        match view.sees_document(state, &version.change.document) {
+            true => Ok(version),
+            false => Err(view.outside(&format!("{key} at revision {revision}"))),
+        }
     }
 
     /// The version of a document that held at a revision.
@@ -313,6 +329,7 @@ impl ConfigService {
             Some(revision) => self.state_at(&now, revision).await?,
             None => now,
         };
+        let state = without_foreign_instance(caller, state, asked);
         let at = self.resolve(caller, &state, asked)?;
         let sources = Sources::at(&state, &at);
         if read.reveal {
@@ -351,13 +368,6 @@ impl ConfigService {
         }
         if asked.service.is_none() && asked.node.is_none() && asked.layer.is_none() {
             return invalid("say for which service, node or layer");
-        }
-        if let (Some(service), Some(instance)) = (&asked.service, &asked.instance) {
-            // An instance without a document is nobody's; one with a document elsewhere is outside of the view.
-            let key = Key::instance(service.clone(), DocumentName::from(instance));
-            if state.get(&key).is_some() {
-                view.check_key(state, &key)?;
-            }
         }
         let mut at = At {
             service: asked.service.clone(),
@@ -422,9 +432,10 @@ impl ConfigService {
         view(&caller.claims).check_key(&state, key)?;
         let below = position.as_ref().and_then(|position| position.after.parse().ok());
         let shown_at = position.map_or(state.revision(), |position| position.revision);
-        let (versions, more) = self
-            .versions_below(key, below.unwrap_or(shown_at + 1), limit, full)
-            .await?;
+        let below = below.unwrap_or(shown_at.saturating_add(1));
+        let own = view(&caller.claims);
+        let is_seen = |document: &Document| own.sees_document(&state, document);
+        let (versions, more) = self.versions_below(key, below, limit, full, is_seen).await?;
         if versions.is_empty() && page_token.is_empty() && state.get(key).is_none() {
             return Err(not_found(key, &state));
         }
@@ -451,13 +462,15 @@ impl ConfigService {
     }
 
     /// Versions of a document before a revision, newest first, and whether there are more: up to `limit`, and with the
-    /// documents (`full`) a page's bytes of them. Without `full` a version comes without what its document holds.
+    /// documents (`full`) a page's bytes of them. Without `full` a version comes without what its document holds. What is
+    /// not seen is passed over, as if it had not been.
     async fn versions_below(
         &self,
         key: &Key,
         mut below: u64,
         limit: usize,
         full: bool,
+        is_seen: impl Fn(&Document) -> bool,
     ) -> Result<(Vec<Version>, bool), Problem> {
         let mut found: Vec<Version> = Vec::new();
         let mut bytes = 0;
@@ -466,6 +479,10 @@ impl ConfigService {
             let some = some.map_err(|error| unavailable(&error))?;
             let all = some.len() < VERSIONS_AT_ONCE;
             for mut version in some {
+                if !is_seen(&version.change.document) {
+                    below = version.revision;
+                    continue;
+                }
                 if found.len() == limit || bytes >= PAGE_BYTES {
                     return Ok((found, true));
                 }
@@ -498,7 +515,7 @@ impl ConfigService {
         let state = self.read_state(read).await?;
         view(&caller.claims).check_key(&state, key)?;
         let to = to.unwrap_or_else(|| state.revision());
-        let side = async |revision: u64| match self.version_at(&state, key, revision).await {
+        let side = async |revision: u64| match self.seen_version(caller, &state, key, revision).await {
             Ok(version) => Ok(Some(redacted(&version.change.document))),
             Err(problem) if problem.code == Code::NotFound => Ok(None),
             Err(problem) => Err(problem),
@@ -522,6 +539,19 @@ impl ConfigService {
     /// # Errors
     /// [`Code::RevisionTrimmed`], [`Code::RevisionUnknown`]: list, then watch. Other [`Problem`]s.
     pub async fn watch(&self, caller: &Caller, query: &WatchQuery) -> Result<Answer<WatchStream>, Problem> {
+        self.watch_with(caller, query, &ReadOptions::default()).await
+    }
+
+    /// The same, with `cached` also without the database, and from `min_revision` on.
+    ///
+    /// # Errors
+    /// As [`Self::watch`].
+    pub async fn watch_with(
+        &self,
+        caller: &Caller,
+        query: &WatchQuery,
+        read: &ReadOptions,
+    ) -> Result<Answer<WatchStream>, Problem> {
         self.authorize(&caller.claims, Right::Read)?;
         if query.timeout_s.is_some_and(|timeout| !(1..=3600).contains(&timeout)) {
             return Err(Problem::new(Code::InvalidRequest, "timeout_s: 1 to 3600 are allowed"));
@@ -530,7 +560,7 @@ impl ConfigService {
         if let Some(layer) = &query.layer {
             view(&caller.claims).check_layer(layer)?;
         }
-        let state = self.read_state(&ReadOptions::default()).await?;
+        let state = self.read_state(read).await?;
         let since = query.since.unwrap_or_else(|| state.revision());
         if since > state.revision() {
             self.wait_for(since).await?;
@@ -601,6 +631,22 @@ impl ConfigService {
         let value = json!({ "revision": state.revision(), "digest": digest(&state, layer) });
         Ok(answer(&state, value))
     }
+}
+
+/// An instance with a document elsewhere is, to a bound token, what one without a document is: it must not be told from a
+/// name that nobody uses.
+fn without_foreign_instance(caller: &Caller, mut state: State, asked: &Place) -> State {
+    if let (Some(service), Some(instance)) = (&asked.service, &asked.instance) {
+        let key = Key::instance(service.clone(), DocumentName::from(instance));
+        let view = view(&caller.claims);
+        if state
+            .get(&key)
+            .is_some_and(|held| !view.sees_document(&state, &held.document))
+        {
+            state.remove(&key);
+        }
+    }
+    state
 }
 
 /// Digest of a layer's view.

@@ -20,6 +20,8 @@ const DENIALS_PER_S: u32 = 10;
 const MAX_ADDRESSES: usize = 4096;
 /// Longest life of a token, in seconds: a year.
 const MAX_EXPIRES_S: u32 = 31_536_000;
+/// A revoked token is remembered so long after it has run out, in milliseconds: clocks differ.
+const REVOKED_FOR_MS: i64 = 2 * blaze_auth::LEEWAY_S * 1000;
 /// Entries of a page of the audit.
 const PAGE: usize = 100;
 /// The same, at most.
@@ -258,7 +260,9 @@ impl ConfigService {
 
     /// Reads which tokens are revoked.
     pub(super) async fn refresh_tokens(&self) -> Result<(), StoreError> {
-        let tokens = self.inner.store.tokens(now()).await?;
+        // A token is accepted for a while after it has run out, for clocks differ.
+        let since = Timestamp::from_millis(now().as_millis() - REVOKED_FOR_MS);
+        let tokens = self.inner.store.tokens(since).await?;
         let revoked = tokens.into_iter().filter(|token| token.revoke_time.is_some());
         let entries = revoked.map(|token| (token.id, token.expire_time.as_millis() / 1000));
         self.inner.revocations.learn(entries, now().as_millis() / 1000);
@@ -293,4 +297,64 @@ fn check_token(request: &TokenRequest) -> Result<(), Problem> {
             .find(|member| detail.starts_with(member));
         invalid(&format!("/{}", pointer.unwrap_or("roles")), detail)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use blaze_runtime::Supervisor;
+
+    use super::*;
+    use crate::core::testing;
+    use crate::store::{SqliteStore, Store, TokenStore};
+
+    #[tokio::test]
+    async fn a_revoked_token_that_has_just_run_out_stays_revoked_after_a_restart() {
+        let supervisor = Supervisor::new("test");
+        let store = Arc::new(SqliteStore::in_memory(&supervisor).await.unwrap());
+        let entry = AuditEntry {
+            id: "a".to_owned(),
+            time: now(),
+            revision: None,
+            subject: "ops".to_owned(),
+            roles: Vec::new(),
+            action: "token_create".to_owned(),
+            key: None,
+            allowed: true,
+            code: None,
+            paths: Vec::new(),
+            request_id: "r".to_owned(),
+            address: "127.0.0.1".to_owned(),
+            detail: None,
+        };
+        let ago = |seconds: i64| Timestamp::from_millis(now().as_millis() - seconds * 1000);
+        for (id, expire_time) in [("late", ago(10)), ("old", ago(100))] {
+            let token = TokenRecord {
+                id: id.to_owned(),
+                subject: "ops".to_owned(),
+                roles: vec!["viewer".to_owned()],
+                layer: None,
+                create_time: ago(1000),
+                expire_time,
+                revoke_time: None,
+            };
+            let made = AuditEntry {
+                id: format!("a-{id}"),
+                ..entry.clone()
+            };
+            store.add_token(&token, &made).await.unwrap();
+            let again = AuditEntry {
+                id: format!("b-{id}"),
+                ..entry.clone()
+            };
+            assert!(store.revoke_token(id, ago(500), &again).await.unwrap());
+        }
+        let shared = Arc::clone(&store) as Arc<dyn Store>;
+        let service = testing::service_on(&supervisor, shared, &[("e1", [7; 32])])
+            .await
+            .unwrap();
+        let revocations = &service.inner.revocations;
+        assert!(revocations.is_revoked("late") && !revocations.is_revoked("old"));
+    }
 }

@@ -3,12 +3,13 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use blaze_domain::DocumentName;
 use blaze_domain::config::{Applied, Code, FieldFault, Key, Kind, Problem};
+use blaze_domain::{DocumentName, LayerName};
 use serde_json::{Value, json};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::oneshot;
 
+use super::super::affected::MAX_CANDIDATES;
 use super::super::committer::{Finished, Once, QUEUE_BYTES, Queued, Running, now, outcome_unknown, unavailable};
 use super::super::evaluate::{Content, Form, Item, Prune, Request};
 use super::super::report::{AnswerKind, Done, report_from, written_from};
@@ -19,7 +20,7 @@ use super::super::view::{authorize_whole, view};
 use super::super::watch::trimmed;
 use super::{ConfigService, selector};
 use crate::auth::Right;
-use crate::store::Op;
+use crate::store::{Change, Op};
 
 /// Documents of one `apply`, at most.
 const MAX_ITEMS: usize = 1000;
@@ -147,11 +148,16 @@ impl ConfigService {
         bytes: usize,
     ) -> Result<Answer<ApplyReport>, Problem> {
         match self.submit(request, AnswerKind::Report, idempotency, bytes).await? {
-            Finished::Done(done) => Ok(Answer {
-                revision: done.revision,
-                replayed: false,
-                value: done.report(false),
-            }),
+            Finished::Done(done) => {
+                let revision = done.revision;
+                // Whom it affects may take long to find out.
+                let report = tokio::task::spawn_blocking(move || done.report(false)).await;
+                Ok(Answer {
+                    revision,
+                    replayed: false,
+                    value: report.map_err(|_| internal("the report of a write"))?,
+                })
+            }
             Finished::Before(revision, text) => Ok(Answer {
                 revision,
                 replayed: true,
@@ -292,28 +298,45 @@ impl ConfigService {
         let mut request = request(caller, "apply", Form::Many, items.collect());
         request.prune = prune;
         if asked.dry_run {
-            return self.dry_run(request).await;
+            return self.dry_run(request, bytes).await;
         }
         self.write_many(request, idempotency, bytes).await
     }
 
     /// The same checks, and nothing is written.
-    async fn dry_run(&self, request: Request) -> Result<Answer<ApplyReport>, Problem> {
+    async fn dry_run(&self, request: Request, bytes: usize) -> Result<Answer<ApplyReport>, Problem> {
+        let overloaded =
+            || Problem::new(Code::Overloaded, "too many dry runs wait for each other; try again").retry_after(1);
+        let _waiting = self.inner.dry_waiting.try_acquire().map_err(|_| overloaded())?;
+        let bytes = u32::try_from((bytes + REQUEST_BYTES).min(QUEUE_BYTES)).unwrap_or(u32::MAX);
+        let room = Arc::clone(&self.inner.room).try_acquire_many_owned(bytes);
+        let room = room.map_err(|_| overloaded())?;
+        let running = Arc::clone(&self.inner.dry_running).acquire_owned().await;
+        let running = running.map_err(|_| overloaded())?;
         let before = self.read_state(&ReadOptions::default()).await?;
-        let revision = before.revision() + 1;
-        let evaluated = self.inner.evaluator.evaluate(&before, &request, revision, now())?;
-        let mut after = before.clone();
-        after.advance(revision, &evaluated.changes);
-        let done = Done {
-            revision: before.revision(),
-            before,
-            after,
-            evaluated,
+        let revision = before.revision();
+        let evaluator = Arc::clone(&self.inner.evaluator);
+        let work = move || {
+            // They are held as long as it runs, also when whoever asked has gone.
+            let _held = (room, running);
+            let evaluated = evaluator.evaluate(&before, &request, revision + 1, now())?;
+            let mut after = before.clone();
+            after.advance(revision + 1, &evaluated.changes);
+            let done = Done {
+                revision,
+                before,
+                after,
+                evaluated,
+                view: view(&request.caller.claims),
+                places: MAX_CANDIDATES,
+            };
+            Ok(done.report(true))
         };
+        let report = tokio::task::spawn_blocking(work).await;
         Ok(Answer {
-            revision: done.revision,
+            revision,
             replayed: false,
-            value: done.report(true),
+            value: report.map_err(|_| internal("the report of a dry run").applied(Applied::No))??,
         })
     }
 
@@ -332,7 +355,7 @@ impl ConfigService {
         self.authorize(&caller.claims, Right::Write)?;
         let state = self.read_state(&ReadOptions::default()).await?;
         self.check_view_of_existing(caller, key).await?;
-        let version = match self.version_at(&state, key, revision).await {
+        let version = match self.seen_version(caller, &state, key, revision).await {
             Err(problem) if problem.code == Code::RevisionUnknown => {
                 let detail = format!(
                     "there is no revision {revision} yet; the newest is {}",
@@ -389,15 +412,22 @@ impl ConfigService {
         let mut items = Vec::with_capacity(commit.changes.len());
         let mut unchanged_since = BTreeMap::new();
         let view = view(&caller.claims);
+        let is_roll_out = |change: &Change| change.document.key.kind() == Kind::Rollout;
+        let others = commit.changes.iter().any(|change| !is_roll_out(change));
         for change in &commit.changes {
             // Before anything is told of it: what a deleted document was counts too.
             if !view.sees_document(&state, &change.document) {
                 return Err(view.outside(&format!("commit {revision}")));
             }
             let key = change.document.key.clone();
+            // A roll-out goes on or has ended, whatever became of the documents beside it.
+            if others && is_roll_out(change) && change.previous.is_some() {
+                items.push(item(key, Content::Leave, Precondition::None));
+                continue;
+            }
             let before = match change.previous {
                 None => None,
-                Some(previous) => Some(self.version_at(&state, &key, previous).await?.change.document),
+                Some(previous) => Some(self.seen_version(caller, &state, &key, previous).await?.change.document),
             };
             if !force {
                 let now = if change.op == Op::Delete { 0 } else { revision };
@@ -503,7 +533,10 @@ fn own_revision(done: &Done) -> u64 {
 }
 
 fn once(caller: &Caller, idempotency: &Idempotency) -> Once {
-    let text = json!([caller.claims.subject, idempotency.path, idempotency.key]).to_string();
+    // What a token may is part of who asks: the answer that one got is not for another of the same subject.
+    let claims = &caller.claims;
+    let layer = claims.layer.as_ref().map(LayerName::as_str);
+    let text = json!([claims.subject, layer, claims.roles, idempotency.path, idempotency.key]).to_string();
     Once {
         id: hex(&Sha256::digest(text.as_bytes())),
         body: hex(&idempotency.body),

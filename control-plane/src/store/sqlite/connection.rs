@@ -21,9 +21,9 @@ const LOG_BYTES: i64 = 64 * 1024 * 1024;
 /// The path without links and relative parts, so that one file has one lock.
 ///
 /// # Errors
-/// [`StoreError::Unavailable`] if the folder is not there.
+/// As [`file_error`].
 pub(super) fn real_path(path: &Path) -> Result<PathBuf, StoreError> {
-    let failed = |error: std::io::Error| StoreError::Unavailable(format!("{}: {error}", path.display()));
+    let failed = |error: std::io::Error| file_error(path, "cannot be opened", &error);
     match path.canonicalize() {
         Ok(real) => Ok(real),
         Err(error) if error.kind() == ErrorKind::NotFound => {
@@ -38,16 +38,35 @@ pub(super) fn real_path(path: &Path) -> Result<PathBuf, StoreError> {
     }
 }
 
+/// What a file that cannot be opened means: [`StoreError::Refused`] where waiting does not help, as without its folder.
+pub(super) fn file_error(path: &Path, what: &str, error: &std::io::Error) -> StoreError {
+    let text = format!("{} {what}: {error}", path.display());
+    match error.kind() {
+        ErrorKind::NotFound => StoreError::Refused(format!(
+            "{text}: its folder must be there; make or mount it, or name another file in `control_plane.store.sqlite.path`"
+        )),
+        ErrorKind::PermissionDenied
+        | ErrorKind::NotADirectory
+        | ErrorKind::IsADirectory
+        | ErrorKind::ReadOnlyFilesystem
+        | ErrorKind::InvalidInput
+        | ErrorKind::InvalidFilename => StoreError::Refused(format!(
+            "{text}: this user must be able to write the file and its folder, or name another file in \
+             `control_plane.store.sqlite.path`"
+        )),
+        _ => StoreError::Unavailable(text),
+    }
+}
+
 /// The connection that writes. The file is made if it is not there, readable by its owner alone.
 ///
 /// # Errors
 /// [`StoreError::Refused`] for a file of another program, [`StoreError::Unavailable`], [`StoreError::Corrupt`].
 pub(super) fn open_writer(path: &Path) -> Result<Connection, StoreError> {
-    let failed =
-        |error: std::io::Error| StoreError::Unavailable(format!("{} cannot be written: {error}", path.display()));
     let mut options = OpenOptions::new();
     options.read(true).write(true).create(true).truncate(false).mode(0o600);
-    drop(options.open(path).map_err(failed)?);
+    let opened = options.open(path);
+    drop(opened.map_err(|error| file_error(path, "cannot be written", &error))?);
     let connection = open(path, OpenFlags::SQLITE_OPEN_READ_WRITE)?;
     check_owner(&connection, path)?;
     let mode: String = connection

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 
+use super::connection::file_error;
 use crate::store::StoreError;
 
 /// Held while it lives; the system lets go of it when the process ends, however that happens.
@@ -20,11 +21,10 @@ impl FileLock {
     /// Locks `<path>.lock`, and writes the process id into it for people.
     ///
     /// # Errors
-    /// [`StoreError::Refused`] if another process has it, [`StoreError::Unavailable`] if the folder cannot be written.
+    /// [`StoreError::Refused`] if another process has it, and as [`file_error`].
     pub(super) fn take(path: &Path) -> Result<Self, StoreError> {
         let lock = beside(path, "lock");
-        let failed =
-            |error: std::io::Error| StoreError::Unavailable(format!("{} cannot be written: {error}", lock.display()));
+        let failed = |error: std::io::Error| file_error(&lock, "cannot be written", &error);
         let mut options = OpenOptions::new();
         options.read(true).write(true).create(true).truncate(false).mode(0o600);
         let mut file = options.open(&lock).map_err(failed)?;

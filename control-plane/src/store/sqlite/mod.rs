@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! callers ──▶ writer thread: one transaction per group (BEGIN IMMEDIATE, write-ahead log, synchronous = FULL)
-//!        └──▶ reader thread: a connection of its own, never held up by the writer
+//!        ├──▶ reader thread: a connection of its own, never held up by the writer
+//!        └──▶ look-up thread: another one, for what takes no time and what others wait for, never held up by long reads
 //! <path>       the database        <path>.lock   held by the process that uses it
 //! ```
 //!
@@ -48,19 +49,27 @@ const STEP: usize = 200;
 /// A store in a file, or in memory. Dropped or closed, its threads end and the file is free for another process.
 pub struct SqliteStore {
     /// None in memory, where there is only one connection.
-    reader: Option<Worker>,
+    readers: Option<Readers>,
     /// Closed last: then it empties the write-ahead log.
     writer: Worker,
     path: Option<PathBuf>,
     supervisor: Supervisor,
 }
 
+/// The threads that read.
+struct Readers {
+    /// Whatever may take long.
+    long: Worker,
+    /// Single rows, which commits and health wait for.
+    short: Worker,
+}
+
 impl SqliteStore {
     /// Opens the file, makes it if it is not there, and migrates it.
     ///
     /// # Errors
-    /// [`StoreError::Refused`] if another process has it, or it is of a newer program or of another one;
-    /// [`StoreError::Unavailable`] if it cannot be read and written.
+    /// [`StoreError::Refused`] if another process has it, it is of a newer program or of another one, or its folder is
+    /// not there or not for this user; [`StoreError::Unavailable`] if it cannot be read and written.
     pub async fn open(path: &Path, supervisor: &Supervisor) -> Result<Self, StoreError> {
         Self::open_with(path, &Migrations::default(), supervisor).await
     }
@@ -74,9 +83,13 @@ impl SqliteStore {
         let lock = FileLock::take(&path)?;
         let writer = Worker::start("sqlite-writer", connection::open_writer(&path)?, Some(lock), supervisor)?;
         writer.run(connection::bootstrap).await??;
-        let reader = Worker::start("sqlite-reader", connection::open_reader(&path)?, None, supervisor)?;
+        let reader = |name: &str| Worker::start(name, connection::open_reader(&path)?, None, supervisor);
+        let readers = Readers {
+            long: reader("sqlite-reader")?,
+            short: reader("sqlite-look-up")?,
+        };
         let store = Self {
-            reader: Some(reader),
+            readers: Some(readers),
             writer,
             path: Some(path),
             supervisor: supervisor.clone(),
@@ -93,7 +106,7 @@ impl SqliteStore {
         let writer = Worker::start("sqlite-memory", connection::open_memory()?, None, supervisor)?;
         writer.run(connection::bootstrap).await??;
         let store = Self {
-            reader: None,
+            readers: None,
             writer,
             path: None,
             supervisor: supervisor.clone(),
@@ -146,7 +159,18 @@ impl SqliteStore {
         T: Send + 'static,
         F: FnOnce(&mut Connection) -> Result<T, StoreError> + Send + 'static,
     {
-        self.reader.as_ref().unwrap_or(&self.writer).run(job).await?
+        let reader = self.readers.as_ref().map_or(&self.writer, |readers| &readers.long);
+        reader.run(job).await?
+    }
+
+    /// As [`SqliteStore::read`], for a few rows that are found by a key.
+    async fn look_up<T, F>(&self, job: F) -> Result<T, StoreError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut Connection) -> Result<T, StoreError> + Send + 'static,
+    {
+        let reader = self.readers.as_ref().map_or(&self.writer, |readers| &readers.short);
+        reader.run(job).await?
     }
 
     async fn rewrite_texts(&self, texts: Texts, make: Rewriter<'_>) -> Result<u64, StoreError> {
@@ -203,7 +227,7 @@ impl CommitLog for SqliteStore {
     }
 
     async fn head(&self) -> Result<u64, StoreError> {
-        let head = self.read(|connection| connection::head(connection)).await?;
+        let head = self.look_up(|connection| connection::head(connection)).await?;
         super::encode::unsigned(head)
     }
 
@@ -282,7 +306,7 @@ impl Archive for SqliteStore {
 
     async fn idempotency(&self, id: &str, now: Timestamp) -> Result<Option<IdempotencyRecord>, StoreError> {
         let id = id.to_owned();
-        self.read(move |connection| archive::idempotency(connection, &id, now))
+        self.look_up(move |connection| archive::idempotency(connection, &id, now))
             .await
     }
 }
@@ -302,7 +326,8 @@ impl TokenStore for SqliteStore {
     }
 
     async fn tokens(&self, now: Timestamp) -> Result<Vec<TokenRecord>, StoreError> {
-        self.read(move |connection| archive::tokens(connection, now)).await
+        // What was revoked is asked for every few seconds.
+        self.look_up(move |connection| archive::tokens(connection, now)).await
     }
 }
 
@@ -325,8 +350,8 @@ impl Upkeep for SqliteStore {
     }
 
     async fn close(&self) {
-        if let Some(reader) = &self.reader {
-            reader.close().await;
+        if let Some(Readers { long, short }) = &self.readers {
+            tokio::join!(long.close(), short.close());
         }
         self.writer.close().await;
     }

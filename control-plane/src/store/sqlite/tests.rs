@@ -61,6 +61,50 @@ async fn a_second_opening_is_refused_until_the_first_is_closed() {
 }
 
 #[tokio::test]
+async fn a_long_read_holds_up_neither_commits_nor_health() {
+    let files = Files::new();
+    let store = files.store().await;
+    let (begin, began) = tokio::sync::oneshot::channel();
+    let (end, ended) = std::sync::mpsc::channel::<()>();
+    let long = store.read(move |_| {
+        begin.send(()).unwrap();
+        // Ends with the other side, whatever becomes of the test.
+        let _ = ended.recv();
+        Ok(())
+    });
+    let others = async {
+        began.await.unwrap();
+        assert_eq!(store.head().await.unwrap(), 0);
+        assert_eq!(store.idempotency("x", now()).await.unwrap(), None);
+        assert!(store.tokens(now()).await.unwrap().is_empty());
+        store.commit(&[record(commit(1, &["a"]))]).await.unwrap();
+        assert_eq!(store.head().await.unwrap(), 1);
+        drop(end);
+    };
+    let both = async { tokio::join!(long, others) };
+    let (long, ()) = tokio::time::timeout(std::time::Duration::from_secs(10), both)
+        .await
+        .unwrap();
+    long.unwrap();
+}
+
+#[tokio::test]
+async fn a_folder_that_is_not_there_is_refused_at_once() {
+    let files = Files::new();
+    for path in [
+        files.folder.path().join("missing").join("store.db"),
+        PathBuf::from("/dev/null/store.db"),
+    ] {
+        let error = SqliteStore::open(&path, &files.supervisor).await.err().unwrap();
+        assert!(
+            matches!(&error, StoreError::Refused(text) if text.contains("control_plane.store.sqlite.path")),
+            "{error}"
+        );
+        assert!(!error.is_transient());
+    }
+}
+
+#[tokio::test]
 async fn a_shutdown_ends_its_threads() {
     let files = Files::new();
     let store = files.store().await;

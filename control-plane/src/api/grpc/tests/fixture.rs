@@ -94,7 +94,7 @@ impl Fixture {
 
     /// A token that runs out after some seconds, or did so before.
     pub(super) fn token(&self, role: &str, expires_in_s: i64) -> String {
-        let now_s = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs() as i64;
+        let now_s = now_s();
         let roles = [role.to_owned()];
         let token = NewToken {
             subject: "ops",
@@ -133,6 +133,10 @@ impl Fixture {
             body: body.to_bytes(),
         }
     }
+}
+
+pub(super) fn now_s() -> i64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs() as i64
 }
 
 pub(super) struct Posted {

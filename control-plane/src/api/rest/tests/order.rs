@@ -122,10 +122,25 @@ async fn the_route_is_looked_at_in_its_order() {
         api.get("/api/v1/nodes?limit=0").await.code(),
         (400, "invalid_request".to_owned())
     );
-    assert_eq!(
-        api.call("OPTIONS", "/livez", &[], "").await.header("allow"),
-        "GET, HEAD"
-    );
+    for method in ["OPTIONS", "POST"] {
+        let reply = api.call(method, "/livez?x=1", &[], "").await;
+        assert_eq!((reply.status.as_u16(), reply.header("allow")), (405, "GET, HEAD"));
+    }
+    for page in [
+        "/livez",
+        "/readyz",
+        "/version",
+        "/openapi.json",
+        "/docs",
+        "/docs/errors/in_use",
+    ] {
+        for query in ["x=1", "verbose"] {
+            let reply = api.get(&format!("{page}?{query}")).await;
+            assert_eq!(reply.code(), (400, "unknown_parameter".to_owned()), "{page}?{query}");
+        }
+        assert_eq!(api.get(&format!("{page}?")).await.status, 200, "{page}");
+    }
+    assert_eq!(api.get("/docs/errors/none?x=1").await.status, 404);
 }
 
 #[tokio::test]
@@ -245,6 +260,63 @@ async fn in_development_other_hosts_are_refused() {
     assert_eq!(
         api.call("GET", "/api/v1/nodes", &foreign, "").await.code(),
         (403, "permission_denied".to_owned())
+    );
+}
+
+#[tokio::test]
+async fn a_request_with_two_hosts_is_refused_everywhere() {
+    let api = open().await;
+    for path in ["/livez", "/nothing", "/api/v1/nodes"] {
+        let reply = api.call("GET", path, &[("host", "localhost")], "").await;
+        assert_eq!(reply.code(), (400, "invalid_header".to_owned()), "{path}");
+    }
+}
+
+#[tokio::test]
+async fn slow_bodies_take_no_place_among_those_at_work() {
+    let limits = LimitsSection {
+        in_flight: 1,
+        ..NO_LIMITS
+    };
+    let api = open_with(&limits).await;
+    let send = |body: Body| {
+        let request = Request::builder()
+            .method("POST")
+            .uri("/api/v1/layers")
+            .header("host", "localhost")
+            .header("content-type", "application/json")
+            .body(body)
+            .unwrap();
+        Box::pin(api.router.clone().oneshot(request))
+    };
+    let never = || Body::from_stream(futures::stream::pending::<Result<Bytes, std::convert::Infallible>>());
+    let mut slow = [send(never()), send(never()), send(never())];
+    for one in &mut slow {
+        assert!(futures::FutureExt::now_or_never(one).is_none());
+    }
+    let made = send(Body::from(layer().to_string())).await.unwrap();
+    assert_eq!(made.status(), 201);
+}
+
+#[tokio::test]
+async fn a_body_that_never_comes_has_changed_nothing() {
+    let api = open().await;
+    tokio::time::pause();
+    let never = futures::stream::pending::<Result<Bytes, std::convert::Infallible>>();
+    let request = Request::builder()
+        .method("POST")
+        .uri("/api/v1/layers")
+        .header("host", "localhost")
+        .header("content-type", "application/json")
+        .body(Body::from_stream(never))
+        .unwrap();
+    let response = api.router.clone().oneshot(request).await.unwrap();
+    assert_eq!(response.status(), 504);
+    let body = response.into_body().collect().await.unwrap().to_bytes();
+    let problem: Value = serde_json::from_slice(&body).unwrap();
+    assert_eq!(
+        (&problem["code"], &problem["applied"]),
+        (&json!("deadline_exceeded"), &json!("no"))
     );
 }
 

@@ -3,9 +3,10 @@
 use serde_json::json;
 
 use super::super::super::documents::MAX_REASON;
-use super::super::super::tokens::{DEFAULT_LIFE_S, MAX_LIFE_S, MAX_SUBJECT};
+use super::super::super::tokens::{MAX_LIFE_S, MAX_SUBJECT};
 use super::super::shapes::{Shape, closed, flag, free, like, list, or_null, refer, said, text, whole, word};
 use super::{kinds, name, real_revision, revision};
+use crate::api::DEFAULT_TOKEN_LIFE_S;
 use crate::auth::Role;
 
 /// All of them.
@@ -91,7 +92,9 @@ fn token_request() -> Shape {
             ),
             (
                 "expires_in_s",
-                whole(1, MAX_LIFE_S as i64).default(Some(json!(DEFAULT_LIFE_S))).into(),
+                whole(1, MAX_LIFE_S as i64)
+                    .default(Some(json!(DEFAULT_TOKEN_LIFE_S)))
+                    .into(),
             ),
         ],
     );
