@@ -363,7 +363,7 @@ impl Evaluator {
             let key = &change.document.key;
             let referrers = refs::referrers(after, key, COUNTED);
             if !referrers.is_empty() {
-                let mut problem = in_use(key, &referrers, after, &view);
+                let mut problem = in_use(key, &referrers, [before, after], &view);
                 problem.revision = change.previous;
                 faults.conflict(index_of(key), problem);
             }
@@ -860,11 +860,13 @@ fn not_found(key: &Key) -> Problem {
     Problem::new(Code::NotFound, format!("there is no {key}"))
 }
 
-fn in_use(key: &Key, referrers: &[Key], state: &State, view: &View) -> Problem {
+/// Names referrers as far as the token sees them, before the change (where what they stand on is there) or after it.
+fn in_use(key: &Key, referrers: &[Key], states: [&State; 2], view: &View) -> Problem {
     let is_seen = |key: &&Key| {
-        state
-            .get(key)
-            .is_some_and(|held| view.sees_document(state, &held.document))
+        states.iter().any(|state| {
+            let held = state.get(key);
+            held.is_some_and(|held| view.sees_document(state, &held.document))
+        })
     };
     let seen = referrers.iter().filter(is_seen).take(NAMED);
     let mut named: Vec<String> = seen.map(ToString::to_string).collect();

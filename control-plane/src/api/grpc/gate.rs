@@ -320,15 +320,17 @@ mod tests {
                 "payload_too_large",
             ),
             (Status::internal("failed to decode Protobuf message"), "invalid_request"),
+            (Status::unimplemented(""), "method_not_allowed"),
+            (Status::from_error(Problem::new(Code::RateLimited, "").into()), "rate_limited"),
         ] {
             let mut response = status.into_http::<Body>();
             response.headers_mut().insert(REVISION, 7.into());
-            assert_eq!(explain(&mut response, "r1"), code);
+            assert_eq!(explain(&mut response, "r1", 1), code);
             let status = response.extensions().get::<Status>().unwrap();
             assert_eq!(status::code_of(status).unwrap().as_str(), code);
             assert_eq!(response.headers()[REVISION], "7");
         }
-        assert_eq!(explain(&mut Response::new(Body::empty()), "r1"), "ok");
+        assert_eq!(explain(&mut Response::new(Body::empty()), "r1", 1), "ok");
     }
 
     proptest! {
