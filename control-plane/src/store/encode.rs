@@ -83,9 +83,11 @@ fn encode_commit(record: &CommitRecord) -> Result<EncodedCommit, StoreError> {
     })
 }
 
-/// What each document is after all of these commits: its last version, which may be its deletion.
-pub(crate) fn last_versions(group: &[EncodedCommit]) -> BTreeMap<&str, &VersionRow> {
-    let versions = group.iter().flat_map(|commit| &commit.versions);
+/// What each document is after all of these changes, which ascend: its last version, which may be its deletion.
+pub(crate) fn last_versions<'a>(
+    versions: impl IntoIterator<Item = &'a VersionRow>,
+) -> BTreeMap<&'a str, &'a VersionRow> {
+    let versions = versions.into_iter();
     versions.map(|version| (version.key.as_str(), version)).collect()
 }
 
@@ -133,6 +135,15 @@ impl VersionRow {
     /// Whether the document is there after this change.
     pub(crate) fn is_deletion(&self) -> bool {
         self.op == Op::Delete.as_str()
+    }
+
+    /// The document as it is from this change on.
+    pub(crate) fn into_current(self) -> DocumentRow {
+        DocumentRow {
+            key: self.key,
+            revision: self.revision,
+            document: self.document,
+        }
     }
 
     pub(crate) fn into_version(self) -> Result<Version, StoreError> {

@@ -278,7 +278,7 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
 
 fn first() -> Migration {
     const SQL: &str = include_str!("../../migrations/0001_first.sql");
-    let commands: [(&'static str, &'static str); 10] = [
+    let commands: [(&'static str, &'static str); 11] = [
         (
             "events",
             include_str!("../../migrations/0001_first.mongodb/01_events.json"),
@@ -318,6 +318,10 @@ fn first() -> Migration {
         (
             "tokens-index",
             include_str!("../../migrations/0001_first.mongodb/10_tokens_index.json"),
+        ),
+        (
+            "events-index",
+            include_str!("../../migrations/0001_first.mongodb/11_events_index.json"),
         ),
     ];
     Migration {

@@ -272,7 +272,7 @@ pub trait CommitLog: Send + Sync + 'static {
     /// [`StoreError`].
     async fn commits_after(&self, revision: u64, limit: usize) -> Result<CommitBatch, StoreError>;
 
-    /// Writes commits with contiguous revisions in one transaction, durable before it returns. An unknown result is
+    /// Writes commits with contiguous revisions, all or none of them, durable before it returns. An unknown result is
     /// settled here, by the batch id, as long as the store can be read.
     ///
     /// # Errors
@@ -306,6 +306,14 @@ pub trait Archive: Send + Sync + 'static {
     /// # Errors
     /// [`StoreError`].
     async fn trim(&self, floor: u64, keep_versions: u32) -> Result<u64, StoreError>;
+
+    /// Does what can wait, in small parts. To be called about once a second; nothing but time is lost without.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    async fn tidy(&self) -> Result<(), StoreError> {
+        Ok(())
+    }
 
     /// The newest revision that is older than a time; 0 if there is none. For trimming by age.
     ///

@@ -21,6 +21,8 @@ const HEALTH: Duration = Duration::from_millis(700);
 const LOOK: Duration = Duration::from_millis(1200);
 /// Between two readings of revoked tokens: they are refused everywhere within five seconds.
 const TOKENS: Duration = Duration::from_secs(2);
+/// Between two tidyings of the store.
+const TIDY: Duration = Duration::from_secs(1);
 /// Pause of the follower after a failure, full jitter.
 const PAUSE: std::ops::Range<Duration> = Duration::from_millis(50)..Duration::from_millis(500);
 /// Refusals that are written to the audit together.
@@ -56,6 +58,7 @@ impl ConfigService {
         spawn("committer", Box::pin(parts.committer.run()));
         spawn("reads", Box::pin(self.clone().answer_looks(parts.looks)));
         spawn("trimming", Box::pin(self.clone().trim_periodically(parts.history)));
+        spawn("tidying", Box::pin(self.clone().tidy_periodically()));
         spawn("tokens", Box::pin(self.clone().refresh_periodically()));
         spawn("store health", Box::pin(self.clone().watch_health(parts.readiness)));
         spawn("audit of refusals", Box::pin(self.clone().write_denials(parts.denials)));
@@ -156,6 +159,17 @@ impl ConfigService {
             self.inner.store.trim(floor, history.keep_versions).await?;
         }
         Ok(())
+    }
+
+    async fn tidy_periodically(self) {
+        let mut ticks = interval(TIDY);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            ticks.tick().await;
+            if let Err(error) = self.inner.store.tidy().await {
+                tracing::debug!(%error, "the store was not tidied");
+            }
+        }
     }
 
     async fn refresh_periodically(self) {

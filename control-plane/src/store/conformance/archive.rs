@@ -6,7 +6,7 @@ use super::Fixture;
 use super::samples::{self, answer, audit, record, time, token};
 use super::tools::{Model, Outcome, commit, fresh, same, told};
 use crate::store::upkeep::now;
-use crate::store::{AuditEntry, AuditQuery, Op, TokenRecord};
+use crate::store::{AuditEntry, AuditQuery, FullStore, Op, TokenRecord};
 
 /// The history of a document is read newest first, in pages, also after its deletion, and never holds another one's.
 ///
@@ -158,20 +158,7 @@ pub async fn audit_is_filtered_and_paged(fixture: &dyn Fixture) -> Outcome {
         let expected: Vec<AuditEntry> = entries.iter().filter(|entry| holds(entry)).cloned().collect();
         same(&format!("{query:?}"), &found, &expected)?;
     }
-    let mut paged: Vec<AuditEntry> = Vec::new();
-    loop {
-        let query = AuditQuery {
-            below: paged.last().map(|entry| entry.id.clone()),
-            limit: 3,
-            ..AuditQuery::default()
-        };
-        let page = told("audit", store.audit(&query).await)?;
-        if page.is_empty() {
-            break;
-        }
-        paged.extend(page);
-    }
-    same("all pages", &paged, &entries)
+    same("all pages", &pages(store.as_ref(), 3).await?, &entries)
 }
 
 /// Not long ago, so that it is not taken for old.
@@ -213,6 +200,69 @@ pub async fn audit_written_twice_is_there_once(fixture: &dyn Fixture) -> Outcome
         ..AuditQuery::default()
     };
     same("entries", &told("audit", store.audit(&query).await)?.len(), &3)
+}
+
+/// Entries of commits and others are one audit, newest first by their ids, also where ids do not follow revisions, and
+/// whatever of it is trimmed.
+///
+/// # Errors
+/// How the store breaks the rule.
+pub async fn audit_of_commits_is_among_the_rest(fixture: &dyn Fixture) -> Outcome {
+    let mut model = Model::new(fixture, "merged").await?;
+    let mut all = Vec::new();
+    for number in 0..12_u64 {
+        let mut written = model.record(&["a"]);
+        // Two to each commit, which overlap with those of commits before and after.
+        written.audit = [number, number + 1].map(entry).to_vec();
+        for (place, entry) in (0..).zip(&mut written.audit) {
+            entry.revision = Some(number + 1);
+            entry.id = format!("{:08}-{number}-{place}", number * 7 % 30 + place * 4);
+        }
+        all.extend(written.audit.clone());
+        commit(model.store.as_ref(), &[written]).await?;
+        let apart = entry(number);
+        told(
+            "append_audit",
+            model.store.append_audit(std::slice::from_ref(&apart)).await,
+        )?;
+        all.push(apart);
+    }
+    all.sort_by(|one, other| other.id.cmp(&one.id));
+    for floor in [0, 5, 12] {
+        told("trim", model.store.trim(floor, 1).await)?;
+        told("tidy", model.store.tidy().await)?;
+        for limit in [1, 4, 100] {
+            let found = pages(model.store.as_ref(), limit).await?;
+            same(&format!("pages of {limit}, floor {floor}"), &found, &all)?;
+        }
+        let query = AuditQuery {
+            subject: Some("eve".to_owned()),
+            allowed: Some(true),
+            limit: 100,
+            ..AuditQuery::default()
+        };
+        let found = told("audit", model.store.audit(&query).await)?;
+        let expected = all.iter().filter(|entry| entry.subject == "eve" && entry.allowed);
+        same("entries of one subject", &found, &expected.cloned().collect())?;
+    }
+    Ok(())
+}
+
+/// All of the audit, in pages.
+async fn pages(store: &dyn FullStore, limit: usize) -> Outcome<Vec<AuditEntry>> {
+    let mut paged: Vec<AuditEntry> = Vec::new();
+    loop {
+        let query = AuditQuery {
+            below: paged.last().map(|entry| entry.id.clone()),
+            limit,
+            ..AuditQuery::default()
+        };
+        let page = told("audit", store.audit(&query).await)?;
+        if page.is_empty() {
+            return Ok(paged);
+        }
+        paged.extend(page);
+    }
 }
 
 /// An answer is found until its time, and not after it, even while it is still stored.

@@ -195,3 +195,84 @@ pub async fn commits_come_in_order_and_in_parts(fixture: &dyn Fixture) -> Outcom
         count => Err(format!("{count} commits of 250 KiB in one read")),
     }
 }
+
+/// A commit may be larger than a database likes: it is whole all the same, alone and among others, in the log, in history
+/// and after trimming.
+///
+/// # Errors
+/// How the store breaks the rule.
+pub async fn commits_are_whole_whatever_their_size(fixture: &dyn Fixture) -> Outcome {
+    let store = fresh(fixture, "huge").await?;
+    let mut commits = Vec::new();
+    for (revision, documents) in [(1, 70), (2, 1), (3, 30), (4, 30)] {
+        let changes = (0..documents).map(|number| large_change(number, revision));
+        let mut large = commit_of(revision, changes.collect());
+        if revision > 1 {
+            // Those after the first one are one group.
+            "group".clone_into(&mut large.batch);
+        }
+        commits.push(large);
+    }
+    let records: Vec<_> = commits.iter().cloned().map(record).collect();
+    let (first, rest) = records.split_at(1);
+    commit(store.as_ref(), first).await?;
+    commit(store.as_ref(), rest).await?;
+    for round in 0..2 {
+        let found = log(store.as_ref(), 0).await?;
+        if found != commits {
+            return Err(format!("commits differ from what was written, round {round}"));
+        }
+        let snapshot = told("load", store.load().await)?;
+        same("documents", &snapshot.documents.len(), &70)?;
+        for document in &snapshot.documents {
+            let changes = commits.iter().flat_map(|commit| &commit.changes).rev();
+            let mut last = changes.map(|change| &change.document);
+            let last = last.find(|last| last.key == document.key);
+            if last.map(AsRef::as_ref) != Some(document) {
+                return Err(format!("{} differs from what was written, round {round}", document.key));
+            }
+        }
+        for (name, expected) in [("n69", 1), ("n29", 3), ("n0", 4)] {
+            let history = told("versions", store.versions(&samples::key(name), None, 9).await)?;
+            same(&format!("versions of {name}"), &history.len(), &expected)?;
+        }
+        let before = told("documents_at", store.documents_at(2, 4).await)?;
+        let old = before.iter().filter_map(|(_, document)| document.as_ref());
+        let revisions: Vec<u64> = old.map(|document| document.revision).collect();
+        same("documents that were there at 2", &revisions.len(), &30)?;
+        same(
+            "the one of 2",
+            &revisions.iter().filter(|revision| **revision == 2).count(),
+            &1,
+        )?;
+        told("tidy", store.tidy().await)?;
+    }
+    same("the floor", &told("trim", store.trim(3, 1).await)?, &3)?;
+    same("documents", &told("load", store.load().await)?.documents.len(), &70)?;
+    same("commits", &log(store.as_ref(), 3).await?.len(), &1)?;
+    let before = told("documents_at", store.documents_at(3, 4).await)?;
+    same(
+        "documents that were there at 3",
+        &before.iter().filter(|(_, old)| old.is_some()).count(),
+        &30,
+    )?;
+    let history = told("versions", store.versions(&samples::key("n69"), None, 9).await)?;
+    same("versions of the last document", &history.len(), &1)
+}
+
+/// Of documents n0, n1, …, which are all in commit 1; n0 is in 2, and others are in 3 and 4.
+fn large_change(number: u32, revision: u64) -> crate::store::Change {
+    let name = format!("n{number}");
+    let mut large = samples::node(&name, revision);
+    let text = ["", "a", "b", "c", "d"][usize::try_from(revision % 5).unwrap_or(0)];
+    large.spec = std::sync::Arc::new(serde_json::json!({ "config": { "text": text.repeat(250 * 1024) } }));
+    let before = match (revision, number) {
+        (1, _) => None,
+        (3, 0) => Some(2),
+        (2 | 3, _) => Some(1),
+        _ => Some(3),
+    };
+    let mut change = samples::change(Op::Update, &name, revision, before);
+    change.document = std::sync::Arc::new(large);
+    change
+}

@@ -23,12 +23,13 @@ use async_trait::async_trait;
 use crate::store::FullStore;
 
 pub use archive::{
-    answers_are_kept_until_they_expire, audit_is_filtered_and_paged, audit_written_twice_is_there_once,
-    revisions_before_a_time_are_found, tokens_are_kept_and_revoked, versions_come_newest_first,
+    answers_are_kept_until_they_expire, audit_is_filtered_and_paged, audit_of_commits_is_among_the_rest,
+    audit_written_twice_is_there_once, revisions_before_a_time_are_found, tokens_are_kept_and_revoked,
+    versions_come_newest_first,
 };
 pub use commits::{
     a_group_is_written_whole, a_taken_answer_is_a_conflict, a_taken_revision_is_a_conflict, an_empty_store_is_at_zero,
-    commits_come_in_order_and_in_parts, what_was_written_is_read_back,
+    commits_are_whole_whatever_their_size, commits_come_in_order_and_in_parts, what_was_written_is_read_back,
 };
 pub use many::{
     a_foreign_commit_is_noticed, a_store_that_is_reopened_is_the_same, one_of_two_writers_has_each_revision,
@@ -36,7 +37,7 @@ pub use many::{
 };
 pub use trimming::{
     a_writer_that_slept_through_a_trim_is_refused, every_revision_from_the_floor_on_can_be_told,
-    the_floor_rises_and_commits_go, versions_that_hold_or_are_young_stay,
+    the_floor_rises_and_commits_go, versions_that_hold_or_are_young_stay, what_outlives_a_commit_stays,
 };
 pub use upkeep::{a_backup_is_restored_elsewhere, a_closed_store_is_unavailable, documents_are_rewritten_in_place};
 
@@ -104,14 +105,17 @@ rules!(
     a_taken_revision_is_a_conflict,
     a_taken_answer_is_a_conflict,
     commits_come_in_order_and_in_parts,
+    commits_are_whole_whatever_their_size,
     versions_come_newest_first,
     revisions_before_a_time_are_found,
     audit_is_filtered_and_paged,
     audit_written_twice_is_there_once,
+    audit_of_commits_is_among_the_rest,
     answers_are_kept_until_they_expire,
     tokens_are_kept_and_revoked,
     the_floor_rises_and_commits_go,
     versions_that_hold_or_are_young_stay,
+    what_outlives_a_commit_stays,
     every_revision_from_the_floor_on_can_be_told,
     a_writer_that_slept_through_a_trim_is_refused,
     a_store_that_is_reopened_is_the_same,

@@ -2,7 +2,9 @@
 
 use super::Fixture;
 use super::samples::{self, record};
-use super::tools::{Dice, Model, Outcome, conflict, log, same, told};
+use super::tools::{Dice, Model, Outcome, commit, conflict, log, same, told};
+use crate::store::AuditQuery;
+use crate::store::upkeep::now;
 
 /// The floor rises to what is asked for, never falls, and never passes the newest commit; commits up to it are gone;
 /// revisions go on.
@@ -95,6 +97,44 @@ pub async fn versions_that_hold_or_are_young_stay(fixture: &dyn Fixture) -> Outc
         model.check_now().await?;
     }
     Ok(())
+}
+
+/// Audit entries and answers to repeat are there once each, however often their commits are trimmed away; a key that is
+/// taken stays taken.
+///
+/// # Errors
+/// How the store breaks the rule.
+pub async fn what_outlives_a_commit_stays(fixture: &dyn Fixture) -> Outcome {
+    let mut model = Model::new(fixture, "outlives").await?;
+    let mut written = Vec::new();
+    for number in 0..6 {
+        let mut next = model.record(&["a", "b"]);
+        next.idempotency = Some(samples::answer(&format!("answer-{number}"), model.revision()));
+        commit(model.store.as_ref(), &[next.clone()]).await?;
+        written.push(next);
+    }
+    for floor in [0, 2, 2, 5, 6] {
+        told("trim", model.store.trim(floor, 1).await)?;
+        told("tidy", model.store.tidy().await)?;
+        let query = AuditQuery {
+            limit: 100,
+            ..AuditQuery::default()
+        };
+        let audit = told("audit", model.store.audit(&query).await)?;
+        let mut expected: Vec<_> = written.iter().flat_map(|record| record.audit.clone()).collect();
+        expected.sort_by(|one, other| other.id.cmp(&one.id));
+        same(&format!("the audit, trimmed to {floor}"), &audit, &expected)?;
+        for record in &written {
+            let expected = record.idempotency.clone();
+            let id = expected.as_ref().map_or("", |answer| answer.id.as_str());
+            let found = told("idempotency", model.store.idempotency(id, now()).await)?;
+            same(&format!("an answer, trimmed to {floor}"), &found, &expected)?;
+        }
+        let mut again = record(samples::commit(7, &["late"]));
+        again.idempotency = Some(samples::answer("answer-1", 7));
+        conflict("an answer that is there", model.store.commit(&[again]).await)?;
+    }
+    model.check_now().await
 }
 
 /// Whatever is written and trimmed, what was at each revision from the floor on can be told, exactly.

@@ -1,24 +1,28 @@
 //! What was, and what is written beside commits.
 
-use std::collections::BTreeMap;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
 
 use blaze_domain::config::{Document as Config, Key, Timestamp};
-use futures::FutureExt as _;
+use futures::{FutureExt as _, TryStreamExt as _};
 use mongodb::bson::{DateTime, Document, doc};
-use mongodb::options::ReturnDocument;
 
-use super::client::{QUICK, USUAL, limited};
-use super::errors::is_duplicate;
-use super::rows::{self, FLOOR};
+use super::client::{QUICK, USUAL, limited, limited_steps};
+use super::errors::{is_duplicate, store_error};
+use super::rows;
+use super::statements::RECORD_COMMITS;
 use super::{MongoStore, collect};
 use crate::store::encode::{corrupt, document, signed, unsigned};
-use crate::store::rows::{AuditRow, TokenRow};
-use crate::store::{AuditEntry, AuditQuery, IdempotencyRecord, StoreError, TokenRecord, Version};
+use crate::store::rows::{AuditRow, IdempotencyRow, TokenRow, VersionRow};
+use crate::store::upkeep::now;
+use crate::store::{AUDIT_KEPT_MS, AuditEntry, AuditQuery, IdempotencyRecord, StoreError, TokenRecord, Version};
 
 /// Documents that one query names.
 const NAMED: usize = 500;
 
 impl MongoStore {
+    /// From the log, and below the floor from what trimming has kept. First the log, then the floor, then what was kept: it is
+    /// kept before the floor rises, and the log is cut after that.
     pub(super) async fn read_versions(
         &self,
         key: &Key,
@@ -28,14 +32,33 @@ impl MongoStore {
         if limit == 0 {
             return Ok(Vec::new());
         }
-        let filter = rows::versions_below(&key.to_string(), below.map_or(i64::MAX, signed));
+        let (key, below) = (key.to_string(), below.map_or(i64::MAX, signed));
+        let matching = doc! { "docs.key": &key, "_id": { "$lt": below } };
         let find = self
             .tables
-            .versions
-            .find(filter)
+            .events
+            .find(matching)
             .sort(doc! { "_id": -1 })
             .limit(limit_of(limit));
-        collect(find, |found| rows::read_version(found)?.into_version()).await
+        let find = find.projection(only_of(&doc! { "$eq": ["$$doc.key", &key] }));
+        let records = collect(find, rows::read_record).await?;
+        let floor = signed(self.read_floor().await?);
+        let kept = rows::versions_below(&key, below);
+        let kept = self
+            .tables
+            .versions
+            .find(kept)
+            .sort(doc! { "_id": -1 })
+            .limit(limit_of(limit));
+        let kept = collect(kept, rows::read_version).await?;
+        let logged = records.into_iter().flat_map(|record| record.versions);
+        let logged = logged.filter(|row| row.revision > floor && row.revision < below);
+        let newest: BTreeMap<Reverse<i64>, VersionRow> = kept
+            .into_iter()
+            .chain(logged)
+            .map(|row| (Reverse(row.revision), row))
+            .collect();
+        newest.into_values().take(limit).map(VersionRow::into_version).collect()
     }
 
     pub(super) async fn read_documents_at(
@@ -44,35 +67,26 @@ impl MongoStore {
         until: u64,
     ) -> Result<Vec<(Key, Option<Config>)>, StoreError> {
         // The first change after the revision says which version was there before it.
-        let range = doc! { "revision": { "$gt": signed(revision), "$lte": signed(until) } };
-        let fields = doc! { "_id": 1, "previous": 1 };
-        let find = self
-            .tables
-            .versions
-            .find(range)
-            .sort(doc! { "revision": 1 })
-            .projection(fields);
-        let changes = collect(find, |found| {
-            let id = rows::text(found, "_id")?;
-            let key = rows::split_version_id(&id)?.0.to_owned();
-            Ok((key, rows::integer(found, "previous").ok()))
-        })
-        .await?;
-        let mut first: BTreeMap<String, Option<i64>> = BTreeMap::new();
-        for (key, previous) in changes {
-            first.entry(key).or_insert(previous);
+        let (after, until) = (signed(revision), signed(until));
+        let mut first: BTreeMap<String, (i64, Option<i64>)> = BTreeMap::new();
+        for (key, changed, previous) in self.changes_between(after, until).await? {
+            let place = first.entry(key).or_insert((changed, previous));
+            if changed < place.0 {
+                *place = (changed, previous);
+            }
         }
-        let wanted = first
+        let wanted: BTreeMap<&str, i64> = first
             .iter()
-            .filter_map(|(key, previous)| Some(rows::version_id(key, (*previous)?)));
-        let before = self.read_texts(wanted.collect()).await?;
+            .filter_map(|(key, (_, previous))| Some((key.as_str(), (*previous)?)))
+            .collect();
+        let before = self.read_texts(&wanted).await?;
         let floor = self.read_floor().await?;
         let mut documents = Vec::new();
-        for (text, previous) in first {
+        for (text, (_, previous)) in &first {
             let key: Key = text
                 .parse()
                 .map_err(|error| corrupt(format_args!("a version: {error}")))?;
-            let found = previous.and_then(|previous| before.get(&rows::version_id(&text, previous)));
+            let found = previous.and_then(|_| before.get(text));
             if previous.is_some() && found.is_none() && revision >= floor {
                 return Err(corrupt(format_args!(
                     "{key} of revision {previous:?} is missing from its history"
@@ -84,20 +98,93 @@ impl MongoStore {
         Ok(documents)
     }
 
-    async fn read_texts(&self, ids: Vec<String>) -> Result<BTreeMap<String, String>, StoreError> {
+    /// Key, revision and version before, of all changes in a range.
+    async fn changes_between(&self, after: i64, until: i64) -> Result<Vec<(String, i64, Option<i64>)>, StoreError> {
+        let range = doc! { "_id": { "$gt": after - RECORD_COMMITS, "$lte": until }, "last": { "$gt": after } };
+        let fields = doc! { "docs.key": 1, "docs.revision": 1, "docs.previous": 1 };
+        let logged = self.tables.events.find(range).projection(fields);
+        let logged = collect(logged, |found| {
+            let docs = rows::members(found, "docs");
+            docs.map(|change| {
+                let change = change?;
+                let previous = rows::integer(change, "previous").ok();
+                Ok((rows::text(change, "key")?, rows::integer(change, "revision")?, previous))
+            })
+            .collect::<Result<Vec<_>, StoreError>>()
+        });
+        let mut changes: Vec<_> = logged.await?.into_iter().flatten().collect();
+        let range = doc! { "revision": { "$gt": after, "$lte": until } };
+        let fields = doc! { "_id": 1, "previous": 1 };
+        let kept = self.tables.versions.find(range).projection(fields);
+        let kept = collect(kept, |found| {
+            let id = rows::text(found, "_id")?;
+            let (key, revision) = rows::split_version_id(&id)?;
+            Ok((key.to_owned(), revision, rows::integer(found, "previous").ok()))
+        });
+        changes.extend(kept.await?);
+        changes.retain(|(_, revision, _)| *revision > after && *revision <= until);
+        Ok(changes)
+    }
+
+    /// Texts of one version of each document: from the log, or what trimming has kept of it.
+    async fn read_texts(&self, wanted: &BTreeMap<&str, i64>) -> Result<BTreeMap<String, String>, StoreError> {
         let mut texts = BTreeMap::new();
-        for some in ids.chunks(NAMED) {
-            let find = self
-                .tables
-                .versions
-                .find(doc! { "_id": { "$in": some } })
-                .projection(doc! { "document": 1 });
-            let found = collect(find, |found| {
-                Ok((rows::text(found, "_id")?, rows::text(found, "document")?))
+        let all: Vec<(&str, i64)> = wanted.iter().map(|(key, revision)| (*key, *revision)).collect();
+        // Most commits begin a record; those that do not are looked for one by one.
+        for chunk in all.chunks(NAMED) {
+            let revisions: Vec<i64> = chunk.iter().map(|(_, revision)| *revision).collect();
+            let matching = doc! { "_id": { "$in": revisions } };
+            self.read_logged(matching, wanted, &mut texts).await?;
+            self.read_kept(chunk, wanted, &mut texts).await?;
+        }
+        let rest: Vec<(&str, i64)> = all.into_iter().filter(|(key, _)| !texts.contains_key(*key)).collect();
+        for chunk in rest.chunks(NAMED / 5) {
+            let around = chunk.iter().map(|(key, revision)| {
+                let near = doc! { "$gt": revision - RECORD_COMMITS, "$lte": revision };
+                doc! { "docs.key": key, "_id": near, "last": { "$gte": revision } }
             });
-            texts.extend(found.await?);
+            let matching = doc! { "$or": around.collect::<Vec<_>>() };
+            self.read_logged(matching, wanted, &mut texts).await?;
+            // Last of all, for what has left the log meanwhile.
+            self.read_kept(chunk, wanted, &mut texts).await?;
         }
         Ok(texts)
+    }
+
+    async fn read_logged(
+        &self,
+        matching: Document,
+        wanted: &BTreeMap<&str, i64>,
+        texts: &mut BTreeMap<String, String>,
+    ) -> Result<(), StoreError> {
+        let revisions: BTreeSet<i64> = wanted.values().copied().collect();
+        let find = self
+            .tables
+            .events
+            .find(matching)
+            .projection(doc! { "audit": 0, "answers": 0 });
+        let logged = collect(find, |found| {
+            let mut versions = rows::read_record(found)?.versions;
+            versions.retain(|row| revisions.contains(&row.revision));
+            Ok(versions)
+        });
+        keep_wanted(logged.await?.into_iter().flatten(), wanted, texts);
+        Ok(())
+    }
+
+    async fn read_kept(
+        &self,
+        some: &[(&str, i64)],
+        wanted: &BTreeMap<&str, i64>,
+        texts: &mut BTreeMap<String, String>,
+    ) -> Result<(), StoreError> {
+        let ids = some.iter().filter(|(key, _)| !texts.contains_key(*key));
+        let ids: Vec<String> = ids.map(|(key, revision)| rows::version_id(key, *revision)).collect();
+        if !ids.is_empty() {
+            let kept = self.tables.versions.find(doc! { "_id": { "$in": ids } });
+            keep_wanted(collect(kept, rows::read_version).await?, wanted, texts);
+        }
+        Ok(())
     }
 
     /// Times rise with revisions, but for the differences of the processes' clocks.
@@ -109,12 +196,13 @@ impl MongoStore {
             let find = self
                 .tables
                 .events
-                .find_one(doc! { "_id": middle })
-                .projection(doc! { "time": 1 });
+                .find_one(doc! { "_id": { "$lte": middle } })
+                .sort(doc! { "_id": -1 })
+                .projection(doc! { "commits.time": 1, "last": 1 });
             let found = limited(QUICK, find).await?;
             // What was trimmed away meanwhile is old.
             let old = match found {
-                Some(event) => rows::integer(&event, "time")? < time.as_millis(),
+                Some(record) => time_in(&record, middle)?.is_none_or(|found| found < time.as_millis()),
                 None => true,
             };
             match old {
@@ -126,15 +214,6 @@ impl MongoStore {
             true => Ok(0),
             false => unsigned(before),
         }
-    }
-
-    /// Raises the floor and gives it.
-    pub(super) async fn raise_floor(&self, floor: i64) -> Result<i64, StoreError> {
-        let raise = doc! { "$max": { FLOOR: floor } };
-        let raised = self.tables.documents.find_one_and_update(doc! { "_id": FLOOR }, raise);
-        let raised = limited(USUAL, raised.return_document(ReturnDocument::After)).await?;
-        let raised = raised.ok_or_else(|| corrupt("the floor is missing"))?;
-        rows::integer(&raised, FLOOR)
     }
 
     pub(super) async fn write_audit(&self, entries: &[AuditEntry]) -> Result<(), StoreError> {
@@ -159,19 +238,79 @@ impl MongoStore {
         if query.limit == 0 {
             return Ok(Vec::new());
         }
+        // First the log, then what trimming has moved out of it: nothing is missed, and what is seen twice has one id.
+        let mut newest = self.audit_of_the_log(query).await?;
         let find = self
             .tables
             .audit
             .find(audit_filter(query))
             .sort(doc! { "_id": -1 })
             .limit(limit_of(query.limit));
-        collect(find, |found| rows::read_audit(found)?.decode()).await
+        let apart = collect(find, rows::read_audit).await?;
+        newest.extend(apart.into_iter().map(|row| (row.id.clone(), row)));
+        let newest = newest.into_values().rev().take(query.limit);
+        newest.map(AuditRow::decode).collect()
+    }
+
+    /// The newest entries beside commits that a query asks for, by id. Records come by their newest entry, and may overlap.
+    async fn audit_of_the_log(&self, query: &AuditQuery) -> Result<BTreeMap<String, AuditRow>, StoreError> {
+        let mut matching = doc! { "audit_last": { "$gt": "" } };
+        if let Some(below) = &query.below {
+            matching.insert("audit_first", doc! { "$lt": below });
+        }
+        let entry = audit_filter(query);
+        if !entry.is_empty() {
+            matching.insert("audit", doc! { "$elemMatch": entry });
+        }
+        let oldest = now().as_millis() - AUDIT_KEPT_MS;
+        let find = self.tables.events.find(matching).sort(doc! { "audit_last": -1 });
+        let find = find.projection(doc! { "audit": 1, "audit_last": 1 });
+        limited_steps(USUAL, async {
+            let mut newest = BTreeMap::new();
+            let mut cursor = find.await.map_err(store_error)?;
+            while let Some(found) = cursor.try_next().await.map_err(store_error)? {
+                let full = newest.len() >= query.limit;
+                let least = newest.first_key_value().map(|(id, _): (&String, _)| id.as_str());
+                if full && least >= found.get_str("audit_last").ok() {
+                    break;
+                }
+                for entry in rows::members(&found, "audit") {
+                    let row = rows::read_audit(entry?)?;
+                    if row.time >= oldest && is_asked_for(&row, query) {
+                        newest.insert(row.id.clone(), row);
+                    }
+                }
+                while newest.len() > query.limit {
+                    newest.pop_first();
+                }
+            }
+            Ok(newest)
+        })
+        .await
     }
 
     pub(super) async fn read_answer(&self, id: &str, now: Timestamp) -> Result<Option<IdempotencyRecord>, StoreError> {
-        let filter = doc! { "_id": id, "expires": { "$gt": DateTime::from_millis(now.as_millis()) } };
-        let found = limited(QUICK, self.tables.idempotency.find_one(filter)).await?;
-        found.map(|found| rows::read_idempotency(&found)?.decode()).transpose()
+        let known = self.read_answers(&[id]).await?;
+        let valid = known.into_iter().filter(|row| row.expires > now.as_millis());
+        valid
+            .max_by_key(|row| row.revision)
+            .map(IdempotencyRow::decode)
+            .transpose()
+    }
+
+    /// All answers of these ids, also expired ones. First the log, then what trimming has moved out of it.
+    pub(super) async fn read_answers(&self, ids: &[&str]) -> Result<Vec<IdempotencyRow>, StoreError> {
+        let find = self.tables.events.find(doc! { "answers._id": { "$in": ids } });
+        let find = find.projection(doc! { "answers": 1 });
+        let logged = collect(find, |found| {
+            let answers = rows::members(found, "answers").map(|answer| rows::read_idempotency(answer?));
+            answers.collect::<Result<Vec<_>, _>>()
+        });
+        let mut answers: Vec<IdempotencyRow> = logged.await?.into_iter().flatten().collect();
+        answers.retain(|row| ids.contains(&row.id.as_str()));
+        let find = self.tables.idempotency.find(doc! { "_id": { "$in": ids } });
+        answers.extend(collect(find, rows::read_idempotency).await?);
+        Ok(answers)
     }
 
     pub(super) async fn write_token(&self, token: &TokenRecord, audit: &AuditEntry) -> Result<(), StoreError> {
@@ -223,6 +362,44 @@ impl MongoStore {
             .sort(doc! { "create_time": -1, "_id": -1 });
         collect(find, |found| rows::read_token(found)?.decode()).await
     }
+}
+
+fn keep_wanted(
+    found: impl IntoIterator<Item = VersionRow>,
+    wanted: &BTreeMap<&str, i64>,
+    texts: &mut BTreeMap<String, String>,
+) {
+    let those = found
+        .into_iter()
+        .filter(|row| wanted.get(row.key.as_str()) == Some(&row.revision));
+    texts.extend(those.map(|row| (row.key, row.document)));
+}
+
+/// A projection that leaves those of a record's changes that are asked for.
+fn only_of(condition: &Document) -> Document {
+    let docs = doc! { "$filter": { "input": "$docs", "as": "doc", "cond": condition } };
+    doc! { "last": 1, "batch": 1, "commits": 1, "docs": docs }
+}
+
+/// When a record wrote a revision; none if it is not in it.
+fn time_in(record: &Document, revision: i64) -> Result<Option<i64>, StoreError> {
+    let first = rows::integer(record, "_id")?;
+    let place = usize::try_from(revision - first).unwrap_or(usize::MAX);
+    let commit = rows::members(record, "commits").nth(place).transpose()?;
+    commit.map(|commit| rows::integer(commit, "time")).transpose()
+}
+
+/// As [`audit_filter`], for one entry of several in a record.
+fn is_asked_for(row: &AuditRow, query: &AuditQuery) -> bool {
+    let is = |wanted: &Option<String>, found: Option<&str>| wanted.is_none() || wanted.as_deref() == found;
+    is(&query.subject, Some(&row.subject))
+        && is(&query.kind, row.kind.as_deref())
+        && is(&query.name, row.name.as_deref())
+        && is(&query.action, Some(&row.action))
+        && query.allowed.is_none_or(|allowed| allowed == row.allowed)
+        && query.since.is_none_or(|since| row.time >= since.as_millis())
+        && query.until.is_none_or(|until| row.time < until.as_millis())
+        && query.below.as_ref().is_none_or(|below| row.id < *below)
 }
 
 fn audit_filter(query: &AuditQuery) -> Document {

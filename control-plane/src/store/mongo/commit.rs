@@ -1,36 +1,46 @@
 //! Writing commits.
 //!
 //! ```text
-//! start ─▶ events ─▶ versions ─▶ documents and the guard ─▶ audit ─▶ answers ─▶ commit (majority, journal)
-//!   │ any of these fails: undone, nothing was written                              │ fails: unknown
-//!   ▼                                                                              ▼
-//! Conflict or NotWritten                              again ─▶ settle: seal the transaction, then look
+//! revision free? (fence: known, else asked) ─▶ insert one record (majority, journal) ─▶ in time? ─▶ done
+//!                                                 │ taken: Conflict          │ no answer: unknown
+//!                                                 ▼                          ▼
+//!                                   the record there is another's      insert again: ours now, or taken ─▶ whose is it?
+//!
+//! too large for one record:
+//! start ─▶ records ─▶ changes without room ─▶ commit (majority, journal)
+//!   │ any of these fails: undone               │ fails: unknown
+//!   ▼                                          ▼
+//! Conflict or NotWritten      again ─▶ settle: seal the transaction, then look
 //! ```
 //!
-//! Whoever inserts revision n + 1 first has it: `_id` is unique, and a second writer of it conflicts. A writer that slept
-//! while its next revision was taken and then trimmed away would find that `_id` free, so the guard makes sure that the
-//! floor, which the same snapshot shows, is below.
+//! A record begins where the newest one ended, and whoever inserts it first has its revisions: `_id` is unique. See
+//! [`super::fence`] for why nobody can find a revision free that was taken and trimmed away.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use mongodb::ClientSession;
-use mongodb::bson::doc;
+use mongodb::bson::{Document, RawDocumentBuf, doc};
 use mongodb::error::Error;
 use mongodb::options::{ReadConcern, WriteConcern};
 use tokio::time::{Instant, timeout, timeout_at};
 
-use super::client::QUICK;
-use super::errors::{is_write_conflict, not_written, store_error, surely_aborted, write_errors};
+use super::client::{QUICK, limited};
+use super::errors::{
+    DUPLICATE_KEY, TOO_SLOW, WRITE_CONFLICT, Wrong, command_code, is_refused, is_write_conflict, not_written,
+    store_error, surely_aborted, was_not_sent, write_code,
+};
+use super::fence::{Proof, since_boot};
 use super::rows::{self, FLOOR};
 use super::statements::Statements;
 use super::{MongoStore, stale};
 use crate::store::encode::EncodedCommit;
-use crate::store::rows::EventRow;
+use crate::store::rows::{EventRow, IdempotencyRow};
 use crate::store::{CommitError, StoreError};
 
-/// A transaction takes at most this, without finding out what became of it.
+/// A commit takes at most this, without finding out what became of it.
 const LIMIT: Duration = Duration::from_secs(10);
-/// One try to commit.
+/// One try to insert or to commit.
 const TRY: Duration = Duration::from_secs(3);
 /// How often a commit is tried before it is settled otherwise.
 const TRIES: usize = 3;
@@ -40,6 +50,9 @@ const SETTLE: Duration = Duration::from_secs(5);
 const PAUSE: Duration = Duration::from_millis(100);
 /// A revision that nobody takes and nobody can write for so long is held by a transaction whose process has gone.
 const PATIENCE: Duration = Duration::from_millis(500);
+
+/// An insertion that takes longer is held up by a transaction that somebody left open, or by the disk.
+const HELD: Duration = Duration::from_secs(1);
 
 /// A statement that failed.
 struct Fault {
@@ -57,19 +70,156 @@ impl From<Error> for Fault {
     }
 }
 
-impl From<CommitError> for Fault {
-    fn from(error: CommitError) -> Self {
-        Self { error, held: false }
-    }
+/// What became of one insertion.
+enum Tried {
+    Written,
+    /// There is a record of that revision.
+    Taken,
+    /// An open transaction is in the way.
+    Held,
+    /// It surely is not there, and will not be.
+    Failed(StoreError),
+    /// It may be there, now or later.
+    Unknown(StoreError),
 }
 
 impl MongoStore {
-    /// Writes a group in one transaction.
+    /// Writes a group, whole or not at all.
     pub(super) async fn write_group(&self, group: &[EncodedCommit]) -> Result<(), CommitError> {
-        let Some(first) = group.first().map(|commit| &commit.event) else {
+        let (Some(first), Some(last)) = (group.first(), group.last()) else {
             return Ok(());
         };
-        let statements = Statements::of(group, &self.writer);
+        let (first, last) = (&first.event, last.event.revision);
+        let proof = self.prove_free(first.revision).await?;
+        self.refuse_known_answers(group).await?;
+        let begun = since_boot();
+        let Statements { mut records, versions } = Statements::of(group, &self.writer);
+        match (records.len(), records.pop()) {
+            (1, Some(record)) if versions.is_empty() => self.insert(record, first).await?,
+            (_, Some(record)) => {
+                records.push(record);
+                self.write_large(Statements { records, versions }, first).await?;
+            }
+            (_, None) => {}
+        }
+        if !proof.holds(since_boot())
+            && self.read_floor().await.map_err(CommitError::Unknown)? >= first.revision.unsigned_abs()
+        {
+            // It is below the floor, where nobody looks, or was trimmed already.
+            let text = "MongoDB: this process stood still while it wrote".to_owned();
+            return Err(CommitError::Unknown(StoreError::Unavailable(text)));
+        }
+        self.fence.lock().newest_was(last, begun, since_boot());
+        Ok(())
+    }
+
+    /// Makes sure that a revision comes right behind the newest.
+    async fn prove_free(&self, revision: i64) -> Result<Proof, CommitError> {
+        if let Some(proof) = self.fence.lock().is_free(revision, since_boot()) {
+            return Ok(proof);
+        }
+        self.read_head().await.map_err(CommitError::NotWritten)?;
+        let proof = self.fence.lock().is_free(revision, since_boot());
+        proof.ok_or(CommitError::Conflict)
+    }
+
+    /// An idempotency key is answered once, until its answer has expired. Whoever else wrote one of these since it was
+    /// looked for has taken the revision, too.
+    async fn refuse_known_answers(&self, group: &[EncodedCommit]) -> Result<(), CommitError> {
+        let rows = group
+            .iter()
+            .filter_map(|commit| Some((commit.idempotency.as_ref()?.id.as_str(), commit.event.time)));
+        let times: BTreeMap<&str, i64> = rows.clone().collect();
+        if times.len() < rows.count() {
+            return Err(CommitError::Conflict);
+        }
+        if times.is_empty() {
+            return Ok(());
+        }
+        let ids: Vec<&str> = times.keys().copied().collect();
+        let known = self.read_answers(&ids).await.map_err(CommitError::NotWritten)?;
+        let valid = |row: &IdempotencyRow| times.get(row.id.as_str()).is_some_and(|now| row.expires > *now);
+        match known.iter().any(valid) {
+            true => Err(CommitError::Conflict),
+            false => Ok(()),
+        }
+    }
+
+    /// Inserts one record, and finds out what became of it.
+    async fn insert(&self, record: Document, first: &EventRow) -> Result<(), CommitError> {
+        let until = Instant::now() + LIMIT;
+        let command = doc! {
+            "insert": "events", "documents": [record], "maxTimeMS": i64::try_from(HELD.as_millis()).unwrap_or(i64::MAX),
+            "writeConcern": { "w": "majority", "j": true },
+        };
+        let command = RawDocumentBuf::try_from(&command).map_err(|error| {
+            CommitError::NotWritten(StoreError::Refused(format!(
+                "MongoDB: the commit cannot be stored: {error}"
+            )))
+        })?;
+        let because = match self.try_insert(&command).await {
+            Tried::Written => return Ok(()),
+            Tried::Taken => return Err(CommitError::Conflict),
+            Tried::Held => {
+                stale::end_idle_transactions(&self.tables).await;
+                return Err(CommitError::Conflict);
+            }
+            Tried::Failed(error) => return Err(CommitError::NotWritten(error)),
+            Tried::Unknown(error) => error,
+        };
+        // Once more: then it is there, or there is a record, and it can be seen whose.
+        while Instant::now() < until {
+            tokio::time::sleep(PAUSE).await;
+            match self.try_insert(&command).await {
+                Tried::Written => return Ok(()),
+                Tried::Taken => match self.batch_at(first.revision).await {
+                    Ok(Some(batch)) if batch == first.batch => return Ok(()),
+                    Ok(Some(_)) => return Err(CommitError::Conflict),
+                    Ok(None) | Err(_) => {}
+                },
+                Tried::Held | Tried::Failed(_) | Tried::Unknown(_) => {}
+            }
+        }
+        Err(CommitError::Unknown(because))
+    }
+
+    async fn try_insert(&self, command: &RawDocumentBuf) -> Tried {
+        let run = self.tables.database.run_raw_command(command.clone());
+        match timeout(TRY, run).await {
+            Ok(Ok(answer)) => match write_code(&answer) {
+                Some(Wrong::Document(code, _)) if code == DUPLICATE_KEY => Tried::Taken,
+                Some(Wrong::Document(code, _)) if [WRITE_CONFLICT, TOO_SLOW].contains(&code) => Tried::Held,
+                Some(Wrong::Document(_, text)) => Tried::Failed(StoreError::Unavailable(format!("MongoDB: {text}"))),
+                Some(Wrong::Concern(text)) => Tried::Unknown(StoreError::Unavailable(format!("MongoDB: {text}"))),
+                None => Tried::Written,
+            },
+            Ok(Err(error)) if command_code(&error) == Some(TOO_SLOW) => Tried::Held,
+            Ok(Err(error)) if was_not_sent(&error) || is_refused(&error) => Tried::Failed(store_error(error)),
+            Ok(Err(error)) => Tried::Unknown(store_error(error)),
+            Err(_) => Tried::Unknown(StoreError::Unavailable(format!(
+                "MongoDB: no answer within {} s",
+                TRY.as_secs()
+            ))),
+        }
+    }
+
+    /// Which batch has a revision, as no crash can change it any more.
+    async fn batch_at(&self, revision: i64) -> Result<Option<String>, StoreError> {
+        // Once a majority has a later write, it has whatever was in the way of the insertion.
+        let count = doc! { "$inc": { "count": 1_i64 } };
+        let later = self
+            .tables
+            .meta
+            .update_one(doc! { "_id": "settled" }, count)
+            .upsert(true);
+        limited(QUICK, later).await?;
+        let found = self.tables.events.find_one(doc! { "_id": revision });
+        let found = limited(QUICK, found.projection(doc! { "batch": 1 })).await?;
+        found.map(|found| rows::text(&found, "batch")).transpose()
+    }
+
+    /// Writes in one transaction what is too large for one record.
+    async fn write_large(&self, statements: Statements, first: &EventRow) -> Result<(), CommitError> {
         // Always the same session: a transaction on it ends what an earlier one may have left open on the server.
         let mut place = self.session.lock().await;
         let mut session = match place.take() {
@@ -107,7 +257,10 @@ impl MongoStore {
         let done = timeout_at(deadline, work).await;
         let done = done.unwrap_or_else(|_| {
             let text = format!("MongoDB: the transaction was not done within {} s", LIMIT.as_secs());
-            Err(CommitError::NotWritten(StoreError::Unavailable(text)).into())
+            Err(Fault {
+                error: CommitError::NotWritten(StoreError::Unavailable(text)),
+                held: false,
+            })
         });
         if done.is_err() {
             abort(session).await;
@@ -117,34 +270,13 @@ impl MongoStore {
 
     async fn statements(&self, session: &mut ClientSession, group: Statements) -> Result<(), Fault> {
         let tables = &self.tables;
-        tables.events.insert_many(group.events).session(&mut *session).await?;
-        tables
-            .versions
-            .insert_many(group.versions)
-            .session(&mut *session)
-            .await?;
-        for (command, count) in group.documents {
-            let answer = tables.database.run_command(command).session(&mut *session).await?;
-            if let Some(error) = write_errors(&answer) {
-                return Err(error.into());
-            }
-            if rows::integer(&answer, "n").ok() != Some(count) {
-                // The guard did not match: the revision was taken long ago.
-                return Err(CommitError::Conflict.into());
-            }
-        }
-        if !group.deleted.is_empty() {
-            let gone = doc! { "_id": { "$in": group.deleted } };
-            tables.documents.delete_many(gone).session(&mut *session).await?;
-        }
-        if !group.audit.is_empty() {
-            tables.audit.insert_many(group.audit).session(&mut *session).await?;
-        }
-        for command in group.answers {
-            let answer = tables.database.run_command(command).session(&mut *session).await?;
-            if let Some(error) = write_errors(&answer) {
-                return Err(error.into());
-            }
+        tables.events.insert_many(group.records).session(&mut *session).await?;
+        if !group.versions.is_empty() {
+            tables
+                .versions
+                .insert_many(group.versions)
+                .session(&mut *session)
+                .await?;
         }
         Ok(())
     }

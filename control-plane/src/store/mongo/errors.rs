@@ -5,10 +5,12 @@ use mongodb::error::{Error, ErrorKind, TRANSIENT_TRANSACTION_ERROR, WriteFailure
 
 use crate::store::{CommitError, StoreError};
 
-const DUPLICATE_KEY: i32 = 11_000;
-const WRITE_CONFLICT: i32 = 112;
+pub(super) const DUPLICATE_KEY: i32 = 11_000;
+pub(super) const WRITE_CONFLICT: i32 = 112;
 const NO_SUCH_TRANSACTION: i32 = 251;
 const SNAPSHOT_UNAVAILABLE: i32 = 246;
+/// Longer than `maxTimeMS`.
+pub(super) const TOO_SLOW: i32 = 50;
 pub(super) const NAMESPACE_EXISTS: i32 = 48;
 /// Another transaction holds a lock, or this one was replaced by a newer one of its session, or was ended for it.
 const OTHER_TRANSACTION: [i32; 4] = [24, 225, 267, 290];
@@ -49,6 +51,25 @@ pub(super) fn is_write_conflict(error: &Error) -> bool {
     codes(error).iter().any(|code| *code == WRITE_CONFLICT || *code == 24)
 }
 
+/// Whether a command that failed like this has never left this process.
+pub(super) fn was_not_sent(error: &Error) -> bool {
+    matches!(
+        error.kind.as_ref(),
+        ErrorKind::ServerSelection { .. }
+            | ErrorKind::ConnectionPoolCleared { .. }
+            | ErrorKind::Shutdown
+            | ErrorKind::Authentication { .. }
+            | ErrorKind::InvalidArgument { .. }
+            | ErrorKind::InvalidTlsConfig { .. }
+            | ErrorKind::DnsResolve { .. }
+    )
+}
+
+/// Whether the server did not even begin with a command.
+pub(super) fn is_refused(error: &Error) -> bool {
+    codes(error).iter().any(|code| NEVER.contains(code))
+}
+
 /// Whether the end of a transaction that failed like this has surely not been.
 pub(super) fn surely_aborted(error: &Error) -> bool {
     error.contains_label(TRANSIENT_TRANSACTION_ERROR)
@@ -87,18 +108,32 @@ fn codes(error: &Error) -> Vec<i32> {
     }
 }
 
+/// What is wrong with an answer to a command that the server accepted.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Wrong {
+    /// A document was not written: code and text.
+    Document(i32, String),
+    /// It was written, but it is not known whether a majority has it.
+    Concern(String),
+}
+
 /// A command that the server accepted may still have failed for some of its documents.
-pub(super) fn write_errors(answer: &Document) -> Option<CommitError> {
-    let errors = answer
-        .get_array("writeErrors")
-        .ok()
-        .filter(|errors| !errors.is_empty())?;
-    let first = errors.first().and_then(|error| error.as_document());
-    let code = first.and_then(|error| error.get_i32("code").ok());
-    let text = first.and_then(|error| error.get_str("errmsg").ok()).unwrap_or_default();
-    Some(match code {
-        Some(DUPLICATE_KEY | WRITE_CONFLICT) => CommitError::Conflict,
-        _ => CommitError::NotWritten(StoreError::Unavailable(format!("MongoDB: {text}"))),
+pub(super) fn write_code(answer: &Document) -> Option<Wrong> {
+    let errors = answer.get_array("writeErrors").ok();
+    if let Some(first) = errors.and_then(|errors| errors.first()) {
+        let first = first.as_document();
+        let code = first.and_then(|error| error.get_i32("code").ok()).unwrap_or(0);
+        let text = first.and_then(|error| error.get_str("errmsg").ok()).unwrap_or_default();
+        return Some(Wrong::Document(code, text.to_owned()));
+    }
+    let concern = answer.get_document("writeConcernError").ok()?;
+    Some(Wrong::Concern(concern.get_str("errmsg").unwrap_or_default().to_owned()))
+}
+
+/// What is wrong with an answer, for a command that may be done again.
+pub(super) fn write_error(answer: &Document) -> Option<StoreError> {
+    write_code(answer).map(|wrong| match wrong {
+        Wrong::Document(_, text) | Wrong::Concern(text) => StoreError::Unavailable(format!("MongoDB: {text}")),
     })
 }
 
@@ -110,18 +145,23 @@ mod tests {
 
     #[test]
     fn errors_of_single_documents_are_seen() {
-        assert_eq!(write_errors(&doc! { "ok": 1, "n": 1 }), None);
-        assert_eq!(write_errors(&doc! { "ok": 1, "writeErrors": [] }), None);
+        assert_eq!(write_code(&doc! { "ok": 1, "n": 1 }), None);
+        assert_eq!(write_code(&doc! { "ok": 1, "writeErrors": [] }), None);
         let taken = doc! { "ok": 1, "writeErrors": [{ "index": 0, "code": 11_000, "errmsg": "E11000" }] };
-        assert_eq!(write_errors(&taken), Some(CommitError::Conflict));
-        let other = doc! { "ok": 1, "writeErrors": [{ "index": 0, "code": 121, "errmsg": "no" }] };
-        assert!(matches!(write_errors(&other), Some(CommitError::NotWritten(_))));
+        assert_eq!(
+            write_code(&taken),
+            Some(Wrong::Document(DUPLICATE_KEY, "E11000".to_owned()))
+        );
+        let late = doc! { "ok": 1, "n": 1, "writeConcernError": { "code": 64, "errmsg": "late" } };
+        assert_eq!(write_code(&late), Some(Wrong::Concern("late".to_owned())));
+        assert!(matches!(write_error(&taken), Some(StoreError::Unavailable(_))));
     }
 
     #[test]
     fn what_never_gets_better_is_refused() {
         let io = Error::from(std::io::Error::from(std::io::ErrorKind::ConnectionReset));
         assert!(store_error(io.clone()).is_transient());
+        assert!(!was_not_sent(&io), "it may have arrived");
         assert!(matches!(
             not_written(io),
             CommitError::NotWritten(StoreError::Unavailable(_))

@@ -1,21 +1,27 @@
 //! Documents in a MongoDB replica set, for any number of processes.
 //!
 //! ```text
+//! events      the log: one record per group of commits, _id = its first revision (the fence between writers), with their
+//!             changes, audit entries and answers to repeat
+//! documents   one record per document, _id = key: what was at revision `folded`; and `floor`, the guard of the log
+//! versions    history below the floor, one record per change, _id = key@revision; and changes that a record of the log
+//!             had no room for
+//! audit, idempotency   of commits below the floor, and of what was no commit; removed by the server when they expire
+//! tokens      removed by the server when they expire
 //! meta        store: identity, min_version · lease: who migrates · trimmed · settled
 //! migrations  which steps are done
-//! events      one record per commit, _id = revision: the log, and the fence between writers
-//! versions    one record per change, _id = key@revision: history; with `events` the log
-//! documents   one record per document, _id = key: what is now; and `floor`, the guard of the log
-//! audit, idempotency, tokens     removed by the server when they expire
 //! ```
 //!
-//! A group of commits is one transaction, acknowledged when a majority of the members has it in its journal. No process
-//! leads. Documents are JSON texts: the database looks at no key or value of a user's.
+//! Writing is the insertion of one record, acknowledged when a majority of the members has it in its journal; all else
+//! follows beside it (`fold`) or when history is trimmed (`trim`). No process leads. Documents are JSON texts: the database
+//! looks at no key or value of a user's.
 
 mod archive;
 mod client;
 mod commit;
 mod errors;
+mod fence;
+mod fold;
 mod follow;
 mod migrate;
 mod read;
@@ -27,6 +33,7 @@ mod trim;
 mod upkeep;
 
 use std::future::IntoFuture;
+use std::time::Duration;
 
 use async_trait::async_trait;
 use blaze_domain::config::{Document as Config, Key, Timestamp};
@@ -38,6 +45,7 @@ use tokio::time::Instant;
 
 use self::client::{Tables, USUAL, limited_steps};
 use self::errors::store_error;
+use self::fence::Fence;
 use self::follow::Stream;
 use super::encode::encode_group;
 use super::migrate::{Migrations, Plan};
@@ -52,7 +60,11 @@ pub struct MongoStore {
     tables: Tables,
     /// Which opening of the store this is; marks its commits, so that it need not be told of them.
     writer: String,
-    /// The session of all commits; none before the first one, and while one is under way.
+    /// What is known of the newest revision.
+    fence: parking_lot::Mutex<Fence>,
+    /// Records up to this revision were removed already, if they could be.
+    removed: parking_lot::Mutex<i64>,
+    /// The session of large commits; none before the first one, and while one is under way.
     session: tokio::sync::Mutex<Option<ClientSession>>,
     /// Commits of others.
     stream: tokio::sync::Mutex<Option<Stream>>,
@@ -78,6 +90,23 @@ impl MongoStore {
         let store = Self::connect(uri, database).await?;
         store.migrate(migrations).await?;
         Ok(store)
+    }
+
+    /// Removes records below the floor at once, where others are sure not to be late: for tests.
+    #[cfg(any(test, feature = "conformance"))]
+    #[must_use]
+    pub fn in_a_hurry(self) -> Self {
+        *self.fence.lock() = Fence::removing_after(Duration::ZERO);
+        self
+    }
+
+    /// How many records the log has: for tests.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    #[cfg(any(test, feature = "conformance"))]
+    pub async fn records(&self) -> Result<u64, StoreError> {
+        client::limited(USUAL, self.tables.events.count_documents(mongodb::bson::doc! {})).await
     }
 
     /// What opening the database would migrate. Nothing is changed.
@@ -113,6 +142,8 @@ impl MongoStore {
         Ok(Self {
             tables: Tables::connect(uri, database).await?,
             writer: uuid::Uuid::now_v7().to_string(),
+            fence: parking_lot::Mutex::default(),
+            removed: parking_lot::Mutex::default(),
             session: tokio::sync::Mutex::new(None),
             stream: tokio::sync::Mutex::new(None),
             held: parking_lot::Mutex::new(None),
@@ -125,7 +156,16 @@ async fn collect<T>(
     find: impl IntoFuture<Output = mongodb::error::Result<Cursor<Document>>>,
     read: impl Fn(&Document) -> Result<T, StoreError>,
 ) -> Result<Vec<T>, StoreError> {
-    limited_steps(USUAL, async {
+    collect_within(USUAL, find, read).await
+}
+
+/// As [`collect`], with a limit of its own.
+async fn collect_within<T>(
+    limit: Duration,
+    find: impl IntoFuture<Output = mongodb::error::Result<Cursor<Document>>>,
+    read: impl Fn(&Document) -> Result<T, StoreError>,
+) -> Result<Vec<T>, StoreError> {
+    limited_steps(limit, async {
         let mut cursor = find.into_future().await.map_err(store_error)?;
         let mut all = Vec::new();
         while let Some(found) = cursor.try_next().await.map_err(store_error)? {
@@ -188,6 +228,10 @@ impl Archive for MongoStore {
 
     async fn audit(&self, query: &AuditQuery) -> Result<Vec<AuditEntry>, StoreError> {
         self.read_audit(query).await
+    }
+
+    async fn tidy(&self) -> Result<(), StoreError> {
+        self.tidy_up().await
     }
 
     async fn idempotency(&self, id: &str, now: Timestamp) -> Result<Option<IdempotencyRecord>, StoreError> {

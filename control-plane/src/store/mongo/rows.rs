@@ -5,31 +5,180 @@
 use mongodb::bson::{Bson, DateTime, Document, doc};
 
 use crate::store::StoreError;
-use crate::store::encode::corrupt;
+use crate::store::encode::{EncodedCommit, corrupt};
 use crate::store::rows::{AuditRow, DocumentRow, EventRow, IdempotencyRow, TokenRow, VersionRow};
 
-/// `_id` of the record in `documents` that holds the floor. Keys of documents begin with a capital letter.
+/// `_id` of the record in `documents` that holds the floor, and how far the documents have come. Keys of documents begin
+/// with a capital letter.
 pub(super) const FLOOR: &str = "floor";
+
+/// What the record [`FLOOR`] holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Guard {
+    /// Commits up to this revision are gone.
+    pub(super) floor: i64,
+    /// The documents are those of this revision.
+    pub(super) folded: i64,
+    /// How often the log was rewritten: what was read of it before is out of date.
+    pub(super) rewrites: i64,
+}
+
+impl Guard {
+    pub(super) fn read(found: &Document) -> Result<Self, StoreError> {
+        Ok(Self {
+            floor: integer(found, FLOOR)?,
+            folded: integer(found, "folded")?,
+            rewrites: integer(found, "rewrites")?,
+        })
+    }
+
+    /// The record as long as it is this one.
+    pub(super) fn unchanged(self) -> Document {
+        doc! { "_id": FLOOR, FLOOR: self.floor, "folded": self.folded, "rewrites": self.rewrites }
+    }
+}
 
 /// Bytes that a document takes beside its long texts.
 pub(super) const OVERHEAD_BYTES: usize = 256;
 
-pub(super) fn event(row: &EventRow, writer: &str) -> Document {
-    doc! {
-        "_id": row.revision, "batch": &row.batch, "writer": writer, "time": row.time, "subject": &row.subject,
-        "request_id": &row.request_id, "changes": row.changes, "bytes": row.bytes,
+/// One record of the log: commits that were written together.
+#[derive(Debug, Default)]
+pub(super) struct Record {
+    pub(super) first: i64,
+    pub(super) last: i64,
+    /// Its commits.
+    pub(super) events: Vec<EventRow>,
+    /// Their changes, but for those that it had no room for.
+    pub(super) versions: Vec<VersionRow>,
+    pub(super) audit: Vec<AuditRow>,
+    pub(super) answers: Vec<IdempotencyRow>,
+}
+
+impl Record {
+    /// Revisions some of whose changes are in `versions` alone.
+    pub(super) fn incomplete(&self) -> impl Iterator<Item = i64> {
+        let inline = |revision: i64| self.versions.iter().filter(move |row| row.revision == revision).count();
+        let lacks = move |event: &&EventRow| i64::try_from(inline(event.revision)) != Ok(event.changes);
+        // Changes are counted only where a record is large enough to lack some.
+        let count: i64 = self.events.iter().map(|event| event.changes).sum();
+        let whole = i64::try_from(self.versions.len()) == Ok(count);
+        self.events
+            .iter()
+            .filter(move |_| !whole)
+            .filter(lacks)
+            .map(|event| event.revision)
     }
 }
 
-pub(super) fn read_event(found: &Document) -> Result<EventRow, StoreError> {
-    Ok(EventRow {
-        revision: integer(found, "_id")?,
-        batch: text(found, "batch")?,
-        time: integer(found, "time")?,
-        subject: text(found, "subject")?,
-        request_id: text(found, "request_id")?,
-        changes: integer(found, "changes")?,
-        bytes: integer(found, "bytes")?,
+/// The record of some commits, with at most `inline` of their changes in it.
+pub(super) fn record(commits: &[EncodedCommit], writer: &str, inline: usize) -> Document {
+    let first = commits.first().map(|commit| &commit.event);
+    let batch = first.map_or("", |event| event.batch.as_str());
+    let events: Vec<Document> = commits.iter().map(|commit| event(&commit.event, batch)).collect();
+    let versions = commits.iter().flat_map(|commit| &commit.versions).take(inline);
+    let docs: Vec<Document> = versions.map(change).collect();
+    let mut record = doc! {
+        "_id": first.map_or(0, |event| event.revision),
+        "last": commits.last().map_or(0, |commit| commit.event.revision),
+        "batch": batch, "writer": writer, "commits": events, "docs": docs,
+    };
+    let entries = || commits.iter().flat_map(|commit| &commit.audit);
+    if let (Some(oldest), Some(newest)) = (
+        entries().map(|entry| &entry.id).min(),
+        entries().map(|entry| &entry.id).max(),
+    ) {
+        record.insert("audit_first", oldest);
+        record.insert("audit_last", newest);
+        record.insert("audit", entries().map(audit).collect::<Vec<_>>());
+    }
+    let answers = commits.iter().filter_map(|commit| commit.idempotency.as_ref());
+    let answers: Vec<Document> = answers.map(idempotency).collect();
+    if !answers.is_empty() {
+        record.insert("answers", answers);
+    }
+    record
+}
+
+fn event(row: &EventRow, batch: &str) -> Document {
+    let mut event = doc! {
+        "time": row.time, "subject": &row.subject, "request_id": &row.request_id, "changes": row.changes,
+        "bytes": row.bytes,
+    };
+    if row.batch != batch {
+        event.insert("batch", &row.batch);
+    }
+    event
+}
+
+fn change(row: &VersionRow) -> Document {
+    doc! {
+        "key": &row.key, "revision": row.revision, "position": row.position, "op": &row.op,
+        "previous": row.previous.map_or(Bson::Null, Bson::Int64), "paths": &row.paths, "document": &row.document,
+    }
+}
+
+/// Reads a record; what was left out of it by the query is left out here.
+pub(super) fn read_record(found: &Document) -> Result<Record, StoreError> {
+    let first = integer(found, "_id")?;
+    let batch = text(found, "batch")?;
+    let mut events = Vec::new();
+    for (revision, commit) in (first..).zip(members(found, "commits")) {
+        let commit = commit?;
+        events.push(EventRow {
+            revision,
+            batch: optional_text(commit, "batch")?.unwrap_or_else(|| batch.clone()),
+            time: integer(commit, "time")?,
+            subject: text(commit, "subject")?,
+            request_id: text(commit, "request_id")?,
+            changes: integer(commit, "changes")?,
+            bytes: integer(commit, "bytes")?,
+        });
+    }
+    let versions = members(found, "docs").map(|change| read_change(first, &events, change?));
+    Ok(Record {
+        first,
+        last: integer(found, "last")?,
+        versions: versions.collect::<Result<_, _>>()?,
+        audit: members(found, "audit")
+            .map(|entry| read_audit(entry?))
+            .collect::<Result<_, _>>()?,
+        answers: members(found, "answers")
+            .map(|answer| read_idempotency(answer?))
+            .collect::<Result<_, _>>()?,
+        events,
+    })
+}
+
+fn read_change(first: i64, events: &[EventRow], found: &Document) -> Result<VersionRow, StoreError> {
+    let revision = integer(found, "revision")?;
+    let event = usize::try_from(revision - first)
+        .ok()
+        .and_then(|place| events.get(place));
+    let event = event.ok_or_else(|| corrupt(format_args!("commit {revision} is not in its record {first}")))?;
+    Ok(VersionRow {
+        key: text(found, "key")?,
+        revision,
+        position: integer(found, "position")?,
+        op: text(found, "op")?,
+        previous: optional_integer(found, "previous")?,
+        time: event.time,
+        subject: event.subject.clone(),
+        request_id: event.request_id.clone(),
+        paths: text(found, "paths")?,
+        document: text(found, "document")?,
+    })
+}
+
+/// The documents of an array; none if it is not there.
+pub(super) fn members<'a>(
+    found: &'a Document,
+    name: &str,
+) -> impl Iterator<Item = Result<&'a Document, StoreError>> + use<'a> {
+    let all = found.get_array(name).map(Vec::as_slice).unwrap_or_default();
+    all.iter().map(|member| {
+        member
+            .as_document()
+            .ok_or_else(|| corrupt("a record holds what is no document"))
     })
 }
 
@@ -201,9 +350,25 @@ mod tests {
     fn rows_are_read_as_they_were_written() {
         let mut record = samples::record(samples::commit(7, &["a", "b"]));
         record.idempotency = Some(samples::answer("x", 7));
-        let group = encode_group(&[record]).unwrap();
+        let mut next = samples::record(samples::commit(8, &["c"]));
+        next.commit = std::sync::Arc::new(crate::store::Commit {
+            batch: record.commit.batch.clone(),
+            ..(*next.commit).clone()
+        });
+        let group = encode_group(&[record, next]).unwrap();
+        let found = read_record(&super::record(&group, "me", usize::MAX)).unwrap();
+        assert_eq!((found.first, found.last), (7, 8));
+        assert_eq!(found.events, [group[0].event.clone(), group[1].event.clone()]);
+        assert_eq!(
+            found.versions,
+            [group[0].versions.clone(), group[1].versions.clone()].concat()
+        );
+        assert_eq!(found.audit, [group[0].audit.clone(), group[1].audit.clone()].concat());
+        assert_eq!(found.answers, [group[0].idempotency.clone().unwrap()]);
+        assert_eq!(found.incomplete().count(), 0);
+        let part = read_record(&super::record(&group, "me", 1)).unwrap();
+        assert_eq!(part.incomplete().collect::<Vec<_>>(), [7, 8]);
         let commit = &group[0];
-        assert_eq!(read_event(&event(&commit.event, "me")).unwrap(), commit.event);
         for row in &commit.versions {
             assert_eq!(read_version(&version(row)).unwrap(), *row);
         }

@@ -1,27 +1,49 @@
 //! Removing what nobody needs any more. What expires by itself (audit, answers, tokens) is removed by the server.
+//!
+//! ```text
+//! documents brought to the floor ─▶ step by step, each one transaction: what outlives the log is copied, the floor rises
+//!                                ─▶ versions to spare are removed ─▶ records below the floor are removed, later
+//! ```
+//!
+//! Readers take the log first and what was copied last, so they miss nothing; what is below the floor they take from the
+//! copies alone.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
-use futures::TryStreamExt as _;
 use mongodb::bson::{Document, doc};
 
-use super::client::{LONG, USUAL, limited, limited_steps};
-use super::errors::store_error;
-use super::{MongoStore, collect, rows};
-use crate::store::StoreError;
+use super::client::{LONG, USUAL, limited};
+use super::fold::advance;
+use super::read::Part;
+use super::rows::{Guard, Record};
+use super::statements::{RECORD_COMMITS, update_command};
+use super::{MongoStore, collect, collect_within, rows};
 use crate::store::encode::{signed, unsigned};
 use crate::store::retain::{Trimmed, to_spare};
+use crate::store::rows::VersionRow;
+use crate::store::upkeep::now;
+use crate::store::{AUDIT_KEPT_MS, StoreError};
 
-/// Commits or versions that one command removes.
-const STEP: i64 = 1_000;
+/// Records that one step moves, and versions that one command removes.
+const STEP: usize = 1_000;
+/// Bytes of the rows of one command, about.
+const BYTES: usize = 8 * 1024 * 1024;
 
 impl MongoStore {
     /// Raises the floor, which readers see before anything goes, then removes.
     pub(super) async fn trim_to(&self, floor: u64, keep: u32) -> Result<u64, StoreError> {
         let head = signed(self.read_head().await?);
-        let floor = self.raise_floor(signed(floor).min(head)).await?;
-        let now = Trimmed { floor, head, keep };
-        self.remove_events(floor).await?;
+        let wanted = signed(floor).min(head);
+        let mut guard = self.fold_until(wanted).await?;
+        while guard.floor < wanted {
+            self.move_some(guard, wanted, keep).await?;
+            guard = self.read_guard().await?;
+        }
+        let now = Trimmed {
+            floor: guard.floor,
+            head,
+            keep,
+        };
         self.remove_versions(now).await?;
         let note = doc! { "$set": { "floor": now.floor, "head": now.head, "keep": i64::from(now.keep) } };
         let note = self
@@ -30,47 +52,67 @@ impl MongoStore {
             .update_one(doc! { "_id": "trimmed" }, note)
             .upsert(true);
         limited(USUAL, note).await?;
-        unsigned(floor)
+        self.remove_records(guard.floor).await?;
+        unsigned(guard.floor)
     }
 
-    async fn remove_events(&self, floor: i64) -> Result<(), StoreError> {
-        let events = &self.tables.events;
-        loop {
-            let oldest = events
-                .find_one(doc! {})
-                .sort(doc! { "_id": 1 })
-                .projection(doc! { "_id": 1 });
-            let Some(oldest) = limited(USUAL, oldest).await? else {
-                return Ok(());
-            };
-            let oldest = rows::integer(&oldest, "_id")?;
-            if oldest > floor {
-                return Ok(());
-            }
-            let until = floor.min(oldest + STEP - 1);
-            limited(USUAL, events.delete_many(doc! { "_id": { "$lte": until } })).await?;
-        }
+    /// One step. If another process was faster, it has done nothing.
+    async fn move_some(&self, guard: Guard, wanted: i64, keep: u32) -> Result<(), StoreError> {
+        let part = Part {
+            after: guard.floor,
+            records: STEP,
+            whole: true,
+        };
+        let (records, _) = self.read_records(part).await?;
+        let floor = records.last().map_or(wanted, |record| record.last.min(wanted));
+        let mut commands = vec![advance(guard, doc! { rows::FLOOR: floor })];
+        commands.extend(copies(records, guard.floor, floor, keep));
+        self.guarded(commands).await?;
+        Ok(())
     }
 
     async fn remove_versions(&self, now: Trimmed) -> Result<(), StoreError> {
         let before = self.read_note().await?;
         let mut doomed = Vec::new();
         for key in self.changed_keys(before, now).await? {
-            let mine = rows::versions_below(&key, i64::MAX);
-            let find = self
-                .tables
-                .versions
-                .find(mine)
-                .sort(doc! { "_id": -1 })
-                .projection(doc! { "_id": 1 });
-            let revisions = collect(find, |found| Ok(rows::split_version_id(&rows::text(found, "_id")?)?.1)).await?;
-            let gone = to_spare(&revisions, now.floor, now.keep);
+            let gone = to_spare(&self.revisions_of(&key, now).await?, now.floor, now.keep);
             doomed.extend(gone.into_iter().map(|revision| rows::version_id(&key, revision)));
-            if doomed.len() >= usize::try_from(STEP).unwrap_or(usize::MAX) {
+            if doomed.len() >= STEP {
                 self.remove_named(std::mem::take(&mut doomed)).await?;
             }
         }
         self.remove_named(doomed).await
+    }
+
+    /// Revisions of the versions of a document, newest first; of those in the log, as many as count.
+    async fn revisions_of(&self, key: &str, now: Trimmed) -> Result<Vec<i64>, StoreError> {
+        let find = self
+            .tables
+            .versions
+            .find(rows::versions_below(key, i64::MAX))
+            .projection(doc! { "_id": 1 });
+        let kept = collect(find, |found| Ok(rows::split_version_id(&rows::text(found, "_id")?)?.1));
+        let mut revisions: BTreeSet<i64> = kept.await?.into_iter().collect();
+        let find = self
+            .tables
+            .events
+            .find(doc! { "docs.key": key, "_id": { "$gt": now.floor - RECORD_COMMITS } })
+            .sort(doc! { "_id": -1 })
+            .limit(i64::from(now.keep).max(1))
+            .projection(doc! { "docs.key": 1, "docs.revision": 1 });
+        let logged = collect(find, |found| {
+            let mut mine = Vec::new();
+            for change in rows::members(found, "docs") {
+                let change = change?;
+                if change.get_str("key").is_ok_and(|found| found == key) {
+                    mine.push(rows::integer(change, "revision")?);
+                }
+            }
+            Ok(mine)
+        });
+        let logged = logged.await?.into_iter().flatten();
+        revisions.extend(logged.filter(|revision| *revision > now.floor));
+        Ok(revisions.into_iter().rev().collect())
     }
 
     async fn remove_named(&self, ids: Vec<String>) -> Result<(), StoreError> {
@@ -86,14 +128,18 @@ impl MongoStore {
         for (above, until) in before.ranges_until(now) {
             let range = doc! { "revision": { "$gt": above, "$lte": until } };
             let find = self.tables.versions.find(range).projection(doc! { "_id": 1 });
-            limited_steps(LONG, async {
-                let mut cursor = find.await.map_err(store_error)?;
-                while let Some(found) = cursor.try_next().await.map_err(store_error)? {
-                    keys.insert(rows::split_version_id(&rows::text(&found, "_id")?)?.0.to_owned());
-                }
-                Ok(())
-            })
-            .await?;
+            let kept = collect_within(LONG, find, |found| {
+                Ok(rows::split_version_id(&rows::text(found, "_id")?)?.0.to_owned())
+            });
+            keys.extend(kept.await?);
+            let range = doc! { "_id": { "$gt": above.saturating_sub(RECORD_COMMITS), "$lte": until } };
+            let find = self.tables.events.find(range).projection(doc! { "docs.key": 1 });
+            let logged = collect_within(LONG, find, |found| {
+                let docs = rows::members(found, "docs");
+                docs.map(|change| rows::text(change?, "key"))
+                    .collect::<Result<Vec<_>, _>>()
+            });
+            keys.extend(logged.await?.into_iter().flatten());
         }
         Ok(keys)
     }
@@ -103,6 +149,60 @@ impl MongoStore {
         let found = limited(USUAL, self.tables.meta.find_one(doc! { "_id": "trimmed" })).await?;
         Ok(found.as_ref().and_then(note).unwrap_or_default())
     }
+}
+
+/// Commands that copy what outlives the commits above one revision and up to another.
+fn copies(records: Vec<Record>, above: i64, until: i64, keep: u32) -> Vec<Document> {
+    let now = now().as_millis();
+    let mut tables: BTreeMap<&str, Vec<Document>> = BTreeMap::new();
+    let mut versions = Vec::new();
+    for record in records {
+        // Both are moved with the end of their record, so that each is moved once.
+        if record.last <= until {
+            let audit = record.audit.iter().filter(|row| row.time > now - AUDIT_KEPT_MS);
+            tables.entry("audit").or_default().extend(audit.map(|row| {
+                let mut new = rows::audit(row);
+                new.remove("_id");
+                doc! { "q": { "_id": &row.id }, "u": new, "upsert": true }
+            }));
+            let answers = record.answers.iter().filter(|row| row.expires > now);
+            tables.entry("idempotency").or_default().extend(answers.map(|row| {
+                let mut new = rows::idempotency(row);
+                new.remove("_id");
+                doc! { "q": { "_id": &row.id }, "u": new, "upsert": true }
+            }));
+        }
+        versions.extend(record.versions);
+    }
+    versions.retain(|row| row.revision > above && row.revision <= until);
+    let updates = worth_keeping(&versions, keep).into_iter().map(|row| {
+        let mut new = rows::version(row);
+        new.remove("_id");
+        doc! { "q": { "_id": rows::version_id(&row.key, row.revision) }, "u": new, "upsert": true }
+    });
+    tables.insert("versions", updates.collect());
+    let mut commands = Vec::new();
+    for (table, updates) in tables {
+        commands.extend(chunks(updates).into_iter().map(|some| update_command(table, some)));
+    }
+    commands
+}
+
+/// The newest of each document: those before them are to spare as soon as these are below the floor.
+fn worth_keeping(versions: &[VersionRow], keep: u32) -> Vec<&VersionRow> {
+    let most = usize::try_from(keep).unwrap_or(usize::MAX).max(1);
+    let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+    let newest = versions.iter().rev().filter(|row| {
+        let count = counts.entry(row.key.as_str()).or_default();
+        *count += 1;
+        *count <= most
+    });
+    newest.collect()
+}
+
+/// Updates in commands below the limit of the server.
+fn chunks(updates: Vec<Document>) -> Vec<Vec<Document>> {
+    super::upkeep::chunks(updates, BYTES)
 }
 
 fn note(found: &Document) -> Option<Trimmed> {

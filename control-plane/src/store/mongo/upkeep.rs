@@ -8,15 +8,17 @@ use mongodb::{ClientSession, Collection, Database};
 use tokio::sync::mpsc;
 
 use super::client::{LONG, USUAL, limited};
-use super::errors::write_errors;
-use super::rows::{self, FLOOR};
+use super::errors::write_error;
+use super::rows::{self, FLOOR, Guard};
+use super::statements::RECORD_COMMITS;
 use super::{MongoStore, collect};
+use crate::store::StoreError;
 use crate::store::encode::{corrupt, signed};
+use crate::store::rows::DocumentRow;
 use crate::store::upkeep::{
     BackupHead, BackupRow, Piece, RESTORE_RAISES_BY, Restored, Rewriter, Row, not_empty, not_whole, now, rewritten,
     send,
 };
-use crate::store::{CommitError, StoreError};
 
 /// Documents that one step of a rewriting looks at, and rows that one insertion of a restore has at most.
 const STEP: i64 = 200;
@@ -34,8 +36,7 @@ impl MongoStore {
     /// Sends everything, read in one snapshot. A server keeps a snapshot for five minutes
     /// (`minSnapshotHistoryWindowInSeconds`).
     pub(super) async fn send_all(&self, pieces: &mpsc::Sender<Piece>) -> Result<(), StoreError> {
-        let tables: [(&str, ReadRow); 5] = [
-            ("documents", |found| rows::read_document(found).map(Row::Document)),
+        let tables: [(&str, ReadRow); 4] = [
             ("versions", |found| rows::read_version(found).map(Row::Version)),
             ("audit", |found| rows::read_audit(found).map(Box::new).map(Row::Audit)),
             ("tokens", |found| rows::read_token(found).map(Row::Token)),
@@ -46,19 +47,95 @@ impl MongoStore {
         // A snapshot session brings its read concern; one of the collections would stand in its way.
         let plain = self.tables.client.database(self.tables.database.name());
         let mut session = limited(USUAL, self.tables.client.start_session().snapshot(true)).await?;
-        let head = read_head(&plain, &mut session).await?;
+        let (head, guard) = read_head(&plain, &mut session).await?;
         send(pieces, Piece::Head(head)).await?;
+        let row = |row| send(pieces, Piece::Row(BackupRow(row)));
+        // What the documents lack, they get on the way.
+        let mut changed = self.send_log(&plain, &mut session, guard, pieces).await?;
+        let documents = plain.collection::<Document>("documents");
+        let find = documents.find(doc! { "_id": { "$ne": FLOOR } }).sort(doc! { "_id": 1 });
+        let mut cursor = limited(USUAL, async { find.session(&mut session).await }).await?;
+        while let Some(found) = next(&mut cursor, &mut session).await? {
+            let old = rows::read_document(&found)?;
+            if let Some(now) = changed.remove(&old.key).unwrap_or(Some(old)) {
+                row(Row::Document(now)).await?;
+            }
+        }
+        for new in changed.into_values().flatten() {
+            row(Row::Document(new)).await?;
+        }
         for (table, read) in tables {
             let table = plain.collection::<Document>(table);
             let find = table.find(doc! {}).sort(doc! { "_id": 1 });
             let mut cursor = limited(USUAL, async { find.session(&mut session).await }).await?;
             while let Some(found) = next(&mut cursor, &mut session).await? {
-                if found.get_str("_id").is_ok_and(|id| id != FLOOR) {
-                    send(pieces, Piece::Row(BackupRow(read(&found)?))).await?;
-                }
+                row(read(&found)?).await?;
             }
         }
         send(pieces, Piece::End).await
+    }
+
+    /// Sends what is in the log alone. Gives the documents that changed since those of the table; none for a deleted one.
+    async fn send_log(
+        &self,
+        plain: &Database,
+        session: &mut ClientSession,
+        guard: Guard,
+        pieces: &mpsc::Sender<Piece>,
+    ) -> Result<BTreeMap<String, Option<DocumentRow>>, StoreError> {
+        let row = |row| send(pieces, Piece::Row(BackupRow(row)));
+        let mut changed = BTreeMap::new();
+        let events = plain.collection::<Document>("events");
+        let above = doc! { "last": { "$gt": guard.floor }, "_id": { "$gt": guard.floor - RECORD_COMMITS } };
+        let find = events.find(above).sort(doc! { "_id": 1 });
+        let mut cursor = limited(USUAL, async { find.session(&mut *session).await }).await?;
+        while let Some(found) = next(&mut cursor, session).await? {
+            let record = rows::read_record(&found)?;
+            let lacking: Vec<i64> = record.incomplete().collect();
+            for version in record.versions {
+                if version.revision > guard.folded {
+                    let current = (!version.is_deletion()).then(|| version.clone().into_current());
+                    changed.insert(version.key.clone(), current);
+                }
+                // Up to the floor they are copied already.
+                if version.revision > guard.floor {
+                    row(Row::Version(version)).await?;
+                }
+            }
+            self.note_rest(plain, session, (lacking, guard.folded), &mut changed)
+                .await?;
+            for entry in record.audit {
+                row(Row::Audit(Box::new(entry))).await?;
+            }
+            for answer in record.answers {
+                row(Row::Idempotency(answer)).await?;
+            }
+        }
+        Ok(changed)
+    }
+
+    /// Changes that a record had no room for are sent with the table that has them.
+    async fn note_rest(
+        &self,
+        plain: &Database,
+        session: &mut ClientSession,
+        (lacking, folded): (Vec<i64>, i64),
+        changed: &mut BTreeMap<String, Option<DocumentRow>>,
+    ) -> Result<(), StoreError> {
+        if lacking.is_empty() {
+            return Ok(());
+        }
+        let versions = plain.collection::<Document>("versions");
+        let find = versions.find(doc! { "revision": { "$in": lacking } });
+        let mut cursor = limited(USUAL, async { find.session(&mut *session).await }).await?;
+        while let Some(found) = next(&mut cursor, session).await? {
+            let version = rows::read_version(&found)?;
+            if version.revision > folded {
+                let current = (!version.is_deletion()).then(|| version.clone().into_current());
+                changed.insert(version.key, current);
+            }
+        }
+        Ok(())
     }
 
     /// Fills an empty store, which cannot be opened until it is whole.
@@ -83,10 +160,17 @@ impl MongoStore {
             store_id: uuid::Uuid::now_v7().to_string(),
             revision: head.revision + RESTORE_RAISES_BY,
         };
-        self.raise_floor(signed(restored.revision)).await?;
+        self.start_at(signed(restored.revision)).await?;
         self.mark(doc! { "$set": { "store_id": &restored.store_id }, "$unset": { "restoring": "" } })
             .await?;
         Ok(restored)
+    }
+
+    /// The log goes on above a revision, and the documents are those of it.
+    async fn start_at(&self, revision: i64) -> Result<(), StoreError> {
+        let guard = doc! { "$max": { FLOOR: revision, "folded": revision } };
+        limited(USUAL, self.tables.documents.update_one(doc! { "_id": FLOOR }, guard)).await?;
+        Ok(())
     }
 
     async fn mark(&self, change: Document) -> Result<(), StoreError> {
@@ -110,10 +194,61 @@ impl MongoStore {
         Ok(true)
     }
 
-    /// Rewrites documents, then versions. A document that is changed meanwhile keeps its change.
+    /// Rewrites the log, then documents and versions. A document that is changed meanwhile keeps its change. Whoever has
+    /// read of the log before, and is about to copy it, finds the guard changed, and begins anew.
     pub(super) async fn rewrite_all(&self, make: Rewriter<'_>, before: BeforeStep<'_>) -> Result<u64, StoreError> {
-        let documents = self.rewrite_table(&self.tables.documents, make, before).await?;
-        Ok(documents + self.rewrite_table(&self.tables.versions, make, before).await?)
+        if !self.has_guard().await? {
+            // It was never opened, so it has no documents.
+            return Ok(0);
+        }
+        let head = self.read_head().await?;
+        self.fold_until(signed(head)).await?;
+        let mut replaced = self.rewrite_log(make, before).await?;
+        let count = doc! { "$inc": { "rewrites": 1_i64 } };
+        limited(USUAL, self.tables.documents.update_one(doc! { "_id": FLOOR }, count)).await?;
+        replaced += self.rewrite_table(&self.tables.documents, make, before).await?;
+        Ok(replaced + self.rewrite_table(&self.tables.versions, make, before).await?)
+    }
+
+    /// Below the floor, too, for as long as it is there.
+    async fn rewrite_log(&self, make: Rewriter<'_>, before: BeforeStep<'_>) -> Result<u64, StoreError> {
+        let (mut place, mut replaced) = (i64::MIN, 0);
+        loop {
+            before().await?;
+            let behind = doc! { "_id": { "$gt": place } };
+            let find = self.tables.events.find(behind).sort(doc! { "_id": 1 }).limit(STEP / 4);
+            let find = find.projection(doc! { "docs.key": 1, "docs.document": 1 });
+            let found = collect(find, |found| Ok(found.clone())).await?;
+            let Some(last) = found.last() else {
+                return Ok(replaced);
+            };
+            place = rows::integer(last, "_id")?;
+            for record in found {
+                replaced += self.rewrite_record(&record, make).await?;
+            }
+        }
+    }
+
+    async fn rewrite_record(&self, record: &Document, make: Rewriter<'_>) -> Result<u64, StoreError> {
+        let (mut old, mut new) = (doc! { "_id": rows::integer(record, "_id")? }, Document::new());
+        for (place, change) in rows::members(record, "docs").enumerate() {
+            let change = change?;
+            let text = rows::text(change, "document")?;
+            if let Some(made) = rewritten(&rows::text(change, "key")?, &text, make)? {
+                // Nothing changes a record but another rewriting, and that changes all of it.
+                if new.is_empty() {
+                    old.insert(format!("docs.{place}.document"), text);
+                }
+                new.insert(format!("docs.{place}.document"), made);
+            }
+        }
+        if new.is_empty() {
+            return Ok(0);
+        }
+        let count = u64::try_from(new.len()).map_err(corrupt)?;
+        let update = self.tables.events.update_one(old, doc! { "$set": new });
+        let done = limited(LONG, update).await?;
+        Ok(count * done.modified_count)
     }
 
     async fn rewrite_table(
@@ -143,7 +278,7 @@ impl MongoStore {
                     updates.push(doc! { "q": { "_id": &id, "document": text }, "u": { "$set": { "document": new } } });
                 }
             }
-            for some in chunks(updates) {
+            for some in chunks(updates, BYTES) {
                 replaced += self.replace(table.name(), some).await?;
             }
         }
@@ -154,21 +289,20 @@ impl MongoStore {
             "update": table, "updates": updates, "ordered": false, "writeConcern": { "w": "majority", "j": true },
         };
         let answer = limited(LONG, self.tables.database.run_command(command)).await?;
-        match write_errors(&answer) {
-            Some(CommitError::NotWritten(error) | CommitError::Unknown(error)) => Err(error),
-            Some(CommitError::Conflict) => Err(StoreError::Unavailable("MongoDB: a write conflict".to_owned())),
+        match write_error(&answer) {
+            Some(error) => Err(error),
             None => u64::try_from(rows::integer(&answer, "nModified")?).map_err(corrupt),
         }
     }
 }
 
-/// Below the size of a command, two texts to each update.
-fn chunks(updates: Vec<Document>) -> Vec<Vec<Document>> {
+/// Updates in commands of a size, about.
+pub(super) fn chunks(updates: Vec<Document>, most: usize) -> Vec<Vec<Document>> {
     let mut chunks = vec![Vec::new()];
     let mut bytes = 0;
     for update in updates {
         let size = text_bytes(&update);
-        if bytes + size > BYTES {
+        if bytes + size > most {
             chunks.push(Vec::new());
             bytes = 0;
         }
@@ -190,12 +324,12 @@ fn text_bytes(found: &Document) -> usize {
     sizes.sum::<usize>() + rows::OVERHEAD_BYTES
 }
 
-async fn read_head(plain: &Database, session: &mut ClientSession) -> Result<BackupHead, StoreError> {
+async fn read_head(plain: &Database, session: &mut ClientSession) -> Result<(BackupHead, Guard), StoreError> {
     let events = plain.collection::<Document>("events");
     let newest = events
         .find_one(doc! {})
         .sort(doc! { "_id": -1 })
-        .projection(doc! { "_id": 1 });
+        .projection(doc! { "last": 1 });
     let newest = limited(USUAL, newest.session(&mut *session)).await?;
     let floor = plain.collection::<Document>("documents");
     let floor = limited(USUAL, floor.find_one(doc! { "_id": FLOOR }).session(&mut *session)).await?;
@@ -204,15 +338,16 @@ async fn read_head(plain: &Database, session: &mut ClientSession) -> Result<Back
     let (Some(floor), Some(store)) = (floor, store) else {
         return Err(corrupt("the floor or the store's identity is missing"));
     };
-    let floor = rows::integer(&floor, FLOOR)?;
-    let newest = newest.map_or(Ok(0), |newest| rows::integer(&newest, "_id"))?;
-    Ok(BackupHead {
+    let guard = Guard::read(&floor)?;
+    let newest = newest.map_or(Ok(0), |newest| rows::integer(&newest, "last"))?;
+    let head = BackupHead {
         format: 1,
         store_id: rows::text(&store, "store_id")?,
-        revision: u64::try_from(newest.max(floor)).map_err(corrupt)?,
-        floor: u64::try_from(floor).map_err(corrupt)?,
+        revision: u64::try_from(newest.max(guard.floor)).map_err(corrupt)?,
+        floor: u64::try_from(guard.floor).map_err(corrupt)?,
         time: now().to_string(),
-    })
+    };
+    Ok((head, guard))
 }
 
 async fn next(

@@ -54,7 +54,7 @@ fn insert(transaction: &Transaction<'_>, group: &[EncodedCommit]) -> Result<(), 
     let mut delete = transaction
         .prepare("DELETE FROM documents WHERE key = ?1")
         .map_err(not_written)?;
-    for (key, row) in last_versions(group) {
+    for (key, row) in last_versions(group.iter().flat_map(|commit| &commit.versions)) {
         let done = match row.is_deletion() {
             true => delete.execute([key]),
             false => put.execute((key, row.revision, &row.document)),
