@@ -62,7 +62,7 @@ fn a_commit_is_read_as_it_was_written() {
     for (read, record) in commits.iter().zip(&records) {
         assert_eq!(read, &*record.commit);
     }
-    let last = last_versions(&group);
+    let last = last_versions(group.iter().flat_map(|commit| &commit.versions));
     assert_eq!(last.len(), 2);
     assert_eq!(last.get("Node/a").map(|version| version.revision), Some(5));
 }
