@@ -56,6 +56,11 @@ impl View {
         self.layer.as_ref()
     }
 
+    /// Whether it is not the whole system.
+    pub(crate) fn is_bound(&self) -> bool {
+        self.layer.is_some()
+    }
+
     /// Whether a document that counts there is seen.
     pub(crate) fn sees(&self, placement: &Placement) -> bool {
         self.layer

@@ -468,22 +468,17 @@ async fn refused(world: &World) {
     } });
     world.write(Method::PUT, "/api/v1/services/strict", &[], &strict).await;
     let service = "/api/v1/services/strict";
-    for (number, name) in ["short", "number", "word", "fixed", "pattern", "not", "any", "one"]
-        .iter()
-        .enumerate()
-    {
-        let patch = json!({ "spec": { "config": { *name: secret(u32::try_from(100 + number).unwrap()) } } });
+    // What a schema says of its text is not asked: the answer would tell of it.
+    for name in ["short", "word", "fixed", "pattern", "not", "any", "one"] {
+        let patch = json!({ "spec": { "config": { name: secret(99) } } });
+        let path = "/api/v1/services/strict?dry_run=true";
         let answer = world
-            .ask(&world.rest, Method::PATCH, service, &[("if-match", "*")], Some(&patch))
+            .ask(&world.rest, Method::PATCH, path, &[("if-match", "*")], Some(&patch))
             .await;
-        assert_eq!(
-            (answer.status, answer.code().as_str()),
-            (422, "schema_mismatch"),
-            "{name}: {}",
-            answer.text
-        );
+        assert_eq!(answer.status, 200, "{name}: {}", answer.text);
     }
     for (config, code) in [
+        (json!({ "number": secret(100) }), "schema_mismatch"),
         (json!({ "format": [secret(110), secret(110)] }), "schema_mismatch"),
         (json!({ "closed": { "x": secret(111) } }), "schema_mismatch"),
         (json!({ "a": { "$secret": text(112), "b": 1 } }), "validation_failed"),

@@ -321,7 +321,10 @@ mod tests {
             ),
             (Status::internal("failed to decode Protobuf message"), "invalid_request"),
             (Status::unimplemented(""), "method_not_allowed"),
-            (Status::from_error(Problem::new(Code::RateLimited, "").into()), "rate_limited"),
+            (
+                Status::from_error(Problem::new(Code::RateLimited, "").into()),
+                "rate_limited",
+            ),
         ] {
             let mut response = status.into_http::<Body>();
             response.headers_mut().insert(REVISION, 7.into());

@@ -329,7 +329,7 @@ impl ConfigService {
             Some(revision) => self.state_at(&now, revision).await?,
             None => now,
         };
-        let state = without_foreign_instance(caller, state, asked);
+        let state = without_foreign_instance(caller, state, asked)?;
         let at = self.resolve(caller, &state, asked)?;
         let sources = Sources::at(&state, &at);
         if read.reveal {
@@ -633,20 +633,21 @@ impl ConfigService {
     }
 }
 
-/// An instance with a document elsewhere is, to a bound token, what one without a document is: it must not be told from a
-/// name that nobody uses.
-fn without_foreign_instance(caller: &Caller, mut state: State, asked: &Place) -> State {
+/// To a token that is bound to a layer, an instance with a document elsewhere is what one without a document is, for the one
+/// must not be told from the other: none where a place is asked for, outside of the view where its own place is.
+fn without_foreign_instance(caller: &Caller, mut state: State, asked: &Place) -> Result<State, Problem> {
     if let (Some(service), Some(instance)) = (&asked.service, &asked.instance) {
         let key = Key::instance(service.clone(), DocumentName::from(instance));
         let view = view(&caller.claims);
-        if state
-            .get(&key)
-            .is_some_and(|held| !view.sees_document(&state, &held.document))
-        {
+        let is_seen = state.get(&key).map(|held| view.sees_document(&state, &held.document));
+        if view.is_bound() && is_seen != Some(true) && asked.node.is_none() && asked.layer.is_none() {
+            return Err(view.outside(&key.to_string()));
+        }
+        if is_seen == Some(false) {
             state.remove(&key);
         }
     }
-    state
+    Ok(state)
 }
 
 /// Digest of a layer's view.

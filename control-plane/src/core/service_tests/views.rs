@@ -149,18 +149,24 @@ async fn an_instance_elsewhere_is_as_one_that_nobody_uses() {
         json!({ "node": "server", "config": { "of": "fog" } }),
     )
     .await;
-    for layer in [None, Some("edge")] {
-        let of = async |instance: &str| {
-            let place = Place {
-                instance: Some(instance.parse().unwrap()),
-                layer: layer.map(|layer| layer.parse().unwrap()),
-                ..slam()
-            };
-            let answer = w.service.effective(&bound, &place, true, &ReadOptions::default()).await;
-            let mut value = answer.unwrap().value;
+    let of = async |instance: &str, layer: Option<&str>| {
+        let place = Place {
+            instance: Some(instance.parse().unwrap()),
+            layer: layer.map(|layer| layer.parse().unwrap()),
+            ..slam()
+        };
+        let answer = w.service.effective(&bound, &place, true, &ReadOptions::default()).await;
+        answer.map(|answer| {
+            let mut value = answer.value;
             value.place.instance = None;
             value
-        };
-        assert_eq!(of("far").await, of("unused").await);
+        })
+    };
+    assert_eq!(
+        of("far", Some("edge")).await.unwrap(),
+        of("unused", Some("edge")).await.unwrap()
+    );
+    for name in ["far", "unused"] {
+        assert_eq!(of(name, None).await.unwrap_err().code, Code::PermissionDenied, "{name}");
     }
 }

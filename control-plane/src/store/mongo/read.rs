@@ -43,7 +43,10 @@ impl MongoStore {
             "singleBatch": true, "readConcern": { "level": "majority" },
         };
         let answer = limited(QUICK, self.tables.database.run_raw_command(newest)).await?;
-        let batch = answer.get_document("cursor").ok().map(|cursor| rows::members(cursor, "firstBatch"));
+        let batch = answer
+            .get_document("cursor")
+            .ok()
+            .map(|cursor| rows::members(cursor, "firstBatch"));
         let head = match batch.and_then(|mut batch| batch.next()).transpose()? {
             Some(found) => unsigned(rows::integer(found, "last")?)?,
             // All commits up to the floor are gone, and none came after it.
