@@ -253,6 +253,12 @@ pub trait CommitLog: Send + Sync + 'static {
     /// Whether other processes may write to it too. `false`: nobody does while this one lives.
     fn is_shared(&self) -> bool;
 
+    /// A revision such that whoever has read it, and wrote all newer ones, has the newest state *now*: no other process
+    /// can have written since, or read what this one has not. `None`: ask for the [`CommitLog::head`].
+    fn alone(&self) -> Option<u64> {
+        (!self.is_shared()).then_some(0)
+    }
+
     /// Everything, in one snapshot.
     ///
     /// # Errors

@@ -4,6 +4,7 @@
 
 #![allow(clippy::unwrap_used, reason = "the helpers of a test fail like the test")]
 
+mod alone;
 mod killed;
 mod migrations;
 mod outages;

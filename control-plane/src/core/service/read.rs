@@ -63,13 +63,19 @@ impl ConfigService {
     /// The state that a read shows: as new as every write acknowledged before it, unless older data is allowed.
     pub(super) async fn read_state(&self, read: &ReadOptions) -> Result<State, Problem> {
         // Where nobody else writes, a write is acknowledged after it can be read here.
-        if !read.cached && self.inner.store.is_shared() {
+        if !read.cached && !self.is_newest() {
             self.inner.barrier.revision().await?;
         }
         if let Some(wanted) = read.min_revision {
             self.wait_for(wanted).await?;
         }
         Ok(self.state())
+    }
+
+    /// Whether the state in memory is the newest for certain.
+    fn is_newest(&self) -> bool {
+        let above = self.inner.store.alone();
+        above.is_some_and(|above| self.revision() >= above)
     }
 
     /// Waits up to five seconds until a revision is there.

@@ -2,7 +2,7 @@
 
 use super::*;
 
-fn on(kind: &str, name: &str, patch: Value) -> Value {
+fn on(kind: &str, name: &str, patch: &Value) -> Value {
     json!({
         "target": { "kind": kind, "name": name }, "patch": patch,
         "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
@@ -42,11 +42,11 @@ async fn a_roll_out_is_checked_where_it_is_tried() {
         ("Layer", "edge", json!({ "config": { "n": "text" } })),
         ("Node", "robot-1", json!({ "overrides": { "s": { "n": "text" } } })),
     ] {
-        let refused = start(&w, &w.admin, "r", on(kind, name, patch)).await;
+        let refused = start(&w, &w.admin, "r", on(kind, name, &patch)).await;
         assert_eq!(code(refused), Code::SchemaMismatch, "{kind}");
     }
     let patch = json!({ "config": { "n": 2 } });
-    let items = vec![("Rollout/r", on("Service", "s", patch))];
+    let items = vec![("Rollout/r", on("Service", "s", &patch))];
     let report = w.apply(items).await.unwrap();
     let nodes: Vec<_> = report.affected.iter().filter_map(|place| place.node.as_ref()).collect();
     assert_eq!(nodes.len(), 1, "{report:?}");
@@ -58,20 +58,20 @@ async fn a_roll_out_is_checked_where_it_is_tried() {
 #[tokio::test]
 async fn what_a_roll_out_makes_of_its_target_must_be_allowed() {
     let w = canary_world().await;
-    let refused = start(&w, &w.admin, "r", on("Node", "robot-1", json!({ "layer": "nowhere" }))).await;
+    let refused = start(&w, &w.admin, "r", on("Node", "robot-1", &json!({ "layer": "nowhere" }))).await;
     let problem = refused.unwrap_err();
     assert_eq!(problem.code, Code::ReferenceNotFound);
     assert_eq!(problem.errors[0].pointer, "/spec/patch/layer");
     let bound = caller(&["operator"], Some("edge"));
-    let moves = on("Node", "robot-1", json!({ "layer": "fog" }));
+    let moves = on("Node", "robot-1", &json!({ "layer": "fog" }));
     assert_eq!(code(start(&w, &bound, "r", moves).await), Code::PermissionDenied);
-    let stays = on("Node", "robot-1", json!({ "type": "mobile" }));
+    let stays = on("Node", "robot-1", &json!({ "type": "mobile" }));
     start(&w, &bound, "r", stays).await.unwrap();
 
     // Two halves that are too large together, when it begins and when it is promoted.
     let half = |letter: &str| letter.repeat(140 * 1024);
     w.put("Service/s", json!({ "config": { "a": half("a") } })).await;
-    let large = on("Service", "s", json!({ "config": { "b": half("b") } }));
+    let large = on("Service", "s", &json!({ "config": { "b": half("b") } }));
     assert_eq!(
         code(start(&w, &w.admin, "large", large.clone()).await),
         Code::PayloadTooLarge
@@ -89,7 +89,7 @@ async fn what_a_roll_out_makes_of_its_target_must_be_allowed() {
 #[tokio::test]
 async fn one_roll_out_at_a_time_until_it_has_ended() {
     let w = canary_world().await;
-    let spec = || on("Service", "s", json!({ "config": { "n": 2 } }));
+    let spec = || on("Service", "s", &json!({ "config": { "n": 2 } }));
     start(&w, &w.admin, "first", spec()).await.unwrap();
     let problem = start(&w, &w.admin, "second", spec()).await.unwrap_err();
     let first = w.get("Rollout/first").await.unwrap();
@@ -108,7 +108,7 @@ async fn one_roll_out_at_a_time_until_it_has_ended() {
 #[tokio::test]
 async fn a_promotion_can_be_reverted_and_the_roll_out_stays_as_it_is() {
     let w = canary_world().await;
-    let spec = on("Service", "s", json!({ "config": { "n": 2 } }));
+    let spec = on("Service", "s", &json!({ "config": { "n": 2 } }));
     let started = start(&w, &w.admin, "r", spec).await.unwrap().document.revision;
     let name = "r".parse().unwrap();
     let promoted = w.service.promote_rollout(&w.admin, &name, None).await.unwrap().revision;
@@ -123,7 +123,7 @@ async fn a_promotion_can_be_reverted_and_the_roll_out_stays_as_it_is() {
     w.service.revert(&w.admin, started, true, None).await.unwrap();
     assert_eq!(code(w.get("Rollout/r").await), Code::NotFound);
     // A commit that changed nothing but a roll-out has nothing to give back.
-    start(&w, &w.admin, "q", on("Service", "s", json!({ "config": { "n": 3 } })))
+    start(&w, &w.admin, "q", on("Service", "s", &json!({ "config": { "n": 3 } })))
         .await
         .unwrap();
     let name = "q".parse().unwrap();

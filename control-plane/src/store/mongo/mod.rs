@@ -8,7 +8,7 @@
 //!             had no room for
 //! audit, idempotency   of commits below the floor, and of what was no commit; removed by the server when they expire
 //! tokens      removed by the server when they expire
-//! meta        store: identity, min_version · lease: who migrates · trimmed · settled
+//! meta        store: identity, min_version · members: who uses it · lease: who migrates · trimmed · settled
 //! migrations  which steps are done
 //! ```
 //!
@@ -23,6 +23,7 @@ mod errors;
 mod fence;
 mod fold;
 mod follow;
+mod members;
 mod migrate;
 mod read;
 mod rows;
@@ -47,6 +48,7 @@ use self::client::{Tables, USUAL, limited_steps};
 use self::errors::store_error;
 use self::fence::Fence;
 use self::follow::Stream;
+use self::members::Members;
 use super::encode::encode_group;
 use super::migrate::{Migrations, Plan};
 use super::upkeep::{Piece, Restored, Rewriter, Upkeep};
@@ -60,6 +62,8 @@ pub struct MongoStore {
     tables: Tables,
     /// Which opening of the store this is; marks its commits, so that it need not be told of them.
     writer: String,
+    /// Itself and others; none before it is open.
+    members: Option<Members>,
     /// What is known of the newest revision.
     fence: parking_lot::Mutex<Fence>,
     /// Records up to this revision were removed already, if they could be.
@@ -87,8 +91,9 @@ impl MongoStore {
     /// # Errors
     /// As [`MongoStore::open`].
     pub async fn open_with(uri: &str, database: &str, migrations: &Migrations) -> Result<Self, StoreError> {
-        let store = Self::connect(uri, database).await?;
+        let mut store = Self::connect(uri, database).await?;
         store.migrate(migrations).await?;
+        store.members = Some(Members::join(&store.tables, &store.writer).await?);
         Ok(store)
     }
 
@@ -138,10 +143,23 @@ impl MongoStore {
         done
     }
 
+    /// Waits until other processes reckon with this one.
+    async fn admitted(&self) -> Result<u64, StoreError> {
+        match &self.members {
+            Some(members) => members.admitted().await,
+            None => Ok(0),
+        }
+    }
+
+    fn is_still_admitted(&self, joined: u64) -> bool {
+        self.members.as_ref().is_none_or(|members| members.is_still(joined))
+    }
+
     async fn connect(uri: &str, database: &str) -> Result<Self, StoreError> {
         Ok(Self {
             tables: Tables::connect(uri, database).await?,
             writer: uuid::Uuid::now_v7().to_string(),
+            members: None,
             fence: parking_lot::Mutex::default(),
             removed: parking_lot::Mutex::default(),
             session: tokio::sync::Mutex::new(None),
@@ -186,8 +204,19 @@ impl CommitLog for MongoStore {
         self.read_all().await
     }
 
+    fn alone(&self) -> Option<u64> {
+        self.members.as_ref().and_then(Members::alone)
+    }
+
     async fn head(&self) -> Result<u64, StoreError> {
-        self.read_head().await
+        let joined = self.admitted().await?;
+        let head = self.read_head().await?;
+        match self.is_still_admitted(joined) {
+            true => Ok(head),
+            false => Err(StoreError::Unavailable(
+                "MongoDB: this process stood still while it read".to_owned(),
+            )),
+        }
     }
 
     async fn commits_after(&self, revision: u64, limit: usize) -> Result<CommitBatch, StoreError> {
@@ -196,7 +225,14 @@ impl CommitLog for MongoStore {
 
     async fn commit(&self, records: &[CommitRecord]) -> Result<(), CommitError> {
         let group = encode_group(records).map_err(CommitError::NotWritten)?;
-        self.write_group(&group).await
+        let joined = self.admitted().await.map_err(CommitError::NotWritten)?;
+        self.write_group(&group).await?;
+        if !self.is_still_admitted(joined) {
+            // Another process may have thought that it is alone, and answered reads without this.
+            let text = "MongoDB: this process stood still while it wrote".to_owned();
+            return Err(CommitError::Unknown(StoreError::Unavailable(text)));
+        }
+        Ok(())
     }
 
     async fn foreign_commit(&self) {
@@ -269,6 +305,9 @@ impl Upkeep for MongoStore {
     }
 
     async fn close(&self) {
+        if let Some(members) = &self.members {
+            members.leave().await;
+        }
         // Both hold on to the connection.
         self.stream.lock().await.take();
         self.session.lock().await.take();

@@ -10,7 +10,7 @@ use mongodb::{ClientSession, Database};
 use tokio::time::Instant;
 
 use super::MongoStore;
-use super::client::{LONG, QUICK, USUAL, limited, limited_steps};
+use super::client::{LONG, QUICK, Tables, USUAL, limited, limited_steps};
 use super::errors::{is_snapshot_unavailable, store_error};
 use super::fence::since_boot;
 use super::rows::{self, FLOOR, Guard, Record};
@@ -37,21 +37,7 @@ impl MongoStore {
     /// The newest revision that a majority has.
     pub(super) async fn read_head(&self) -> Result<u64, StoreError> {
         let asked = since_boot();
-        // An index has all of it: the record itself may be large, and this is asked for by nearly every read.
-        let newest = rawdoc! {
-            "find": "events", "filter": {}, "projection": { "_id": 0, "last": 1 }, "sort": { "last": -1 }, "limit": 1,
-            "singleBatch": true, "readConcern": { "level": "majority" },
-        };
-        let answer = limited(QUICK, self.tables.database.run_raw_command(newest)).await?;
-        let batch = answer
-            .get_document("cursor")
-            .ok()
-            .map(|cursor| rows::members(cursor, "firstBatch"));
-        let head = match batch.and_then(|mut batch| batch.next()).transpose()? {
-            Some(found) => unsigned(rows::integer(found, "last")?)?,
-            // All commits up to the floor are gone, and none came after it.
-            None => self.read_floor().await?,
-        };
+        let head = newest(&self.tables).await?;
         self.fence.lock().newest_was(signed(head), asked, since_boot());
         Ok(head)
     }
@@ -66,8 +52,7 @@ impl MongoStore {
     }
 
     pub(super) async fn read_guard(&self) -> Result<Guard, StoreError> {
-        let found = limited(QUICK, self.tables.documents.find_one(doc! { "_id": FLOOR })).await?;
-        Guard::read(&found.ok_or_else(|| corrupt("the floor is missing"))?)
+        guard(&self.tables).await
     }
 
     /// Everything in one snapshot.
@@ -200,6 +185,28 @@ impl MongoStore {
         fill(records, super::collect(find, rows::read_version).await?);
         Ok(())
     }
+}
+
+/// The newest revision that a majority has.
+pub(super) async fn newest(tables: &Tables) -> Result<u64, StoreError> {
+    // An index has all of it: the record itself may be large, and this is asked for by nearly every read.
+    let newest = rawdoc! {
+        "find": "events", "filter": {}, "projection": { "_id": 0, "last": 1 }, "sort": { "last": -1 }, "limit": 1,
+        "singleBatch": true, "readConcern": { "level": "majority" },
+    };
+    let answer = limited(QUICK, tables.database.run_raw_command(newest)).await?;
+    let batch = answer.get_document("cursor").ok();
+    let found = batch.and_then(|batch| rows::members(batch, "firstBatch").next());
+    match found.transpose()? {
+        Some(found) => unsigned(rows::integer(found, "last")?),
+        // All commits up to the floor are gone, and none came after it.
+        None => unsigned(guard(tables).await?.floor),
+    }
+}
+
+async fn guard(tables: &Tables) -> Result<Guard, StoreError> {
+    let found = limited(QUICK, tables.documents.find_one(doc! { "_id": FLOOR })).await?;
+    Guard::read(&found.ok_or_else(|| corrupt("the floor is missing"))?)
 }
 
 /// Puts changes into the records of their commits. A copy of one that is there already changes nothing.

@@ -65,7 +65,7 @@ async fn a_long_read_holds_up_neither_commits_nor_health() {
     let files = Files::new();
     let store = files.store().await;
     let (begin, began) = tokio::sync::oneshot::channel();
-    let (end, ended) = std::sync::mpsc::channel::<()>();
+    let (end, ended) = std::sync::mpsc::sync_channel::<()>(1);
     let long = store.read(move |_| {
         begin.send(()).unwrap();
         // Ends with the other side, whatever becomes of the test.
