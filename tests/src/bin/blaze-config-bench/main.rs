@@ -80,6 +80,9 @@ struct Arguments {
     /// Only those whose name contains this beside etcd: grpc, rest, mongodb, sqlite
     #[arg(long, default_value = "")]
     beside: String,
+    /// A second main service on MongoDB, so that reads have to ask the database
+    #[arg(long)]
+    second_process: bool,
     /// Folder for the data of all servers; else the one that holds this program, under target/
     #[arg(long, value_name = "FOLDER")]
     data: Option<PathBuf>,
@@ -158,7 +161,7 @@ fn main() -> anyhow::Result<ExitCode> {
         .into_iter()
         .filter(|store| contenders.iter().any(|contender| contender.store == *store))
         .collect();
-    let subjects = Subjects::start(folder.path(), &stores, arguments.documents)?;
+    let subjects = Subjects::start(folder.path(), &stores, arguments.documents, arguments.second_process)?;
     runtime.block_on(async {
         for subject in subjects.all() {
             subject.fill().await?;

@@ -58,6 +58,8 @@ enum Server {
 struct Blaze {
     store: Store,
     process: Process,
+    /// Does nothing, but might.
+    _second: Option<Process>,
     mongo: Option<MongoServer>,
     rest: SocketAddr,
     grpc: SocketAddr,
@@ -98,18 +100,18 @@ struct Sample {
 }
 
 impl Subjects {
-    /// Starts etcd and a main service on each store, all with data in one folder.
+    /// Starts etcd and a main service on each store, all with data in one folder; on MongoDB a second one if that is wanted.
     ///
     /// # Errors
     /// When one is not there or does not start.
-    pub(crate) fn start(folder: &Path, stores: &[Store], documents: u64) -> anyhow::Result<Self> {
+    pub(crate) fn start(folder: &Path, stores: &[Store], documents: u64, second: bool) -> anyhow::Result<Self> {
         let etcd = EtcdServer::start(EtcdOptions {
             folder: Some(folder.to_owned()),
             extra: vec![ETCD_BYTES.to_owned()],
         })?;
         let mut all = vec![Subject::new("etcd", documents, Server::Etcd(etcd))];
         for store in stores {
-            let blaze = Blaze::start(folder, *store)?;
+            let blaze = Blaze::start(folder, *store, second && *store == Store::Mongo)?;
             let name = format!("blaze {}", store.name());
             all.push(Subject::new(&name, documents, Server::Blaze(Box::new(blaze))));
         }
@@ -253,7 +255,7 @@ fn aborted(mongo: &MongoServer) -> anyhow::Result<i64> {
 
 impl Blaze {
     /// With a token needed and everything else as it is by default.
-    fn start(folder: &Path, store: Store) -> anyhow::Result<Self> {
+    fn start(folder: &Path, store: Store, second: bool) -> anyhow::Result<Self> {
         let folder = folder.join(store.name());
         std::fs::create_dir(&folder)?;
         let mongo = match store {
@@ -278,13 +280,8 @@ impl Blaze {
             "--config",
             node_file.to_str().context("the folder has a name in UTF-8")?,
         ];
-        let process = Process::start("blaze-config", &arguments, None)?;
-        let line = wait::until_some(
-            "the ready line of blaze-config",
-            START,
-            || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
-            || process.tail(),
-        )?;
+        let (process, line) = ready(&arguments)?;
+        let second = if second { Some(ready(&arguments)?.0) } else { None };
         let admin = address(&line, "admin")?;
         Ok(Self {
             store,
@@ -295,6 +292,7 @@ impl Blaze {
                 namespace: None,
             },
             process,
+            _second: second,
             mongo,
             token,
         })
@@ -312,6 +310,18 @@ impl Blaze {
             metric("blaze_config_commit_duration_seconds_count")?,
         ))
     }
+}
+
+/// A process that is ready, and the line that says so.
+fn ready(arguments: &[&str]) -> anyhow::Result<(Process, String)> {
+    let process = Process::start("blaze-config", arguments, None)?;
+    let line = wait::until_some(
+        "the ready line of blaze-config",
+        START,
+        || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
+        || process.tail(),
+    )?;
+    Ok((process, line))
 }
 
 /// JSON is YAML.
