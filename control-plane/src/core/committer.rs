@@ -143,7 +143,10 @@ pub(crate) async fn follow(store: &dyn Store, log: &Log, at_least: Option<u64>) 
             return Ok(());
         }
         let batch = store.commits_after(from, READ).await?;
-        if batch.floor > from && log.revision() == from {
+        if batch.floor > from {
+            if log.revision() != from {
+                continue;
+            }
             // What is between was trimmed: this process has slept too long and begins anew.
             let snapshot = store.load().await?;
             tracing::warn!(
@@ -252,6 +255,11 @@ impl Committer {
             });
         }
         let start = self.log.state();
+        // Who is told of an answer may read what it speaks of.
+        let is_ahead = |one: &Work| matches!(one.before, Some(Tried::Before(revision, _)) if revision > start.revision());
+        if work.iter().any(is_ahead) {
+            return Err(Again::Follow);
+        }
         let is_long = batch.iter().map(|queued| queued.bytes).sum::<usize>() > QUICK_BYTES
             || start.has_schemas()
             || start.has_big()

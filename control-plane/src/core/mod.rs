@@ -8,7 +8,9 @@
 
 mod affected;
 mod barrier;
+mod check;
 mod committer;
+mod cost;
 mod effective;
 mod evaluate;
 mod log;

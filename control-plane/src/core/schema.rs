@@ -4,41 +4,28 @@ use std::collections::{HashMap, HashSet};
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
-use blaze_domain::ServiceName;
-use blaze_domain::config::spec::NODE_FILE_SECTIONS;
-use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_DEPTH, MAX_EFFECTIVE_BYTES, canonical, secret};
-use jsonschema::error::ValidationErrorKind;
+use blaze_domain::config::{canonical, secret};
 use jsonschema::{Draft, Keyword, PatternOptions, ValidationError, Validator};
 use lru::LruCache;
 use parking_lot::Mutex;
 use serde_json::{Map, Value};
 use sha2::{Digest as _, Sha256};
 
-use super::affected::touched;
-use super::effective::{At, Sources};
-use super::state::State;
-use super::view::View;
+use super::cost;
 
 /// Compiled schemas that are kept.
 const CACHED: NonZeroUsize = NonZeroUsize::MIN.saturating_add(511);
-/// Faults that are told, at most.
-pub(crate) const MAX_FAULTS: usize = 20;
 /// Compiled patterns may take so many bytes each.
 const PATTERN_BYTES: usize = 1 << 20;
-/// Subschemas that may be looked at on the way to one leaf of a configuration. References that meet again multiply it.
-const MAX_STEPS: u64 = 10_000;
-/// How many of them may lie within each other: each takes a part of the stack.
-const MAX_NESTING: usize = 512;
-
-/// Subschemas that `uniqueItems` counts as: it looks at all that a list holds.
-const UNIQUE_STEPS: u64 = 50;
 /// The dialect that schemas are in.
 const DIALECT: &str = "https://json-schema.org/draft/2020-12/schema";
 
 /// A schema, in full and without `required`.
-struct Compiled {
+pub(super) struct Compiled {
     full: Validator,
     partial: Validator,
+    /// That it takes for each value of a configuration, at most.
+    steps: u64,
 }
 
 /// Compiled schemas, the most recently used.
@@ -54,13 +41,28 @@ impl Default for Schemas {
     }
 }
 
+impl Compiled {
+    /// The form for an instance, and the one for a service without instance.
+    pub(super) fn validator(&self, is_instance: bool) -> &Validator {
+        match is_instance {
+            true => &self.full,
+            false => &self.partial,
+        }
+    }
+
+    /// Steps for each value of a configuration, at most.
+    pub(super) fn steps(&self) -> u64 {
+        self.steps
+    }
+}
+
 impl Schemas {
     /// What is wrong with the schema itself.
     pub(crate) fn check(&self, schema: &Value) -> Result<(), String> {
         self.compiled(schema).map(|_| ())
     }
 
-    fn compiled(&self, schema: &Value) -> Result<Arc<Compiled>, String> {
+    pub(super) fn compiled(&self, schema: &Value) -> Result<Arc<Compiled>, String> {
         let text = schema.to_string();
         let id: [u8; 32] = Sha256::digest(text.as_bytes()).into();
         if let Some(found) = self.cache.lock().get(&id) {
@@ -72,9 +74,7 @@ impl Schemas {
             ));
         }
         if let Some(dialect) = foreign_dialect(schema) {
-            return Err(format!(
-                "$schema {dialect:?} is another dialect; only {DIALECT} is taken"
-            ));
+            return Err(dialect);
         }
         let build = |schema: &Value| {
             let patterns = PatternOptions::regex()
@@ -93,8 +93,9 @@ impl Schemas {
             let text: String = error.to_string().chars().take(500).collect();
             format!("at {:?}: {text}", error.instance_path().as_str())
         })?;
-        estimate(schema)?;
+        let steps = cost::steps(schema)?;
         let compiled = Arc::new(Compiled {
+            steps,
             full: build(schema)?,
             // What refers into a keyword that goes leads nowhere: then only the full form can be judged.
             partial: build(&without_required(schema)).or_else(|_| build(&Value::Bool(true)))?,
@@ -102,101 +103,12 @@ impl Schemas {
         self.cache.lock().put(id, Arc::clone(&compiled));
         Ok(compiled)
     }
-
-    /// Checks every effective configuration that changed documents can concern: its size, and its service's schema. Of
-    /// what is outside the view no more is told than that it would not do.
-    pub(crate) fn check_effective(&self, state: &State, keys: &[Key], view: &View) -> Vec<FieldFault> {
-        let any_schema = |service: &ServiceName| schema_of(state, service).is_some();
-        // Most writes concern no schema at all; to find the places that they touch would cost more than the write.
-        let matters = |key: &&Key| {
-            state.has_big()
-                || match (key.kind(), key.service_name()) {
-                    (Kind::Service, _) => any_schema(&ServiceName::from(key.name())),
-                    (Kind::Instance, Some(service)) => any_schema(service),
-                    _ => state.has_schemas(),
-                }
-        };
-        let keys: Vec<Key> = keys.iter().filter(matters).cloned().collect();
-        let mut faults = Vec::new();
-        let mut is_refused_outside = false;
-        for at in touched(state, &keys) {
-            if faults.len() >= MAX_FAULTS {
-                break;
-            }
-            let Some(service) = &at.service else { continue };
-            let has_schema = any_schema(service);
-            if !has_schema && !state.has_big() {
-                continue;
-            }
-            let is_seen = view.sees_place(state, &at);
-            if is_refused_outside && !is_seen {
-                continue;
-            }
-            let sources = Sources::at(state, &at);
-            let mut found = Vec::new();
-            if state.has_big() && sources.size_bound() > MAX_EFFECTIVE_BYTES {
-                found.extend(size_fault(&sources, &at));
-            }
-            if has_schema && let Some(document) = schema_of(state, service) {
-                self.check_one(&document, &sources, &at, MAX_FAULTS - faults.len(), &mut found);
-            }
-            if is_seen {
-                faults.append(&mut found);
-            } else if !found.is_empty() {
-                is_refused_outside = true;
-                faults.push(FieldFault {
-                    pointer: "/spec".to_owned(),
-                    code: Code::SchemaMismatch,
-                    detail: "a service outside the token's layer does not take this".to_owned(),
-                    document: None,
-                });
-            }
-        }
-        faults.truncate(MAX_FAULTS);
-        faults
-    }
-
-    fn check_one(&self, service: &Document, sources: &Sources, at: &At, limit: usize, faults: &mut Vec<FieldFault>) {
-        let Some(schema) = service.spec_member("schema") else {
-            return;
-        };
-        let Ok(compiled) = self.compiled(schema) else {
-            // It was sound when it was written; a newer program may see it otherwise, and must not block every write.
-            tracing::warn!(service = %service.key, "the stored schema cannot be compiled; it is not checked");
-            return;
-        };
-        let (mut config, secrets) = with_placeholders(sources.merged());
-        if let Value::Object(members) = &mut config {
-            members.retain(|name, _| !NODE_FILE_SECTIONS.contains(&name.as_str()));
-        }
-        let validator = if at.instance.is_some() {
-            &compiled.full
-        } else {
-            &compiled.partial
-        };
-        let errors = validator.iter_errors(&config).filter(|error| {
-            !secrets.contains(error.instance_path().as_str())
-                || matches!(
-                    error.kind(),
-                    ValidationErrorKind::Type { .. } | ValidationErrorKind::FalseSchema
-                )
-        });
-        for error in errors.take(limit) {
-            let found: String = error.masked().to_string().chars().take(300).collect();
-            faults.push(FieldFault {
-                pointer: format!("/spec/config{}", error.instance_path().as_str()),
-                code: Code::SchemaMismatch,
-                detail: format!("effective configuration of {}: {found}", described(at)),
-                document: None,
-            });
-        }
-    }
 }
 
 /// A configuration with a text in place of each secret that says nothing of it, and where they are. Whether a text has a
 /// length or matches a pattern would tell it, one try after the other, to who may not read it. The texts differ, as
 /// secrets may.
-fn with_placeholders(mut config: Value) -> (Value, HashSet<String>) {
+pub(super) fn with_placeholders(mut config: Value) -> (Value, HashSet<String>) {
     let mut found = HashSet::new();
     if secret::contains(&config) {
         secret::map(&mut config, &mut |pointer, _| {
@@ -246,49 +158,28 @@ fn unique_items<'a>(
     Ok(Box::new(UniqueItems(schema.as_bool().unwrap_or(false))))
 }
 
-/// The dialect that a schema says it is in, if it is not the one that is taken.
-fn foreign_dialect(schema: &Value) -> Option<&Value> {
-    let dialect = schema.get("$schema")?;
+/// What is wrong with the dialect that a schema, or a part of it, says it is in: only one is taken. A part in another one
+/// would be read by other rules than those that its cost is told by.
+fn foreign_dialect(schema: &Value) -> Option<String> {
+    let members = schema.as_object()?;
+    let own = own_dialect(members);
+    own.or_else(|| members.iter().find_map(|(name, value)| match (name.as_str(), value) {
+        (name, value) if ONE.contains(&name) => foreign_dialect(value),
+        (name, Value::Array(list)) if LIST.contains(&name) => list.iter().find_map(foreign_dialect),
+        (name, Value::Object(named)) if NAMED.contains(&name) => named.values().find_map(foreign_dialect),
+        _ => None,
+    }))
+}
+
+/// The same of one subschema without those within it.
+pub(super) fn own_dialect(members: &Map<String, Value>) -> Option<String> {
+    let dialect = members.get("$schema")?;
     let text = dialect.as_str().map(|text| text.strip_suffix('#').unwrap_or(text));
-    (text != Some(DIALECT)).then_some(dialect)
-}
-
-fn schema_of(state: &State, service: &ServiceName) -> Option<Arc<Document>> {
-    let held = state.get(&Key::service(service))?;
-    held.document
-        .spec_member("schema")
-        .is_some()
-        .then(|| Arc::clone(&held.document))
-}
-
-fn size_fault(sources: &Sources, at: &At) -> Option<FieldFault> {
-    let bytes = sources.merged().to_string().len();
-    (bytes > MAX_EFFECTIVE_BYTES).then(|| FieldFault {
-        pointer: "/spec/config".to_owned(),
-        code: Code::ValidationFailed,
-        detail: format!(
-            "effective configuration of {}: {bytes} bytes, at most {MAX_EFFECTIVE_BYTES} are allowed",
-            described(at)
-        ),
-        document: None,
-    })
-}
-
-fn described(at: &At) -> String {
-    let mut out = at.service.as_ref().map(ToString::to_string).unwrap_or_default();
-    if let Some(instance) = &at.instance {
-        out.push_str(&format!("/{instance}"));
-    }
-    match (&at.node, &at.layer) {
-        (Some(node), _) => out.push_str(&format!(" on node {node}")),
-        (None, Some(layer)) => out.push_str(&format!(" in layer {layer}")),
-        (None, None) => {}
-    }
-    out
+    (text != Some(DIALECT)).then(|| format!("$schema {dialect} is another dialect; only {DIALECT} is taken"))
 }
 
 /// Keywords whose value is one schema.
-const ONE: &[&str] = &[
+pub(super) const ONE: &[&str] = &[
     "additionalProperties",
     "contains",
     "contentSchema",
@@ -307,6 +198,7 @@ const LIST: &[&str] = &["allOf", "anyOf", "oneOf", "prefixItems"];
 const NAMED: &[&str] = &[
     "$defs",
     "definitions",
+    "dependencies",
     "dependentSchemas",
     "patternProperties",
     "properties",
@@ -417,9 +309,12 @@ fn without_unevaluated(schema: &Value) -> Value {
     Value::Object(kept.collect())
 }
 
-/// What a reference within a schema leads to.
-fn resolve<'s>(root: &'s Value, anchors: &HashMap<&str, &'s Value>, reference: &str) -> Option<&'s Value> {
+/// What a reference within a schema leads to. Percent-encoding leads nowhere: decoded it could be another place.
+pub(super) fn resolve<'s>(root: &'s Value, anchors: &HashMap<&str, &'s Value>, reference: &str) -> Option<&'s Value> {
     let fragment = reference.strip_prefix('#').unwrap_or(reference);
+    if fragment.contains('%') {
+        return None;
+    }
     match fragment.is_empty() || fragment.starts_with('/') {
         true => root.pointer(fragment),
         false => anchors.get(fragment).copied(),
@@ -438,150 +333,12 @@ fn foreign_reference(value: &Value) -> Option<String> {
     }
 }
 
-/// What checking one leaf of a configuration comes to, at most.
-#[derive(Clone, Copy)]
-struct Effort {
-    steps: u64,
-    nesting: usize,
-}
-
-impl Effort {
-    const NONE: Self = Self { steps: 0, nesting: 0 };
-    const ONE: Self = Self { steps: 1, nesting: 1 };
-
-    /// Both are looked at.
-    fn and(self, other: Self) -> Self {
-        Self {
-            steps: self.steps.saturating_add(other.steps),
-            nesting: self.nesting.max(other.nesting),
-        }
-    }
-
-    /// One of them is looked at.
-    fn or(self, other: Self) -> Self {
-        Self {
-            steps: self.steps.max(other.steps),
-            nesting: self.nesting.max(other.nesting),
-        }
-    }
-}
-
-/// Refuses a schema that could take for ever, or the whole stack, although it is small.
-fn estimate(schema: &Value) -> Result<(), String> {
-    let mut anchors = HashMap::new();
-    find_anchors(schema, true, &mut anchors)?;
-    let mut estimate = Estimate {
-        root: schema,
-        anchors,
-        known: HashMap::new(),
-    };
-    estimate.effort(schema, MAX_DEPTH, 1).map(|_| ())
-}
-
-struct Estimate<'s> {
-    root: &'s Value,
-    anchors: HashMap<&'s str, &'s Value>,
-    /// By subschema, and how many levels of the configuration may still come.
-    known: HashMap<(*const Value, usize), Effort>,
-}
-
-impl<'s> Estimate<'s> {
-    fn effort(&mut self, schema: &'s Value, levels: usize, nesting: usize) -> Result<Effort, String> {
-        let Value::Object(members) = schema else {
-            return Ok(Effort::ONE);
-        };
-        let id = (std::ptr::from_ref(schema), levels);
-        if let Some(known) = self.known.get(&id) {
-            return Ok(*known);
-        }
-        if nesting > MAX_NESTING {
-            return Err(too_much());
-        }
-        // What leads back to itself at one place is not followed again.
-        self.known.insert(id, Effort::ONE);
-        let (mut here, mut below) = (Effort::NONE, Effort::NONE);
-        for (name, value) in members {
-            match (name.as_str(), value) {
-                ("$ref" | "$dynamicRef", Value::String(target)) => {
-                    let target = self.target(target)?;
-                    here = here.and(self.effort(target, levels, nesting + 1)?);
-                }
-                ("not" | "if" | "then" | "else", value) => {
-                    here = here.and(self.effort(value, levels, nesting + 1)?);
-                }
-                ("allOf" | "anyOf" | "oneOf", Value::Array(list)) => {
-                    for one in list {
-                        here = here.and(self.effort(one, levels, nesting + 1)?);
-                    }
-                }
-                ("dependentSchemas", Value::Object(named)) => {
-                    for one in named.values() {
-                        here = here.and(self.effort(one, levels, nesting + 1)?);
-                    }
-                }
-                _ if levels == 0 => {}
-                // A member has one name, and an item one place.
-                ("properties", Value::Object(named)) => {
-                    let mut any = Effort::NONE;
-                    for one in named.values() {
-                        any = any.or(self.effort(one, levels - 1, nesting + 1)?);
-                    }
-                    below = below.and(any);
-                }
-                ("prefixItems", Value::Array(list)) => {
-                    let mut any = Effort::NONE;
-                    for one in list {
-                        any = any.or(self.effort(one, levels - 1, nesting + 1)?);
-                    }
-                    below = below.and(any);
-                }
-                ("patternProperties", Value::Object(named)) => {
-                    for one in named.values() {
-                        below = below.and(self.effort(one, levels - 1, nesting + 1)?);
-                    }
-                }
-                (name, value) if ONE.contains(&name) => {
-                    below = below.and(self.effort(value, levels - 1, nesting + 1)?);
-                }
-                _ => {}
-            }
-        }
-        if members.contains_key("unevaluatedProperties") || members.contains_key("unevaluatedItems") {
-            // To know what is left over, everything is looked at once more.
-            here = here.and(here);
-        }
-        if members.get("uniqueItems").and_then(Value::as_bool) == Some(true) {
-            here.steps = here.steps.saturating_add(UNIQUE_STEPS);
-        }
-        let within = here.and(below);
-        let effort = Effort {
-            steps: within.steps.saturating_add(1),
-            nesting: within.nesting + 1,
-        };
-        if effort.steps > MAX_STEPS || effort.nesting > MAX_NESTING {
-            return Err(too_much());
-        }
-        self.known.insert(id, effort);
-        Ok(effort)
-    }
-
-    fn target(&self, reference: &str) -> Result<&'s Value, String> {
-        resolve(self.root, &self.anchors, reference).ok_or_else(|| {
-            let known = "#, #/… (without percent-encoding) or #anchor";
-            format!("$ref {reference:?} leads nowhere; it is {known}")
-        })
-    }
-}
-
-fn too_much() -> String {
-    format!(
-        "its references meet again and again: more than {MAX_STEPS} subschemas for one value, or {MAX_NESTING} within \
-         each other"
-    )
-}
-
 /// Anchors by name. Within a subschema with an `$id` of its own, `#` would be something else.
-fn find_anchors<'s>(value: &'s Value, is_root: bool, out: &mut HashMap<&'s str, &'s Value>) -> Result<(), String> {
+pub(super) fn find_anchors<'s>(
+    value: &'s Value,
+    is_root: bool,
+    out: &mut HashMap<&'s str, &'s Value>,
+) -> Result<(), String> {
     match value {
         Value::Object(members) => {
             if !is_root && members.get("$id").is_some_and(Value::is_string) {
@@ -589,7 +346,10 @@ fn find_anchors<'s>(value: &'s Value, is_root: bool, out: &mut HashMap<&'s str, 
             }
             for name in ["$anchor", "$dynamicAnchor"] {
                 if let Some(anchor) = members.get(name).and_then(Value::as_str) {
-                    out.insert(anchor, value);
+                    let other = out.insert(anchor, value);
+                    if other.is_some_and(|other| !std::ptr::eq(other, value)) {
+                        return Err(format!("the anchor {anchor:?} is there twice"));
+                    }
                 }
             }
             members.values().try_for_each(|inner| find_anchors(inner, false, out))
@@ -611,11 +371,12 @@ mod tests {
             "type": "object", "required": ["a"],
             "properties": { "required": { "type": "array" }, "a": { "required": ["b"], "type": "object" } },
             "allOf": [{ "required": ["c"] }], "enum": [{ "required": 1 }],
+            "dependencies": { "a": { "required": ["b"] }, "b": ["a"] },
         });
         let expected = json!({
             "type": "object",
             "properties": { "required": { "type": "array" }, "a": { "type": "object" } },
-            "allOf": [{}], "enum": [{ "required": 1 }],
+            "allOf": [{}], "enum": [{ "required": 1 }], "dependencies": { "a": {}, "b": ["a"] },
         });
         assert_eq!(without_required(&schema), expected);
     }
@@ -672,8 +433,6 @@ mod tests {
     fn a_schema_may_lead_back_to_itself() {
         let schemas = Schemas::default();
         for schema in [
-            json!({ "$ref": "#" }),
-            json!({ "allOf": [{ "$ref": "#" }, { "$ref": "#" }] }),
             json!({ "properties": { "left": { "$ref": "#" }, "right": { "$ref": "#" }, "value": true } }),
             json!({ "type": ["object", "string"], "additionalProperties": { "$ref": "#" } }),
             json!({
@@ -717,9 +476,19 @@ mod tests {
             json!("https://example.org/meta"),
             json!(7),
         ] {
-            let error = schemas.check(&json!({ "$schema": bad })).unwrap_err();
-            assert!(error.contains("another dialect"), "{error}");
+            let part = json!({ "$schema": bad });
+            for schema in [
+                part.clone(),
+                json!({ "properties": { "a": part } }),
+                json!({ "$defs": { "a": { "anyOf": [part] } } }),
+                json!({ "$ref": "#/enum/0", "enum": [part] }),
+            ] {
+                let error = schemas.check(&schema).unwrap_err();
+                assert!(error.contains("another dialect"), "{schema}: {error}");
+            }
         }
+        let own = json!({ "properties": { "a": { "$schema": DIALECT } }, "enum": [{ "$schema": "x" }] });
+        assert_eq!(schemas.check(&own), Ok(()));
         assert_eq!(
             schemas.check(&json!({ "properties": { "$schema": { "type": "string" } } })),
             Ok(())

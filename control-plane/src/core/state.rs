@@ -37,9 +37,21 @@ impl Held {
         self.bytes > BIG_BYTES
     }
 
+    /// A service's, or one that a roll-out tries.
     fn has_schema(&self) -> bool {
-        self.document.key.kind() == Kind::Service && self.document.spec_member("schema").is_some()
+        let document = &self.document;
+        match document.key.kind() {
+            Kind::Service => document.spec_member("schema").is_some(),
+            Kind::Rollout => is_active(document) && tries_schema(document),
+            Kind::Layer | Kind::Node | Kind::Instance => false,
+        }
     }
+}
+
+/// Whether the change of a roll-out brings a schema.
+pub(crate) fn tries_schema(rollout: &Document) -> bool {
+    let schema = rollout.spec_member("patch").and_then(|patch| patch.get("schema"));
+    schema.is_some_and(|schema| !schema.is_null())
 }
 
 /// The document as users see it.
@@ -72,7 +84,7 @@ pub(crate) struct State {
     active: OrdSet<(Key, Key)>,
     /// Documents that are large enough to matter for the size of effective configurations.
     big: usize,
-    /// Services with a schema.
+    /// Services with a schema, and roll-outs that try one now.
     schemas: usize,
 }
 
@@ -171,9 +183,15 @@ impl State {
         self.big > 0
     }
 
-    /// Whether any service has a schema.
+    /// Whether any service has a schema, be it on canaries alone.
     pub(crate) fn has_schemas(&self) -> bool {
         self.schemas > 0
+    }
+
+    /// Whether this one has.
+    pub(crate) fn has_schema(&self, service: &ServiceName) -> bool {
+        let key = Key::service(service);
+        self.get(&key).is_some_and(|held| held.has_schema()) || self.active_on(&key).any(|held| held.has_schema())
     }
 
     /// Puts a document, in place of the one of the same key.

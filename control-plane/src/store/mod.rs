@@ -41,6 +41,9 @@ use upkeep::Piece;
 pub(crate) const READ_BYTES: i64 = 8 * 1024 * 1024;
 /// How long the audit is kept: 400 days, in milliseconds.
 pub(crate) const AUDIT_KEPT_MS: i64 = 400 * 24 * 3_600 * 1_000;
+/// How long a token is remembered after it has run out: clocks differ, and a revoked one must be known as long as it is
+/// accepted (`blaze_auth::LEEWAY_S`, twice). MongoDB's index says the same.
+pub(crate) const TOKEN_KEPT_MS: i64 = 60_000;
 
 /// Opens the store that the node file names, and migrates it.
 ///

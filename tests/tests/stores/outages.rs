@@ -93,6 +93,44 @@ async fn a_server_that_stands_still_is_unavailable_and_goes_on() {
     check(&store, &ledger).await;
 }
 
+/// A server that stands still long enough for its connections to be given up still reads what was sent before.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_was_sent_to_a_server_that_stands_still_is_not_refused() {
+    let server = server();
+    let store = store(&server).await;
+    let mut ledger = Ledger::new();
+    for round in 0..if blaze_tests::long() { 10 } else { 2 } {
+        write_through(&store, &mut ledger).await;
+        let revision = store_head(&ledger) + 1;
+        let batch = format!("sent-{round}");
+        server.freeze().unwrap();
+        let group = [record(revision, &batch)];
+        let (told, ()) = tokio::join!(store.commit(&group), async {
+            // Longer than the driver waits for a sign of life (3 s), shorter than a commit is tried (10 s).
+            tokio::time::sleep(Duration::from_millis(3_500 + 400 * round)).await;
+            server.thaw().unwrap();
+        });
+        println!("{told:?}");
+        match told {
+            Ok(()) => ledger.insert(batch, Told::Yes),
+            Err(CommitError::Unknown(_)) => ledger.insert(batch, Told::Unknown),
+            Err(CommitError::Conflict | CommitError::NotWritten(_)) => ledger.insert(batch, Told::No),
+        };
+        // What may have been written has to be looked at before memory counts.
+        if ledger.values().any(|told| *told == Told::Unknown) {
+            assert!(store.alone().is_none_or(|above| above >= revision));
+            return check_with_unknown(&store, &mut ledger).await;
+        }
+    }
+    write_through(&store, &mut ledger).await;
+    check(&store, &ledger).await;
+}
+
+async fn check_with_unknown(store: &MongoStore, ledger: &mut Ledger) {
+    write_through(store, ledger).await;
+    check(store, ledger).await;
+}
+
 /// Every write counts as yes, no or unknown, and yes and no hold exactly, while the server is killed again and again.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_writer_is_told_is_true_while_the_server_is_killed() {

@@ -12,7 +12,7 @@ use super::super::types::{Answer, Caller, Page, ReadOptions, TokenRequest};
 use super::super::view::authorize_whole;
 use super::ConfigService;
 use crate::auth::{Claims, NewToken};
-use crate::store::{AuditEntry, AuditQuery, StoreError, TokenRecord};
+use crate::store::{AuditEntry, AuditQuery, StoreError, TOKEN_KEPT_MS, TokenRecord};
 
 /// Refusals per address and second that are written to the audit; the rest is counted.
 const DENIALS_PER_S: u32 = 10;
@@ -20,8 +20,6 @@ const DENIALS_PER_S: u32 = 10;
 const MAX_ADDRESSES: usize = 4096;
 /// Longest life of a token, in seconds: a year.
 const MAX_EXPIRES_S: u32 = 31_536_000;
-/// A revoked token is remembered so long after it has run out, in milliseconds: clocks differ.
-const REVOKED_FOR_MS: i64 = 2 * blaze_auth::LEEWAY_S * 1000;
 /// Entries of a page of the audit.
 const PAGE: usize = 100;
 /// The same, at most.
@@ -147,6 +145,8 @@ impl ConfigService {
             .map_err(|error| unavailable(&error))?;
         let more = items.len() > limit;
         items.truncate(limit);
+        // A commit that is not in the state yet is not told of, or a read that follows would be older than this one.
+        items.retain(|entry| entry.revision.is_none_or(|revision| revision <= state.revision()));
         let next = items.last().filter(|_| more).map(|entry| Position {
             revision: state.revision(),
             after: entry.id.clone(),
@@ -176,7 +176,7 @@ impl ConfigService {
         check_token(&request)?;
         let disabled = || {
             let detail = "no key with sign: true is configured (control_plane.auth.keys)";
-            Problem::new(Code::SigningDisabled, detail)
+            Problem::new(Code::SigningDisabled, detail).at(self.revision())
         };
         let authenticator = self.inner.authenticator.as_ref().ok_or_else(disabled)?;
         let time = now();
@@ -261,7 +261,7 @@ impl ConfigService {
     /// Reads which tokens are revoked.
     pub(super) async fn refresh_tokens(&self) -> Result<(), StoreError> {
         // A token is accepted for a while after it has run out, for clocks differ.
-        let since = Timestamp::from_millis(now().as_millis() - REVOKED_FOR_MS);
+        let since = Timestamp::from_millis(now().as_millis() - TOKEN_KEPT_MS);
         let tokens = self.inner.store.tokens(since).await?;
         let revoked = tokens.into_iter().filter(|token| token.revoke_time.is_some());
         let entries = revoked.map(|token| (token.id, token.expire_time.as_millis() / 1000));

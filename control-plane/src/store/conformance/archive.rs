@@ -51,7 +51,17 @@ pub async fn versions_come_newest_first(fixture: &dyn Fixture) -> Outcome {
         &0,
     )?;
     let unknown = told("versions", model.store.versions(&samples::key("z"), None, 9).await)?;
-    same("versions of an unknown document", &unknown.len(), &0)
+    same("versions of an unknown document", &unknown.len(), &0)?;
+    // The page begins in the middle of commits that were written together, with later changes of the same document.
+    model.write(&[&["b"]]).await?;
+    model.write(&[&["ab"], &["b"], &["b"], &["ab"]]).await?;
+    for (below, limit, expected) in [(8, 1, vec![6]), (9, 1, vec![8]), (9, 2, vec![8, 6]), (8, 9, vec![6])] {
+        let page = model.store.versions(&samples::key("b"), Some(below), limit).await;
+        let page = told("versions", page)?;
+        let page: Vec<u64> = page.iter().map(|version| version.revision).collect();
+        same(&format!("{limit} below {below}"), &page, &expected)?;
+    }
+    Ok(())
 }
 
 /// The newest revision before a time is found.

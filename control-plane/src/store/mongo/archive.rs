@@ -17,6 +17,8 @@ use crate::store::rows::{AuditRow, IdempotencyRow, TokenRow, VersionRow};
 use crate::store::upkeep::now;
 use crate::store::{AUDIT_KEPT_MS, AuditEntry, AuditQuery, IdempotencyRecord, StoreError, TokenRecord, Version};
 
+/// Between the time of an entry and that in its id, at most: they are taken one after the other.
+const ID_SLACK_MS: i64 = 3_600_000;
 /// Documents that one query names.
 const NAMED: usize = 500;
 
@@ -39,7 +41,8 @@ impl MongoStore {
             .events
             .find(matching)
             .sort(doc! { "_id": -1 })
-            .limit(limit_of(limit));
+            // One more, for the record in the middle of which it begins may have later changes alone.
+            .limit(limit_of(limit.saturating_add(1)));
         let find = find.projection(only_of(&doc! { "$eq": ["$$doc.key", &key] }));
         let records = collect(find, rows::read_record).await?;
         let floor = signed(self.read_floor().await?);
@@ -254,9 +257,12 @@ impl MongoStore {
 
     /// The newest entries beside commits that a query asks for, by id. Records come by their newest entry, and may overlap.
     async fn audit_of_the_log(&self, query: &AuditQuery) -> Result<BTreeMap<String, AuditRow>, StoreError> {
-        let mut matching = doc! { "audit_last": { "$gt": "" } };
-        if let Some(below) = &query.below {
-            matching.insert("audit_first", doc! { "$lt": below });
+        // Below the floor they were moved.
+        let floor = signed(self.read_floor().await?);
+        let (first, last) = ids_of(query);
+        let mut matching = doc! { "audit_last": { "$gt": first }, "last": { "$gt": floor } };
+        if let Some(last) = last {
+            matching.insert("audit_first", doc! { "$lt": last });
         }
         let entry = audit_filter(query);
         if !entry.is_empty() {
@@ -300,8 +306,11 @@ impl MongoStore {
 
     /// All answers of these ids, also expired ones. First the log, then what trimming has moved out of it.
     pub(super) async fn read_answers(&self, ids: &[&str]) -> Result<Vec<IdempotencyRow>, StoreError> {
-        let find = self.tables.events.find(doc! { "answers._id": { "$in": ids } });
-        let find = find.projection(doc! { "answers": 1 });
+        // What is below the floor was moved; a record that is still there may be one that came too late.
+        let floor = signed(self.read_floor().await?);
+        let find = self.tables.events.find(doc! { "answers._id": { "$in": ids }, "last": { "$gt": floor } });
+        let asked = doc! { "$filter": { "input": "$answers", "as": "answer", "cond": { "$in": ["$$answer._id", ids] } } };
+        let find = find.projection(doc! { "answers": asked });
         let logged = collect(find, |found| {
             let answers = rows::members(found, "answers").map(|answer| rows::read_idempotency(answer?));
             answers.collect::<Result<Vec<_>, _>>()
@@ -387,6 +396,27 @@ fn time_in(record: &Document, revision: i64) -> Result<Option<i64>, StoreError> 
     let place = usize::try_from(revision - first).unwrap_or(usize::MAX);
     let commit = rows::members(record, "commits").nth(place).transpose()?;
     commit.map(|commit| rows::integer(commit, "time")).transpose()
+}
+
+/// Ids of entries are made in the order of their times, by the same clock: all that a query asks for have an id above the
+/// first one, and below the last one.
+fn ids_of(query: &AuditQuery) -> (String, Option<String>) {
+    let oldest = now().as_millis() - AUDIT_KEPT_MS;
+    let since = query.since.map_or(oldest, |since| since.as_millis().max(oldest));
+    let until = query.until.map(|until| id_at(until.as_millis() + ID_SLACK_MS));
+    let last = match (query.below.clone(), until) {
+        (Some(below), Some(until)) => Some(below.min(until)),
+        (below, until) => below.or(until),
+    };
+    (id_at(since - ID_SLACK_MS), last)
+}
+
+/// The least UUIDv7 of a time.
+fn id_at(milliseconds: i64) -> String {
+    let time = u64::try_from(milliseconds).unwrap_or(0).min((1 << 48) - 1);
+    let digits = format!("{time:012x}");
+    let (high, low) = digits.split_at(8);
+    format!("{high}-{low}")
 }
 
 /// As [`audit_filter`], for one entry of several in a record.

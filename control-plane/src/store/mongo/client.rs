@@ -85,8 +85,12 @@ impl Tables {
             app_name,
         };
         let hello = limited(USUAL, tables.admin().run_command(doc! { "hello": 1 })).await?;
-        let sharded = hello.get_str("msg").is_ok_and(|what| what == "isdbgrid");
-        if hello.get_str("setName").is_err() && !sharded {
+        if hello.get_str("msg").is_ok_and(|what| what == "isdbgrid") {
+            return Err(StoreError::Refused(
+                "this MongoDB is the router of a sharded cluster: name the members of a replica set of its own".to_owned(),
+            ));
+        }
+        if hello.get_str("setName").is_err() {
             return Err(StoreError::Refused(
                 "this MongoDB is no replica set, and has no transactions: start mongod with `--replSet rs0`, run \
                  `rs.initiate()` once (one member is enough)"

@@ -95,22 +95,30 @@ impl MongoStore {
         let begun = since_boot();
         let Statements { mut records, versions } = Statements::of(group, &self.writer);
         match (records.len(), records.pop()) {
-            (1, Some(record)) if versions.is_empty() => self.insert(record, first).await?,
+            (1, Some(record)) if versions.is_empty() => self.insert(record, first, proof).await?,
             (_, Some(record)) => {
                 records.push(record);
-                self.write_large(Statements { records, versions }, first).await?;
+                self.write_large(Statements { records, versions }, first, proof).await?;
             }
             (_, None) => {}
         }
         if !proof.holds(since_boot())
             && self.read_floor().await.map_err(CommitError::Unknown)? >= first.revision.unsigned_abs()
         {
-            // It is below the floor, where nobody looks, or was trimmed already.
-            let text = "MongoDB: this process stood still while it wrote".to_owned();
-            return Err(CommitError::Unknown(StoreError::Unavailable(text)));
+            // It is below the floor, where nobody looks, or was trimmed already; or it lies under the records of others.
+            self.remove_late(first).await;
+            return Err(CommitError::Unknown(stood_still()));
         }
         self.fence.lock().newest_was(last, begun, since_boot());
         Ok(())
+    }
+
+    /// Removes what was written too late. If that fails, readers leave it out, and trimming removes it.
+    async fn remove_late(&self, first: &EventRow) {
+        let ours = doc! { "_id": { "$gte": first.revision }, "batch": &first.batch };
+        if let Err(error) = limited(QUICK, self.tables.events.delete_many(ours)).await {
+            tracing::warn!(%error, revision = first.revision, "a commit that came too late could not be removed");
+        }
     }
 
     /// Makes sure that a revision comes right behind the newest.
@@ -146,7 +154,7 @@ impl MongoStore {
     }
 
     /// Inserts one record, and finds out what became of it.
-    async fn insert(&self, record: Document, first: &EventRow) -> Result<(), CommitError> {
+    async fn insert(&self, record: Document, first: &EventRow, proof: Proof) -> Result<(), CommitError> {
         let until = Instant::now() + LIMIT;
         let command = doc! {
             "insert": "events", "documents": [record], "maxTimeMS": i64::try_from(HELD.as_millis()).unwrap_or(i64::MAX),
@@ -157,6 +165,9 @@ impl MongoStore {
                 "MongoDB: the commit cannot be stored: {error}"
             )))
         })?;
+        if !proof.holds(since_boot()) {
+            return Err(CommitError::NotWritten(stood_still()));
+        }
         let because = match self.try_insert(&command).await {
             Tried::Written => return Ok(()),
             Tried::Taken => return Err(CommitError::Conflict),
@@ -170,6 +181,9 @@ impl MongoStore {
         // Once more: then it is there, or there is a record, and it can be seen whose.
         while Instant::now() < until {
             tokio::time::sleep(PAUSE).await;
+            if !proof.holds(since_boot()) {
+                break;
+            }
             match self.try_insert(&command).await {
                 Tried::Written => return Ok(()),
                 Tried::Taken => match self.batch_at(first.revision).await {
@@ -219,7 +233,7 @@ impl MongoStore {
     }
 
     /// Writes in one transaction what is too large for one record.
-    async fn write_large(&self, statements: Statements, first: &EventRow) -> Result<(), CommitError> {
+    async fn write_large(&self, statements: Statements, first: &EventRow, proof: Proof) -> Result<(), CommitError> {
         // Always the same session: a transaction on it ends what an earlier one may have left open on the server.
         let mut place = self.session.lock().await;
         let mut session = match place.take() {
@@ -228,6 +242,10 @@ impl MongoStore {
         };
         let deadline = Instant::now() + LIMIT;
         let (done, held) = match self.statements_within(deadline, &mut session, statements).await {
+            Ok(()) if !proof.holds(since_boot()) => {
+                abort(&mut session).await;
+                (Err(CommitError::NotWritten(stood_still())), false)
+            }
             Ok(()) => (self.finish(&mut session, first, deadline).await, false),
             Err(fault) => (Err(fault.error), fault.held),
         };
@@ -381,6 +399,10 @@ impl MongoStore {
             }
         }
     }
+}
+
+pub(super) fn stood_still() -> StoreError {
+    StoreError::Unavailable("MongoDB: this process stood still meanwhile".to_owned())
 }
 
 /// What a later transaction sees of an earlier one.

@@ -51,12 +51,12 @@ pub(super) fn is_write_conflict(error: &Error) -> bool {
     codes(error).iter().any(|code| *code == WRITE_CONFLICT || *code == 24)
 }
 
-/// Whether a command that failed like this has never left this process.
+/// Whether a command that failed like this has never left this process. A pool that was cleared says nothing: commands that
+/// were sent already fail by it, too.
 pub(super) fn was_not_sent(error: &Error) -> bool {
     matches!(
         error.kind.as_ref(),
         ErrorKind::ServerSelection { .. }
-            | ErrorKind::ConnectionPoolCleared { .. }
             | ErrorKind::Shutdown
             | ErrorKind::Authentication { .. }
             | ErrorKind::InvalidArgument { .. }

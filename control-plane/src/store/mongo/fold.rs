@@ -8,17 +8,19 @@
 //! Any process may do it at any time; whoever is second finds another r, and has done nothing.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use futures::FutureExt as _;
 use mongodb::bson::{Document, doc};
+use tokio::time::Instant;
 
-use super::MongoStore;
+use super::{MongoStore, collect};
 use super::client::{USUAL, limited};
 use super::errors::write_error;
 use super::fence::since_boot;
 use super::read::Part;
 use super::rows::{self, Guard};
-use super::statements::document_updates;
+use super::statements::{RECORD_COMMITS, document_updates};
 use crate::store::StoreError;
 use crate::store::encode::signed;
 
@@ -26,19 +28,36 @@ use crate::store::encode::signed;
 const STEP: usize = 1_000;
 /// Steps of one call that is not urgent.
 const STEPS: usize = 4;
+/// Revisions that the documents may be behind the log, for [`FOLD_PERIOD`].
+const BEHIND: i64 = 20_000;
+pub(super) const FOLD_PERIOD: Duration = Duration::from_secs(30);
 /// Revisions whose records one command removes.
 const REMOVED: i64 = 1_000;
 
 impl MongoStore {
     /// What can wait: bringing the documents up to date, removing what is below the floor.
     pub(super) async fn tidy_up(&self) -> Result<(), StoreError> {
-        for _ in 0..STEPS {
-            if !self.fold_once().await? {
-                break;
+        if self.is_time_to_fold().await? {
+            for _ in 0..STEPS {
+                if !self.fold_once().await? {
+                    *self.folded.lock() = Some(Instant::now());
+                    break;
+                }
             }
         }
         let floor = self.read_floor().await?;
         self.remove_records(signed(floor)).await
+    }
+
+    /// Seldom, and many commits together: writers wait while the database is at it, and a document that changed often is
+    /// written once.
+    async fn is_time_to_fold(&self) -> Result<bool, StoreError> {
+        let is_old = self.folded.lock().is_none_or(|last| last.elapsed() >= self.fold_period);
+        if is_old {
+            return Ok(true);
+        }
+        let newest = self.fence.lock().newest().unwrap_or(0);
+        Ok(newest - self.read_guard().await?.folded > BEHIND)
     }
 
     /// Brings the documents to a revision, at least.
@@ -103,6 +122,23 @@ impl MongoStore {
         failed.map_or(Ok(done), Err)
     }
 
+    /// Removes records across a revision under which others lie: they came too late, see [`super::fence`].
+    async fn remove_late_below(&self, revision: i64) -> Result<(), StoreError> {
+        let across = doc! { "_id": { "$lte": revision, "$gt": revision - RECORD_COMMITS }, "last": { "$gt": revision } };
+        let events = &self.tables.events;
+        let found = events.find(across).projection(doc! { "last": 1, "batch": 1 });
+        let across = collect(found, |found| {
+            Ok((rows::integer(found, "_id")?, rows::integer(found, "last")?, rows::text(found, "batch")?))
+        });
+        for (first, last, batch) in across.await? {
+            let next = events.find_one(doc! { "_id": { "$gt": first, "$lte": last } });
+            if limited(USUAL, next.projection(doc! { "_id": 1 })).await?.is_some() {
+                limited(USUAL, events.delete_one(doc! { "_id": first, "batch": batch })).await?;
+            }
+        }
+        Ok(())
+    }
+
     /// Removes records that are wholly below the floor, but never the newest one, and only those that were seen long ago.
     pub(super) async fn remove_records(&self, floor: i64) -> Result<(), StoreError> {
         let removable = self.fence.lock().removable(since_boot()).min(floor);
@@ -125,6 +161,7 @@ impl MongoStore {
             let gone = doc! { "_id": { "$lte": place }, "last": { "$lte": removable.min(newest - 1) } };
             limited(USUAL, events.delete_many(gone)).await?;
         }
+        self.remove_late_below(removable).await?;
         let mut removed = self.removed.lock();
         *removed = removable.max(*removed);
         Ok(())

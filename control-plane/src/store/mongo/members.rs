@@ -323,7 +323,9 @@ impl Beating {
                 continue;
             }
             let before = *self.standing.borrow();
-            let stayed = table.beats.contains_key(&self.me) && before.beat.is_some();
+            // It may have been left out since, and be in the table again by an exchange of which it heard nothing.
+            let age = asked.zip(before.beat).and_then(|(asked, beat)| asked.checked_sub(beat));
+            let stayed = table.beats.contains_key(&self.me) && age.is_some_and(|age| age <= VALID);
             let has_others = next.has_others_than(&self.me);
             let mut standing = Standing { beat: asked, ..before };
             if !stayed {

@@ -34,6 +34,7 @@ mod trim;
 mod upkeep;
 
 use std::future::IntoFuture;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -64,8 +65,13 @@ pub struct MongoStore {
     writer: String,
     /// Itself and others; none before it is open.
     members: Option<Members>,
+    /// The newest revision of commits of which it is not known whether they were written.
+    doubt: AtomicU64,
     /// What is known of the newest revision.
     fence: parking_lot::Mutex<Fence>,
+    /// When the documents were last brought up to date with the log, and how often that is done at least.
+    folded: parking_lot::Mutex<Option<Instant>>,
+    fold_period: Duration,
     /// Records up to this revision were removed already, if they could be.
     removed: parking_lot::Mutex<i64>,
     /// The session of large commits; none before the first one, and while one is under way.
@@ -102,7 +108,10 @@ impl MongoStore {
     #[must_use]
     pub fn in_a_hurry(self) -> Self {
         *self.fence.lock() = Fence::removing_after(Duration::ZERO);
-        self
+        Self {
+            fold_period: Duration::ZERO,
+            ..self
+        }
     }
 
     /// How many records the log has: for tests.
@@ -143,6 +152,16 @@ impl MongoStore {
         done
     }
 
+    /// Reads what other processes reckon with this one to read.
+    async fn as_member<T>(&self, read: impl Future<Output = Result<T, StoreError>>) -> Result<T, StoreError> {
+        let joined = self.admitted().await?;
+        let found = read.await?;
+        match self.is_still_admitted(joined) {
+            true => Ok(found),
+            false => Err(commit::stood_still()),
+        }
+    }
+
     /// Waits until other processes reckon with this one.
     async fn admitted(&self) -> Result<u64, StoreError> {
         match &self.members {
@@ -160,7 +179,10 @@ impl MongoStore {
             tables: Tables::connect(uri, database).await?,
             writer: uuid::Uuid::now_v7().to_string(),
             members: None,
+            doubt: AtomicU64::new(0),
             fence: parking_lot::Mutex::default(),
+            folded: parking_lot::Mutex::default(),
+            fold_period: fold::FOLD_PERIOD,
             removed: parking_lot::Mutex::default(),
             session: tokio::sync::Mutex::new(None),
             stream: tokio::sync::Mutex::new(None),
@@ -201,38 +223,35 @@ impl CommitLog for MongoStore {
     }
 
     async fn load(&self) -> Result<Snapshot, StoreError> {
-        self.read_all().await
+        self.as_member(self.read_all()).await
     }
 
     fn alone(&self) -> Option<u64> {
-        self.members.as_ref().and_then(Members::alone)
+        let above = self.members.as_ref().and_then(Members::alone)?;
+        Some(above.max(self.doubt.load(Ordering::Acquire)))
     }
 
     async fn head(&self) -> Result<u64, StoreError> {
-        let joined = self.admitted().await?;
-        let head = self.read_head().await?;
-        match self.is_still_admitted(joined) {
-            true => Ok(head),
-            false => Err(StoreError::Unavailable(
-                "MongoDB: this process stood still while it read".to_owned(),
-            )),
-        }
+        self.as_member(self.read_head()).await
     }
 
     async fn commits_after(&self, revision: u64, limit: usize) -> Result<CommitBatch, StoreError> {
-        self.read_commits(revision, limit).await
+        self.as_member(self.read_commits(revision, limit)).await
     }
 
     async fn commit(&self, records: &[CommitRecord]) -> Result<(), CommitError> {
         let group = encode_group(records).map_err(CommitError::NotWritten)?;
         let joined = self.admitted().await.map_err(CommitError::NotWritten)?;
-        self.write_group(&group).await?;
-        if !self.is_still_admitted(joined) {
+        let done = match self.write_group(&group).await {
             // Another process may have thought that it is alone, and answered reads without this.
-            let text = "MongoDB: this process stood still while it wrote".to_owned();
-            return Err(CommitError::Unknown(StoreError::Unavailable(text)));
+            Ok(()) if !self.is_still_admitted(joined) => Err(CommitError::Unknown(commit::stood_still())),
+            done => done,
+        };
+        if let (Err(CommitError::Unknown(_)), Some(last)) = (&done, group.last()) {
+            // Until these revisions are taken, memory may lack them.
+            self.doubt.fetch_max(last.event.revision.unsigned_abs(), Ordering::AcqRel);
         }
-        Ok(())
+        done
     }
 
     async fn foreign_commit(&self) {

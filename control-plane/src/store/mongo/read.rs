@@ -163,13 +163,14 @@ impl MongoStore {
             let mut bytes = 0;
             while let Some(found) = cursor.try_next().await.map_err(store_error)? {
                 let record = rows::read_record(&found)?;
-                bytes += record.events.iter().map(|event| event.bytes).sum::<i64>();
+                bytes += record.bytes();
                 if bytes > READ_BYTES && !records.is_empty() {
                     return Ok((records, false));
                 }
                 records.push(record);
             }
             let all = records.len() < part.records;
+            drop_late(&mut records);
             Ok((records, all))
         })
         .await
@@ -189,10 +190,11 @@ impl MongoStore {
 
 /// The newest revision that a majority has.
 pub(super) async fn newest(tables: &Tables) -> Result<u64, StoreError> {
-    // An index has all of it: the record itself may be large, and this is asked for by nearly every read.
+    // An index has all of it: the record itself may be large, and this is asked for by nearly every read. Not the largest
+    // `last`: that may be of a record that came too late, and lies under others.
     let newest = rawdoc! {
-        "find": "events", "filter": {}, "projection": { "_id": 0, "last": 1 }, "sort": { "last": -1 }, "limit": 1,
-        "singleBatch": true, "readConcern": { "level": "majority" },
+        "find": "events", "filter": {}, "projection": { "_id": 0, "last": 1 }, "sort": { "_id": -1 }, "limit": 1,
+        "hint": "newest", "singleBatch": true, "readConcern": { "level": "majority" },
     };
     let answer = limited(QUICK, tables.database.run_raw_command(newest)).await?;
     let batch = answer.get_document("cursor").ok();
@@ -256,6 +258,7 @@ pub(super) async fn records_in(
             Err(error) => return Ok(Err(error)),
         }
     }
+    drop_late(&mut records);
     let lacking: Vec<i64> = records.iter().flat_map(Record::incomplete).collect();
     if !lacking.is_empty() {
         let versions = plain.collection::<Document>("versions");
@@ -271,6 +274,20 @@ pub(super) async fn records_in(
         fill(&mut records, rest);
     }
     Ok(Ok(records))
+}
+
+/// Leaves out records under which others lie, which came too late: see [`super::fence`].
+fn drop_late(records: &mut Vec<Record>) {
+    let mut next = i64::MAX;
+    let mut kept: Vec<Record> = Vec::with_capacity(records.len());
+    for record in records.drain(..).rev() {
+        if record.last < next {
+            next = record.first;
+            kept.push(record);
+        }
+    }
+    kept.reverse();
+    *records = kept;
 }
 
 /// What a snapshot is made of, but for the commits that the documents lack.
@@ -379,6 +396,27 @@ mod tests {
             .collect();
         assert_eq!(keys, ["Node/b", "Node/d"]);
         assert_eq!((found.revision, found.floor), (8, 2));
+    }
+
+    #[test]
+    fn a_record_under_others_came_too_late() {
+        let record = |(first, last)| Record {
+            first,
+            last,
+            ..Record::default()
+        };
+        for (found, left) in [
+            (vec![(1, 2), (3, 3), (4, 9)], vec![1, 3, 4]),
+            (vec![(1, 5), (3, 3), (4, 9)], vec![3, 4]),
+            (vec![(2, 3), (3, 3)], vec![3]),
+            (vec![(1, 2), (3, 7), (5, 7)], vec![1, 5]),
+            (vec![], vec![]),
+        ] {
+            let mut records: Vec<Record> = found.into_iter().map(record).collect();
+            drop_late(&mut records);
+            let firsts: Vec<i64> = records.iter().map(|record| record.first).collect();
+            assert_eq!(firsts, left);
+        }
     }
 
     #[test]

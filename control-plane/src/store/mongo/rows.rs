@@ -55,6 +55,14 @@ pub(super) struct Record {
 }
 
 impl Record {
+    /// About.
+    pub(super) fn bytes(&self) -> i64 {
+        let documents: i64 = self.events.iter().map(|event| event.bytes).sum();
+        let answers: usize = self.answers.iter().map(|answer| answer.answer.len()).sum();
+        let audit = self.audit.iter().map(|entry| entry.paths.len() + 2 * OVERHEAD_BYTES);
+        documents.saturating_add(i64::try_from(answers + audit.sum::<usize>()).unwrap_or(i64::MAX))
+    }
+
     /// Revisions some of whose changes are in `versions` alone.
     pub(super) fn incomplete(&self) -> impl Iterator<Item = i64> {
         let inline = |revision: i64| self.versions.iter().filter(move |row| row.revision == revision).count();

@@ -26,6 +26,8 @@ use crate::store::{AUDIT_KEPT_MS, StoreError};
 
 /// Records that one step moves, and versions that one command removes.
 const STEP: usize = 1_000;
+/// Revisions that are looked through before that is noted.
+const PIECE: i64 = 10_000;
 /// Bytes of the rows of one command, about.
 const BYTES: usize = 8 * 1024 * 1024;
 
@@ -45,13 +47,6 @@ impl MongoStore {
             keep,
         };
         self.remove_versions(now).await?;
-        let note = doc! { "$set": { "floor": now.floor, "head": now.head, "keep": i64::from(now.keep) } };
-        let note = self
-            .tables
-            .meta
-            .update_one(doc! { "_id": "trimmed" }, note)
-            .upsert(true);
-        limited(USUAL, note).await?;
         self.remove_records(guard.floor).await?;
         unsigned(guard.floor)
     }
@@ -71,10 +66,34 @@ impl MongoStore {
         Ok(())
     }
 
+    /// In pieces, each of which is noted, so that a long history is got through at last.
     async fn remove_versions(&self, now: Trimmed) -> Result<(), StoreError> {
         let before = self.read_note().await?;
+        let is_anew = before.keep != now.keep;
+        for (number, (above, until)) in before.ranges_until(now).into_iter().enumerate() {
+            let mut place = above;
+            while let Some(next) = self.next_change(place).await?.filter(|next| *next <= until) {
+                let end = until.min(next.saturating_add(PIECE));
+                self.remove_versions_of(self.changed_keys(place, end).await?, now).await?;
+                place = end;
+                self.write_note(match (is_anew, number) {
+                    (true, _) => Trimmed {
+                        floor: place.min(now.floor),
+                        head: place,
+                        ..now
+                    },
+                    (false, 0) if above == before.floor => Trimmed { floor: place, ..before },
+                    (false, _) => Trimmed { head: place, ..now },
+                })
+                .await?;
+            }
+        }
+        self.write_note(now).await
+    }
+
+    async fn remove_versions_of(&self, keys: BTreeSet<String>, now: Trimmed) -> Result<(), StoreError> {
         let mut doomed = Vec::new();
-        for key in self.changed_keys(before, now).await? {
+        for key in keys {
             let gone = to_spare(&self.revisions_of(&key, now).await?, now.floor, now.keep);
             doomed.extend(gone.into_iter().map(|revision| rows::version_id(&key, revision)));
             if doomed.len() >= STEP {
@@ -82,6 +101,20 @@ impl MongoStore {
             }
         }
         self.remove_named(doomed).await
+    }
+
+    /// The next revision that has versions, or a record in the log that reaches it.
+    async fn next_change(&self, above: i64) -> Result<Option<i64>, StoreError> {
+        let kept = self.tables.versions.find_one(doc! { "revision": { "$gt": above } });
+        let kept = kept.sort(doc! { "revision": 1 }).projection(doc! { "revision": 1 });
+        let kept = limited(USUAL, kept).await?;
+        let kept = kept.map(|found| rows::integer(&found, "revision")).transpose()?;
+        let near = doc! { "_id": { "$gt": above.saturating_sub(RECORD_COMMITS) }, "last": { "$gt": above } };
+        let logged = self.tables.events.find_one(near).sort(doc! { "_id": 1 });
+        let logged = limited(USUAL, logged.projection(doc! { "_id": 1 })).await?;
+        let logged = logged.map(|found| rows::integer(&found, "_id")).transpose()?;
+        let logged = logged.map(|first| first.max(above + 1));
+        Ok(kept.into_iter().chain(logged).min())
     }
 
     /// Revisions of the versions of a document, newest first; of those in the log, as many as count.
@@ -122,26 +155,34 @@ impl MongoStore {
         Ok(())
     }
 
-    /// Documents that may have versions to spare since the last trimming.
-    async fn changed_keys(&self, before: Trimmed, now: Trimmed) -> Result<BTreeSet<String>, StoreError> {
-        let mut keys = BTreeSet::new();
-        for (above, until) in before.ranges_until(now) {
-            let range = doc! { "revision": { "$gt": above, "$lte": until } };
-            let find = self.tables.versions.find(range).projection(doc! { "_id": 1 });
-            let kept = collect_within(LONG, find, |found| {
-                Ok(rows::split_version_id(&rows::text(found, "_id")?)?.0.to_owned())
-            });
-            keys.extend(kept.await?);
-            let range = doc! { "_id": { "$gt": above.saturating_sub(RECORD_COMMITS), "$lte": until } };
-            let find = self.tables.events.find(range).projection(doc! { "docs.key": 1 });
-            let logged = collect_within(LONG, find, |found| {
-                let docs = rows::members(found, "docs");
-                docs.map(|change| rows::text(change?, "key"))
-                    .collect::<Result<Vec<_>, _>>()
-            });
-            keys.extend(logged.await?.into_iter().flatten());
-        }
+    /// Documents that changed above one revision and up to another.
+    async fn changed_keys(&self, above: i64, until: i64) -> Result<BTreeSet<String>, StoreError> {
+        let range = doc! { "revision": { "$gt": above, "$lte": until } };
+        let find = self.tables.versions.find(range).projection(doc! { "_id": 1 });
+        let kept = collect_within(LONG, find, |found| {
+            Ok(rows::split_version_id(&rows::text(found, "_id")?)?.0.to_owned())
+        });
+        let mut keys: BTreeSet<String> = kept.await?.into_iter().collect();
+        let range = doc! { "_id": { "$gt": above.saturating_sub(RECORD_COMMITS), "$lte": until } };
+        let find = self.tables.events.find(range).projection(doc! { "docs.key": 1 });
+        let logged = collect_within(LONG, find, |found| {
+            let docs = rows::members(found, "docs");
+            docs.map(|change| rows::text(change?, "key"))
+                .collect::<Result<Vec<_>, _>>()
+        });
+        keys.extend(logged.await?.into_iter().flatten());
         Ok(keys)
+    }
+
+    async fn write_note(&self, done: Trimmed) -> Result<(), StoreError> {
+        let note = doc! { "$set": { "floor": done.floor, "head": done.head, "keep": i64::from(done.keep) } };
+        let note = self
+            .tables
+            .meta
+            .update_one(doc! { "_id": "trimmed" }, note)
+            .upsert(true);
+        limited(USUAL, note).await?;
+        Ok(())
     }
 
     /// How far the last trimming came; what is not there means that everything is looked at.

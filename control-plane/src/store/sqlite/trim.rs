@@ -6,7 +6,7 @@ use super::connection::{head, number, set_number};
 use super::errors::store_error;
 use crate::store::encode::signed;
 use crate::store::retain::{Trimmed, to_spare};
-use crate::store::{AUDIT_KEPT_MS, StoreError};
+use crate::store::{AUDIT_KEPT_MS, StoreError, TOKEN_KEPT_MS};
 
 /// Rows that one step removes.
 const ROWS: i64 = 1_000;
@@ -81,7 +81,7 @@ pub(super) fn remove_expired(connection: &Connection, now: i64) -> Result<bool, 
     let mut removed = 0;
     for (table, column, limit) in [
         ("idempotency", "expires", now),
-        ("tokens", "expire_time", now),
+        ("tokens", "expire_time", now.saturating_sub(TOKEN_KEPT_MS)),
         ("audit", "time", now.saturating_sub(AUDIT_KEPT_MS)),
     ] {
         let sql = format!(
