@@ -88,7 +88,11 @@ impl<'s> Search<'s> {
             Kind::Node => {
                 let node = NodeName::from(key.name());
                 let layer: Option<LayerName> = state.get(key).and_then(|held| held.document.spec_layer()?.parse().ok());
-                for service in self.services_of(layer.as_ref().map(LayerName::as_str)) {
+                let seen_by = match state.get(key) {
+                    Some(_) => layer.as_ref().map(LayerName::as_str),
+                    None => Some(node.as_str()),
+                };
+                for service in self.services_of(seen_by) {
                     self.add(At {
                         service: Some(service),
                         instance: None,

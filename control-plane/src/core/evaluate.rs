@@ -12,17 +12,19 @@ use blaze_domain::config::{
 };
 use serde_json::{Map, Value, json};
 
-use super::effective::{is_canary, patched};
-use super::placement::{is_active, phase, placement, rollout_target};
+use super::placement::{is_active, phase, rollout_target};
 use super::refs;
+use super::rollouts::{begin, too_large, tried};
 use super::schema::Schemas;
 use super::secrets::Vault;
-use super::state::State;
+use super::state::{State, tries_schema};
 use super::types::{ApplyAction, Caller, DocumentInput, Precondition};
 use super::view::{View, view};
 use crate::secrets::Keyring;
 use crate::store::{Change, Op};
 
+/// Faults of one answer, at most.
+const MAX_FAULTS: usize = 100;
 /// Deletions by `prune` that need no confirmation.
 const PRUNE_FREELY: usize = 20;
 /// Referrers that are named in a refusal.
@@ -103,14 +105,22 @@ pub(crate) struct Request {
 impl Request {
     /// Whether it brings a schema, which is checked against whatever there is.
     pub(crate) fn has_schema(&self) -> bool {
-        self.items.iter().any(|item| {
-            item.key.kind() == Kind::Service
-                && match &item.content {
-                    Content::Write(input) => is_set(input.spec.get("schema")),
-                    Content::Patch(patch) => is_set(patch.get("spec").and_then(|spec| spec.get("schema"))),
-                    Content::Restore(_) => true,
-                    Content::Delete | Content::Promote | Content::Abort(_) | Content::Leave => false,
-                }
+        self.items.iter().any(|item| match (&item.content, item.key.kind()) {
+            (Content::Write(input), Kind::Service) => is_set(input.spec.get("schema")),
+            (Content::Write(input), Kind::Rollout) => {
+                is_set(input.spec.get("patch").and_then(|patch| patch.get("schema")))
+            }
+            (Content::Patch(patch), Kind::Service) => is_set(patch.get("spec").and_then(|spec| spec.get("schema"))),
+            (Content::Restore(_), Kind::Service) | (Content::Promote, _) => true,
+            (
+                Content::Write(_)
+                | Content::Patch(_)
+                | Content::Restore(_)
+                | Content::Delete
+                | Content::Abort(_)
+                | Content::Leave,
+                _,
+            ) => false,
         })
     }
 }
@@ -243,6 +253,8 @@ impl Evaluator {
         faults.finish_invalid()?;
         let mut after = state.clone();
         after.advance(revision, &changes);
+        check_rights(state, &after, request, &changes)?;
+        self.begin_rollouts(&mut after, request, &mut changes, &index_of, &mut faults)?;
         self.check_result(state, &after, request, &changes, &index_of, &mut faults)?;
         let results = order.into_iter().map(|key| {
             let action = actions.get(&key).copied().unwrap_or(ApplyAction::Unchanged);
@@ -311,7 +323,60 @@ impl Evaluator {
         }))
     }
 
-    /// What can only be judged on the resulting state: rights of a bound token, references, schemas, sizes, counts.
+    /// Judges roll-outs that begin by what there is after the change, of which their targets and nodes may be part.
+    fn begin_rollouts(
+        &self,
+        after: &mut State,
+        request: &Request,
+        changes: &mut [Change],
+        index_of: &dyn Fn(&Key) -> usize,
+        faults: &mut Faults,
+    ) -> Result<(), Problem> {
+        let view = view(&request.caller.claims);
+        let is_begun = |change: &&mut Change| begins(request, change);
+        for change in changes.iter_mut().filter(is_begun) {
+            let index = index_of(&change.document.key);
+            let mut rollout = (*change.document).clone();
+            match begin(after, &rollout) {
+                Ok(status) => rollout.status = Some(status),
+                Err(problem) => {
+                    faults.problem(index, *problem)?;
+                    continue;
+                }
+            }
+            if let Some((target, patched)) = tried(after, &rollout) {
+                let written = view.check_write((after, Some(&target)), (after, Some(&patched)));
+                written.map_err(|_| view.outside(&format!("what {} makes of its target", rollout.key)))?;
+                for fault in self.faults_of_tried(after, &rollout, &patched, faults.room()) {
+                    faults.add(index, fault);
+                }
+            }
+            let before = change.previous;
+            *change = put(None, rollout, change.op);
+            change.previous = before;
+            after.put(Arc::clone(&change.document));
+        }
+        Ok(())
+    }
+
+    /// What is wrong with what a roll-out makes of its target: references, and a schema that it brings.
+    fn faults_of_tried(&self, after: &State, rollout: &Document, patched: &Document, most: usize) -> Vec<FieldFault> {
+        let mut found = refs::missing_of(after, patched, most);
+        for fault in &mut found {
+            let within = fault.pointer.strip_prefix("/spec").unwrap_or_default();
+            fault.pointer = format!("/spec/patch{within}");
+        }
+        if patched.key.kind() == Kind::Service
+            && tries_schema(rollout)
+            && let Some(schema) = patched.spec_member("schema")
+            && let Err(reason) = self.schemas.check(schema)
+        {
+            found.push(invalid("/spec/patch/schema", &reason));
+        }
+        found
+    }
+
+    /// What can only be judged on the resulting state: references, schemas, sizes, counts.
     fn check_result(
         &self,
         before: &State,
@@ -322,34 +387,12 @@ impl Evaluator {
         faults: &mut Faults,
     ) -> Result<(), Problem> {
         let view = view(&request.caller.claims);
-        let document = |state: &State, key: &Key| state.get(key).map(|held| Arc::clone(&held.document));
-        for change in changes {
-            let key = &change.document.key;
-            let (was, is) = (document(before, key), document(after, key));
-            let written = view.check_write((before, was.as_deref()), (after, is.as_deref()));
-            written.map_err(|problem| match request.items.iter().any(|item| item.key == *key) {
-                true => problem,
-                // It may be one that the token does not know of.
-                false => view.outside("a document that would change along"),
-            })?;
-        }
-        let begun = changes
-            .iter()
-            .filter(|change| change.op == Op::Create && change.document.key.kind() == Kind::Rollout);
-        for change in begun.clone() {
-            if let Some((target, patched)) = tried(after, &change.document) {
-                let written = view.check_write((after, Some(&target)), (after, Some(&patched)));
-                written.map_err(|_| view.outside(&format!("what {} makes of its target", change.document.key)))?;
-                for mut fault in refs::missing_of(after, &patched) {
-                    let within = fault.pointer.strip_prefix("/spec").unwrap_or_default();
-                    fault.pointer = format!("/spec/patch{within}");
-                    faults.add(index_of(&change.document.key), fault);
-                }
-            }
-        }
         for change in changes.iter().filter(|change| change.op != Op::Delete) {
+            if faults.room() == 0 {
+                break;
+            }
             let key = &change.document.key;
-            for fault in refs::missing(after, key) {
+            for fault in refs::missing(after, key, faults.room()) {
                 faults.add(index_of(key), fault);
             }
         }
@@ -368,7 +411,7 @@ impl Evaluator {
                 faults.conflict(index_of(key), problem);
             }
         }
-        for change in begun {
+        for change in changes.iter().filter(|change| begins(request, change)) {
             if let Some(problem) = active_elsewhere(after, &change.document) {
                 faults.conflict(index_of(&change.document.key), problem);
             }
@@ -384,23 +427,45 @@ impl Evaluator {
     }
 }
 
+/// Whether a change is a roll-out that begins. One that exists does not, but who makes it learns first what is wrong with it.
+fn begins(request: &Request, change: &Change) -> bool {
+    change.document.key.kind() == Kind::Rollout && (change.op == Op::Create || request.form == Form::Create)
+}
+
+/// Refuses changes that a bound token may not make, before anything else is told of them.
+fn check_rights(before: &State, after: &State, request: &Request, changes: &[Change]) -> Result<(), Problem> {
+    let view = view(&request.caller.claims);
+    let document = |state: &State, key: &Key| state.get(key).map(|held| Arc::clone(&held.document));
+    for change in changes {
+        let key = &change.document.key;
+        let (was, is) = (document(before, key), document(after, key));
+        let written = view.check_write((before, was.as_deref()), (after, is.as_deref()));
+        written.map_err(|problem| match request.items.iter().any(|item| item.key == *key) {
+            true => problem,
+            // It may be one that the token does not know of.
+            false => view.outside("a document that would change along"),
+        })?;
+    }
+    Ok(())
+}
+
 /// What becomes of the document of one item, and of others that it changes along.
 fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key, Outcome, Op)>, Box<Problem>> {
     let current = state.get(&item.key).map(|held| &*held.document);
-    precondition(request, item, current)?;
+    precondition(state, request, item, current)?;
     let update = if current.is_some() { Op::Update } else { Op::Create };
     let one = |outcome, op| Ok(vec![(item.key.clone(), outcome, op)]);
     match &item.content {
         Content::Write(input) => {
             // What POST finds is no document to compare with: it is refused as one that exists.
             let compared = current.filter(|_| request.form != Form::Create);
-            one(Outcome::Put(Box::new(written(state, input, compared)?)), update)
+            one(Outcome::Put(Box::new(written(input, compared)?)), update)
         }
         Content::Patch(patch) => {
             let current = current.ok_or_else(|| Box::new(not_found(&item.key)))?;
             let input = patch_input(state, &item.key, patch).map_err(|faults| Box::new(Problem::faults(faults)))?;
             one(
-                Outcome::Put(Box::new(written(state, &input, Some(current))?)),
+                Outcome::Put(Box::new(written(&input, Some(current))?)),
                 Op::Update,
             )
         }
@@ -421,7 +486,8 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
         Content::Restore(Some(version)) => {
             if version.key.kind() == Kind::Rollout {
                 let detail = "a roll-out is not set back; start another one";
-                return Err(Box::new(Problem::new(Code::RolloutState, detail)));
+                let revision = current.map_or(state.revision(), |document| document.revision);
+                return Err(Box::new(Problem::new(Code::RolloutState, detail).at(revision)));
             }
             let faults = spec::check(
                 &version.key,
@@ -446,11 +512,15 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
     }
 }
 
-fn precondition(request: &Request, item: &Item, current: Option<&Document>) -> Result<(), Box<Problem>> {
-    let fail = |mut problem: Problem| {
-        problem.revision = current.map(|document| document.revision);
-        Err(Box::new(problem))
-    };
+fn precondition(
+    state: &State,
+    request: &Request,
+    item: &Item,
+    current: Option<&Document>,
+) -> Result<(), Box<Problem>> {
+    // Of what is missing, that of the store is told.
+    let revision = current.map_or(state.revision(), |document| document.revision);
+    let fail = |problem: Problem| Err(Box::new(problem.at(revision)));
     let many = request.form == Form::Many;
     let rolls_back = matches!(item.content, Content::Restore(_) | Content::Promote | Content::Abort(_));
     if let Some(revision) = request.unchanged_since.get(&item.key)
@@ -496,7 +566,7 @@ fn precondition(request: &Request, item: &Item, current: Option<&Document>) -> R
 }
 
 /// A document as a user wrote it, checked by itself.
-fn written(state: &State, input: &DocumentInput, current: Option<&Document>) -> Result<Target, Box<Problem>> {
+fn written(input: &DocumentInput, current: Option<&Document>) -> Result<Target, Box<Problem>> {
     let faults = spec::check(&input.key, &input.labels, &input.annotations, &input.spec);
     let bytes = spec::document_size(&input.labels, &input.annotations, &input.spec);
     if bytes > MAX_DOCUMENT_BYTES {
@@ -510,14 +580,16 @@ fn written(state: &State, input: &DocumentInput, current: Option<&Document>) -> 
         return Err(Box::new(Problem::faults(faults)));
     }
     let status = match (input.key.kind(), current) {
-        (Kind::Rollout, None) => Some(begin_rollout(state, input)?),
+        // Its canaries are found once the rest of the request is known.
+        (Kind::Rollout, None) => Some(json!({ "phase": "canary", "canaries": [] })),
         (Kind::Rollout, Some(current)) => {
             if !same_spec(&current.spec, &input.spec) {
                 let detail = format!(
                     "{} has begun: its spec stays as it is; abort it and start another one",
                     input.key
                 );
-                return Err(Box::new(Problem::new(Code::RolloutState, detail)));
+                let problem = Problem::new(Code::RolloutState, detail).at(current.revision);
+                return Err(Box::new(problem));
             }
             current.status.clone()
         }
@@ -574,83 +646,6 @@ fn patch_input(state: &State, key: &Key, patch: &Value) -> Result<DocumentInput,
         annotations: envelope.annotations,
         spec: envelope.spec,
     })
-}
-
-/// Refuses a roll-out whose target would have another size than a document may have.
-fn too_large(target: &Document, patched: &Value) -> Result<(), Box<Problem>> {
-    let bytes = spec::document_size(&target.labels, &target.annotations, patched);
-    if bytes <= MAX_DOCUMENT_BYTES {
-        return Ok(());
-    }
-    let detail = format!(
-        "the patch makes of {} a document of {bytes} bytes, at most {MAX_DOCUMENT_BYTES} are allowed",
-        target.key
-    );
-    Err(Box::new(Problem::new(Code::PayloadTooLarge, detail)))
-}
-
-/// The target of a roll-out, and what its patch makes of it.
-fn tried(state: &State, rollout: &Document) -> Option<(Arc<Document>, Document)> {
-    let target = Arc::clone(&state.get(&rollout_target(rollout)?)?.document);
-    let patched = patched(&target, rollout.spec_member("patch")?);
-    Some((target, patched))
-}
-
-fn begin_rollout(state: &State, input: &DocumentInput) -> Result<Value, Box<Problem>> {
-    let refuse = |pointer: &str, detail: &str| Err(Box::new(Problem::faults(vec![invalid(pointer, detail)])));
-    let rollout = Document {
-        key: input.key.clone(),
-        uid: String::new(),
-        revision: 0,
-        create_time: Timestamp::default(),
-        update_time: Timestamp::default(),
-        updated_by: String::new(),
-        labels: input.labels.clone(),
-        annotations: input.annotations.clone(),
-        spec: Arc::new(input.spec.clone()),
-        status: None,
-    };
-    let target = rollout_target(&rollout).and_then(|key| state.get(&key).cloned());
-    let place = target.as_ref().map(|target| placement(state, &target.document));
-    // A change of what a node never sees cannot be tried there.
-    let counts = |node: &Document| {
-        let on = placement(state, node);
-        place.as_ref().is_none_or(|place| {
-            on.layer.is_some_and(|layer| place.visible.contains(&layer))
-                && (place.node.is_none() || place.node == on.node)
-        })
-    };
-    let nodes = state
-        .of_kind(Kind::Node, None)
-        .filter(|(_, held)| is_canary(&rollout, &held.document) && counts(&held.document));
-    let canaries: Vec<Value> = nodes
-        .map(|(key, _)| json!({ "node": key.name().as_str(), "phase": "pending", "revision": null, "reason": "" }))
-        .collect();
-    if canaries.is_empty() {
-        return refuse(
-            "/spec/canary/node_selector",
-            "matches no node on which the target counts; at least one must try the change",
-        );
-    }
-    if let Some(target) = target {
-        let mut patched = (*target.shown.spec).clone();
-        if let Some(patch) = rollout.spec_member("patch") {
-            merge::merge_patch(&mut patched, patch);
-        }
-        let document = &target.document;
-        too_large(document, &patched)?;
-        let faults = spec::check(&document.key, &document.labels, &document.annotations, &patched);
-        if let Some(fault) = faults.first() {
-            return refuse(
-                "/spec/patch",
-                &format!(
-                    "makes of {} a document with a fault: {}: {}",
-                    document.key, fault.pointer, fault.detail
-                ),
-            );
-        }
-    }
-    Ok(json!({ "phase": "canary", "canaries": canaries }))
 }
 
 /// The roll-out of a key, if it can still be promoted or aborted.
@@ -843,7 +838,7 @@ fn is_set(value: Option<&Value>) -> bool {
     value.is_some_and(|value| !value.is_null())
 }
 
-fn invalid(pointer: &str, detail: &str) -> FieldFault {
+pub(super) fn invalid(pointer: &str, detail: &str) -> FieldFault {
     FieldFault {
         pointer: pointer.to_owned(),
         code: Code::ValidationFailed,
@@ -860,7 +855,8 @@ fn not_found(key: &Key) -> Problem {
     Problem::new(Code::NotFound, format!("there is no {key}"))
 }
 
-/// Names referrers as far as the token sees them, before the change (where what they stand on is there) or after it.
+/// Names referrers as far as the token sees them, before the change (where what they stand on is there) or after it. How
+/// many there are besides is nothing to who does not see them.
 fn in_use(key: &Key, referrers: &[Key], states: [&State; 2], view: &View) -> Problem {
     let is_seen = |key: &&Key| {
         states.iter().any(|state| {
@@ -868,14 +864,17 @@ fn in_use(key: &Key, referrers: &[Key], states: [&State; 2], view: &View) -> Pro
             held.is_some_and(|held| view.sees_document(state, &held.document))
         })
     };
-    let seen = referrers.iter().filter(is_seen).take(NAMED);
-    let mut named: Vec<String> = seen.map(ToString::to_string).collect();
-    let others = referrers.len() - named.len();
-    match others {
+    let seen = referrers.iter().filter(is_seen).count();
+    let named = referrers.iter().filter(is_seen).take(NAMED);
+    let mut named: Vec<String> = named.map(ToString::to_string).collect();
+    match seen - named.len() {
         0 => {}
         1 => named.push("1 other".to_owned()),
-        _ if referrers.len() == COUNTED => named.push(format!("{others} or more others")),
-        _ => named.push(format!("{others} others")),
+        others if referrers.len() == COUNTED => named.push(format!("{others} or more others")),
+        others => named.push(format!("{others} others")),
+    }
+    if seen < referrers.len() {
+        named.push("documents that the token does not see".to_owned());
     }
     let detail = format!(
         "{key} is referred to by {}: delete those first, or use cascade=true",
@@ -900,7 +899,15 @@ impl Faults {
         }
     }
 
+    /// How many more are told.
+    fn room(&self) -> usize {
+        MAX_FAULTS - self.invalid.len().min(MAX_FAULTS)
+    }
+
     fn add(&mut self, index: usize, mut fault: FieldFault) {
+        if self.room() == 0 {
+            return;
+        }
         if self.form == Form::Many {
             fault.document = Some(index);
         }
@@ -908,7 +915,9 @@ impl Faults {
     }
 
     fn conflict(&mut self, index: usize, problem: Problem) {
-        self.conflicts.push((index, problem));
+        if self.conflicts.len() < MAX_FAULTS {
+            self.conflicts.push((index, problem));
+        }
     }
 
     /// A refusal of one document: of many, all are told; of one, it is the answer.

@@ -5,19 +5,21 @@ use blaze_domain::{LayerName, NodeName, ServiceName};
 
 use super::state::State;
 
-/// References of a document to what does not exist.
-pub(crate) fn missing(state: &State, key: &Key) -> Vec<FieldFault> {
+/// References of a document to what does not exist, at most so many.
+pub(crate) fn missing(state: &State, key: &Key, most: usize) -> Vec<FieldFault> {
     state
         .get(key)
-        .map(|held| missing_of(state, &held.document))
+        .map(|held| missing_of(state, &held.document, most))
         .unwrap_or_default()
 }
 
 /// The same of a document that need not be part of the state.
-pub(crate) fn missing_of(state: &State, document: &Document) -> Vec<FieldFault> {
+pub(crate) fn missing_of(state: &State, document: &Document, most: usize) -> Vec<FieldFault> {
     spec::references(document)
         .into_iter()
         .filter(|(_, target)| state.get(target).is_none())
+        // Before a near name is looked for, which takes longer than all the rest.
+        .take(most)
         .map(|(pointer, target)| FieldFault {
             pointer,
             code: Code::ReferenceNotFound,
@@ -34,6 +36,7 @@ fn suggestion(state: &State, target: &Key) -> String {
         .of_kind(target.kind(), None)
         .take(1000)
         .filter(|(key, _)| key.service_name() == target.service_name())
+        .filter(|(key, _)| key.name().as_str().len().abs_diff(name.len()) <= 2)
         .map(|(key, _)| (strsim::damerau_levenshtein(key.name().as_str(), name), key))
         .min_by_key(|(distance, _)| *distance);
     match near {

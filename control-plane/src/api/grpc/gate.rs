@@ -266,11 +266,23 @@ fn as_problem(found: &Status, most_bytes: usize) -> Problem {
 }
 
 /// The middleware of what needs no token, and of what is not there.
-pub(super) async fn open(request: Request, next: Next) -> Response {
-    let id = request::request_id(request.headers());
-    let mut response = next.run(request).await;
-    explain(&mut response, &id, MAX_OPEN_BYTES);
-    if let Ok(id) = HeaderValue::from_str(&id) {
+pub(super) async fn open(State(gate): State<Arc<Gate>>, request: Request, next: Next) -> Response {
+    let head = Head {
+        id: request::request_id(request.headers()),
+        address: request::client_address(request.extensions()),
+        method: None,
+    };
+    // A page that a browser of this machine shows is not told what there is either.
+    let checked = match gate.dev {
+        true => request::check_dev(request.uri(), request.headers()),
+        false => Ok(()),
+    };
+    let mut response = match checked {
+        Ok(()) => next.run(request).await,
+        Err(problem) => gate.refuse(&head, None, &problem, "authenticate"),
+    };
+    explain(&mut response, &head.id, MAX_OPEN_BYTES);
+    if let Ok(id) = HeaderValue::from_str(&head.id) {
         response.headers_mut().insert(REQUEST_ID, id);
     }
     response

@@ -74,7 +74,7 @@ pub fn router(service: ConfigService, options: GrpcOptions) -> Router {
     let config = Routes::new(config)
         .into_axum_router()
         .reset_fallback()
-        .route_layer(middleware::from_fn_with_state(gate, gate::gate));
+        .route_layer(middleware::from_fn_with_state(Arc::clone(&gate), gate::gate));
 
     let health = health::Readyz {
         readiness: options.readiness,
@@ -87,7 +87,7 @@ pub fn router(service: ConfigService, options: GrpcOptions) -> Router {
         open
     };
     open.into_axum_router()
-        .layer(middleware::from_fn(gate::open))
+        .layer(middleware::from_fn_with_state(gate, gate::open))
         .merge(config)
 }
 

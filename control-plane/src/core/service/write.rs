@@ -90,7 +90,8 @@ impl ConfigService {
         let once = idempotency.map(|idempotency| once(&request.caller, &idempotency));
         let in_progress = || {
             let detail = "the first request with this Idempotency-Key is still running";
-            Problem::new(Code::IdempotencyInProgress, detail).retry_after(1)
+            let problem = Problem::new(Code::IdempotencyInProgress, detail).retry_after(1);
+            problem.at(self.revision())
         };
         let running = match &once {
             Some(once) => Some(Running::begin(&self.inner.running, &once.id).ok_or_else(in_progress)?),
@@ -533,10 +534,11 @@ fn own_revision(done: &Done) -> u64 {
 }
 
 fn once(caller: &Caller, idempotency: &Idempotency) -> Once {
-    // What a token may is part of who asks: the answer that one got is not for another of the same subject.
+    // What a token sees is part of who asks: the answer that one got is not for another of the same subject. Its roles are
+    // not: every token that comes here may write, and a renewed one may name them otherwise.
     let claims = &caller.claims;
     let layer = claims.layer.as_ref().map(LayerName::as_str);
-    let text = json!([claims.subject, layer, claims.roles, idempotency.path, idempotency.key]).to_string();
+    let text = json!([claims.subject, layer, idempotency.path, idempotency.key]).to_string();
     Once {
         id: hex(&Sha256::digest(text.as_bytes())),
         body: hex(&idempotency.body),

@@ -178,6 +178,13 @@ fn audit_time(number: u64) -> Timestamp {
     Timestamp::from_millis(start + i64::try_from(number).unwrap_or(0) * 1_000)
 }
 
+/// With what ids of this time begin, the same for all of a test.
+fn id_time() -> String {
+    static TIME: std::sync::OnceLock<String> = std::sync::OnceLock::new();
+    let make = || uuid::Uuid::now_v7().to_string().chars().take(8).collect();
+    TIME.get_or_init(make).clone()
+}
+
 fn entry(number: u64) -> AuditEntry {
     let done = number.is_multiple_of(2);
     let mut entry = audit(
@@ -185,7 +192,7 @@ fn entry(number: u64) -> AuditEntry {
         done.then_some(number + 1),
     );
     entry.time = audit_time(number);
-    entry.id = format!("{number:08}-{}", entry.id);
+    entry.id = format!("{}-{number:04}-{}", id_time(), entry.id);
     entry.subject = if number < 4 { "eve" } else { "" }.to_owned();
     entry.key = match number % 5 {
         0 => None,
@@ -226,7 +233,7 @@ pub async fn audit_of_commits_is_among_the_rest(fixture: &dyn Fixture) -> Outcom
         written.audit = [number, number + 1].map(entry).to_vec();
         for (place, entry) in (0..).zip(&mut written.audit) {
             entry.revision = Some(number + 1);
-            entry.id = format!("{:08}-{number}-{place}", number * 7 % 30 + place * 4);
+            entry.id = format!("{}-{:04}-{number}-{place}", id_time(), number * 7 % 30 + place * 4);
         }
         all.extend(written.audit.clone());
         commit(model.store.as_ref(), &[written]).await?;
