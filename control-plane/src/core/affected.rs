@@ -19,8 +19,10 @@ pub(crate) const MAX_KEPT_CANDIDATES: usize = 1000;
 
 /// Documents that are looked at for each place that may be found, at most.
 const LOOKS_PER_PLACE: usize = 25;
+/// The same for few places together.
+const LOOKS_AT_LEAST: usize = 1_000_000;
 
-/// A search for places that finds no more than so many, and looks at no more documents than so many times that.
+/// A search for places that finds no more than so many, and looks at no more documents on the way than it may.
 struct Search<'s> {
     state: &'s State,
     /// Services that count.
@@ -45,7 +47,7 @@ fn candidates<'s>(
         services: None,
         found: BTreeSet::new(),
         limit,
-        looks: limit.saturating_mul(LOOKS_PER_PLACE),
+        looks: limit.saturating_mul(LOOKS_PER_PLACE).max(LOOKS_AT_LEAST),
     };
     for key in keys {
         search.of_key(key);

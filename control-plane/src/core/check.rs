@@ -64,7 +64,7 @@ impl Schemas {
             if check.faults.len() >= MAX_FAULTS {
                 break;
             }
-            if check.place(at).is_none() {
+            if check.place(at).is_err() {
                 check.faults.push(too_many());
                 break;
             }
@@ -73,6 +73,9 @@ impl Schemas {
         check.faults
     }
 }
+
+/// There is more to check than one commit may take.
+struct Exhausted;
 
 /// A service as it was met, with its schema compiled.
 type Known = (Arc<Document>, Option<Arc<Compiled>>);
@@ -91,16 +94,15 @@ struct Check<'c> {
 }
 
 impl Check<'_> {
-    /// `None` if there were too many before it.
-    fn take(&mut self, work: u64) -> Option<()> {
-        self.left = self.left.checked_sub(work)?;
-        Some(())
+    fn take(&mut self, work: u64) -> Result<(), Exhausted> {
+        self.left = self.left.checked_sub(work).ok_or(Exhausted)?;
+        Ok(())
     }
 
-    fn place(&mut self, at: &At) -> Option<()> {
+    fn place(&mut self, at: &At) -> Result<(), Exhausted> {
         let is_seen = self.view.sees_place(self.state, at);
         if self.is_refused_outside && !is_seen {
-            return Some(());
+            return Ok(());
         }
         let sources = Sources::at(self.state, at);
         let mut found = Vec::new();
@@ -124,17 +126,17 @@ impl Check<'_> {
                 document: None,
             });
         }
-        Some(())
+        Ok(())
     }
 
-    fn schema(&mut self, sources: &Sources, at: &At, found: &mut Vec<FieldFault>) -> Option<()> {
+    fn schema(&mut self, sources: &Sources, at: &At, found: &mut Vec<FieldFault>) -> Result<(), Exhausted> {
         // With what a roll-out makes of it there.
-        let Some(service) = &sources.service else { return Some(()) };
+        let Some(service) = &sources.service else { return Ok(()) };
         let Some(schema) = service.spec_member("schema").filter(|schema| !schema.is_null()) else {
-            return Some(());
+            return Ok(());
         };
         let Some(compiled) = self.compiled(service, schema)? else {
-            return Some(());
+            return Ok(());
         };
         let (mut config, secrets) = with_placeholders(sources.merged());
         if let Value::Object(members) = &mut config {
@@ -145,12 +147,12 @@ impl Check<'_> {
         if work > MAX_WORK {
             self.take(values.saturating_mul(STEPS_OF_MERGE))?;
             found.push(too_costly(at, values, compiled.steps()));
-            return Some(());
+            return Ok(());
         }
         self.take(work.saturating_add(values.saturating_mul(STEPS_OF_MERGE)))?;
         let validator = compiled.validator(at.instance.is_some());
         if validator.is_valid(&config) {
-            return Some(());
+            return Ok(());
         }
         // Once more, to tell what is wrong.
         self.take(work)?;
@@ -167,20 +169,20 @@ impl Check<'_> {
                 // What is wrong beside the secret is not known, so it cannot be let through.
                 too_costly(at, values, compiled.steps())
             }));
-            return Some(());
+            return Ok(());
         }
         let errors = validator.iter_errors(&config).filter(is_told);
         let left = MAX_FAULTS.saturating_sub(self.faults.len());
         found.extend(errors.take(left).map(|error| mismatch(&error, at)));
-        Some(())
+        Ok(())
     }
 
-    /// The schema of a service, compiled; `None` within if it cannot be.
-    fn compiled(&mut self, service: &Arc<Document>, schema: &Value) -> Option<Option<Arc<Compiled>>> {
+    /// The schema of a service, compiled, if it can be.
+    fn compiled(&mut self, service: &Arc<Document>, schema: &Value) -> Result<Option<Arc<Compiled>>, Exhausted> {
         self.known.retain(|(known, _)| known.key == service.key);
         let same = |(known, _): &&Known| Arc::ptr_eq(known, service) || known.spec_member("schema") == Some(schema);
         if let Some((_, compiled)) = self.known.iter().find(same) {
-            return Some(compiled.clone());
+            return Ok(compiled.clone());
         }
         self.take(STEPS_OF_SCHEMA)?;
         let compiled = self.schemas.compiled(schema);
@@ -190,7 +192,7 @@ impl Check<'_> {
         }
         let compiled = compiled.ok();
         self.known.push((Arc::clone(service), compiled.clone()));
-        Some(compiled)
+        Ok(compiled)
     }
 }
 
@@ -236,9 +238,10 @@ fn too_many() -> FieldFault {
     FieldFault {
         pointer: String::new(),
         code: Code::ValidationFailed,
-        detail: "the change touches too many effective configurations to check them all at once: make it in parts, or make \
+        detail:
+            "the change touches too many effective configurations to check them all at once: make it in parts, or make \
                  the schemas simpler"
-            .to_owned(),
+                .to_owned(),
         document: None,
     }
 }
@@ -302,7 +305,10 @@ mod tests {
         ];
         for number in 0..instances {
             for service in ["plain", "strict"] {
-                all.push(document(&format!("Instance/{service}/i{number}"), json!({ "layer": "edge" })));
+                all.push(document(
+                    &format!("Instance/{service}/i{number}"),
+                    json!({ "layer": "edge" }),
+                ));
             }
         }
         State::new(1, all)

@@ -187,7 +187,9 @@ impl<'s> Estimate<'s> {
         levels: usize,
         nesting: usize,
     ) -> Result<Effort, String> {
-        schemas.try_fold(Effort::NONE, |sum, one| Ok(sum.and(self.effort(one, levels, nesting + 1)?)))
+        schemas.try_fold(Effort::NONE, |sum, one| {
+            Ok(sum.and(self.effort(one, levels, nesting + 1)?))
+        })
     }
 
     fn any(
@@ -196,7 +198,9 @@ impl<'s> Estimate<'s> {
         levels: usize,
         nesting: usize,
     ) -> Result<Effort, String> {
-        schemas.try_fold(Effort::NONE, |most, one| Ok(most.or(self.effort(one, levels, nesting + 1)?)))
+        schemas.try_fold(Effort::NONE, |most, one| {
+            Ok(most.or(self.effort(one, levels, nesting + 1)?))
+        })
     }
 
     /// What a reference leads to. What leads back to a subschema that is being looked at for the same value would be looked
@@ -283,7 +287,10 @@ mod tests {
         let level = |number: usize| {
             let own = (0..30).map(|_| json!({ "$ref": format!("#/$defs/l{number}") }));
             let next = (0..30).map(|_| json!({ "$ref": format!("#/$defs/l{}", number + 1) }));
-            (format!("l{number}"), json!({ "anyOf": own.chain(next).collect::<Vec<Value>>() }))
+            (
+                format!("l{number}"),
+                json!({ "anyOf": own.chain(next).collect::<Vec<Value>>() }),
+            )
         };
         let mut defs: Map<String, Value> = (0..10).map(level).collect();
         defs.insert("l10".to_owned(), json!(true));

@@ -345,9 +345,10 @@ impl Evaluator {
                 }
             }
             if let Some((target, patched)) = tried(after, &rollout) {
-                let written = view.check_write((after, Some(&target)), (after, Some(&patched)));
+                let state: &State = after;
+                let written = view.check_write((state, Some(&target)), (state, Some(&patched)));
                 written.map_err(|_| view.outside(&format!("what {} makes of its target", rollout.key)))?;
-                for fault in self.faults_of_tried(after, &rollout, &patched, faults.room()) {
+                for fault in self.faults_of_tried(state, &rollout, &patched, faults.room()) {
                     faults.add(index, fault);
                 }
             }
@@ -464,10 +465,7 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
         Content::Patch(patch) => {
             let current = current.ok_or_else(|| Box::new(not_found(&item.key)))?;
             let input = patch_input(state, &item.key, patch).map_err(|faults| Box::new(Problem::faults(faults)))?;
-            one(
-                Outcome::Put(Box::new(written(&input, Some(current))?)),
-                Op::Update,
-            )
+            one(Outcome::Put(Box::new(written(&input, Some(current))?)), Op::Update)
         }
         Content::Leave => one(Outcome::Keep, Op::Update),
         Content::Delete => match current {
@@ -512,12 +510,7 @@ fn outcome_of(state: &State, request: &Request, item: &Item) -> Result<Vec<(Key,
     }
 }
 
-fn precondition(
-    state: &State,
-    request: &Request,
-    item: &Item,
-    current: Option<&Document>,
-) -> Result<(), Box<Problem>> {
+fn precondition(state: &State, request: &Request, item: &Item, current: Option<&Document>) -> Result<(), Box<Problem>> {
     // Of what is missing, that of the store is told.
     let revision = current.map_or(state.revision(), |document| document.revision);
     let fail = |problem: Problem| Err(Box::new(problem.at(revision)));

@@ -5,15 +5,15 @@ use std::sync::Arc;
 use blaze_domain::config::{Code, Document, Kind, MAX_DOCUMENT_BYTES, Problem, merge, spec};
 use serde_json::{Value, json};
 
-use super::effective::{is_canary, patched};
+use super::effective::{canaries, patched};
 use super::evaluate::invalid;
 use super::placement::{placement, rollout_target};
 use super::state::State;
 
 /// The status of a roll-out that begins in a state of which it is part.
 pub(super) fn begin(after: &State, rollout: &Document) -> Result<Value, Box<Problem>> {
-    let canaries = nodes(after, rollout);
-    if canaries.is_empty() {
+    let nodes = nodes(after, rollout);
+    if nodes.is_empty() {
         let detail = "matches no node on which the target counts; at least one must try the change";
         return Err(refusal("/spec/canary/node_selector", detail));
     }
@@ -34,7 +34,7 @@ pub(super) fn begin(after: &State, rollout: &Document) -> Result<Value, Box<Prob
             return Err(refusal("/spec/patch", &detail));
         }
     }
-    Ok(json!({ "phase": "canary", "canaries": canaries }))
+    Ok(json!({ "phase": "canary", "canaries": nodes }))
 }
 
 fn refusal(pointer: &str, detail: &str) -> Box<Problem> {
@@ -44,6 +44,9 @@ fn refusal(pointer: &str, detail: &str) -> Box<Problem> {
 /// The nodes that a roll-out is tried on, as its status tells them.
 fn nodes(after: &State, rollout: &Document) -> Vec<Value> {
     let target = rollout_target(rollout).and_then(|key| after.get(&key));
+    let Some(selector) = canaries(rollout) else {
+        return Vec::new();
+    };
     let place = target.map(|target| placement(after, &target.document));
     // A change of what a node never sees cannot be tried there.
     let counts = |node: &Document| {
@@ -55,7 +58,7 @@ fn nodes(after: &State, rollout: &Document) -> Vec<Value> {
     };
     after
         .of_kind(Kind::Node, None)
-        .filter(|(_, held)| is_canary(rollout, &held.document) && counts(&held.document))
+        .filter(|(_, held)| selector.matches(&held.document.labels) && counts(&held.document))
         .map(|(key, _)| json!({ "node": key.name().as_str(), "phase": "pending", "revision": null, "reason": "" }))
         .collect()
 }

@@ -163,12 +163,14 @@ fn unique_items<'a>(
 fn foreign_dialect(schema: &Value) -> Option<String> {
     let members = schema.as_object()?;
     let own = own_dialect(members);
-    own.or_else(|| members.iter().find_map(|(name, value)| match (name.as_str(), value) {
-        (name, value) if ONE.contains(&name) => foreign_dialect(value),
-        (name, Value::Array(list)) if LIST.contains(&name) => list.iter().find_map(foreign_dialect),
-        (name, Value::Object(named)) if NAMED.contains(&name) => named.values().find_map(foreign_dialect),
-        _ => None,
-    }))
+    own.or_else(|| {
+        members.iter().find_map(|(name, value)| match (name.as_str(), value) {
+            (name, value) if ONE.contains(&name) => foreign_dialect(value),
+            (name, Value::Array(list)) if LIST.contains(&name) => list.iter().find_map(foreign_dialect),
+            (name, Value::Object(named)) if NAMED.contains(&name) => named.values().find_map(foreign_dialect),
+            _ => None,
+        })
+    })
 }
 
 /// The same of one subschema without those within it.

@@ -1,12 +1,13 @@
 //! From secrets as users write them to secrets as they are stored.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use blaze_domain::config::secret::{self, Secret};
 use blaze_domain::config::{Code, Document, FieldFault, Key, canonical, json};
 use serde_json::Value;
 use zeroize::Zeroizing;
 
+use super::edited::Edited;
 use crate::secrets::{Keyring, OpenError};
 
 /// Where secrets of a document go and come from.
@@ -104,7 +105,7 @@ impl Vault<'_> {
     /// equal to one item as it is shown      that one
     /// equal to several                      any, if their secrets are the same; in order, if there are as many as there
     ///                                       were; at the same place, if the list is as long as it was and none moved
-    /// equal to none, so it was edited       at the same place, if the list is as long as it was and none moved
+    /// equal to none, so it was edited       as `Edited` tells by the versions of its secrets, and by its place
     /// otherwise                             nobody knows
     /// ```
     fn counterparts<'c>(&self, items: &[Value], current: &'c [Value]) -> Vec<Counterpart<'c>> {
@@ -118,23 +119,49 @@ impl Vault<'_> {
         for text in &texts {
             *written.entry(text).or_default() += 1;
         }
+        // Places are in order.
+        let is_at = |found: &[usize], index: usize| found.binary_search(&index).is_ok();
         let is_in_place = items.len() == current.len()
             && texts
                 .iter()
                 .enumerate()
-                .all(|(index, text)| places.get(text).is_none_or(|found| found.contains(&index)));
+                .all(|(index, text)| places.get(text).is_none_or(|found| is_at(found, index)));
+        // An item that is written as often as it was there is itself; in place, so is each that is still there.
+        let left: HashSet<usize> = match is_in_place {
+            true => (0..items.len())
+                .filter(|index| !places.contains_key(&texts[*index]))
+                .collect(),
+            false => {
+                let is_left = |text: &str, found: usize| written.get(text).copied().unwrap_or_default() < found;
+                let left = places.iter().filter(|(text, found)| is_left(text, found.len()));
+                left.flat_map(|(_, found)| found.iter().copied()).collect()
+            }
+        };
+        let changed: Vec<&Value> = items
+            .iter()
+            .zip(&texts)
+            .filter(|(_, text)| !places.contains_key(*text))
+            .map(|(item, _)| item)
+            .collect();
+        let edited = Edited::new(current, left, &changed, is_in_place);
         let at = |index: usize| current.get(index).map_or(Counterpart::Unclear, Counterpart::Is);
         let mut met: HashMap<&str, usize> = HashMap::new();
+        // To compare them is to decrypt them.
+        let mut same: HashMap<&str, bool> = HashMap::new();
         let mut out = Vec::with_capacity(items.len());
         for (index, (item, text)) in items.iter().zip(&texts).enumerate() {
             let equal = places.get(text).map_or(&[][..], Vec::as_slice);
             let before = met.entry(text).or_default();
             let nth = *before;
             *before += 1;
+            if !secret::contains(item) {
+                out.push(Counterpart::Nothing);
+                continue;
+            }
             out.push(match equal {
-                _ if !secret::contains(item) => Counterpart::Nothing,
+                [] => edited.place_of(item, index).map_or(Counterpart::Unclear, at),
                 [only] => at(*only),
-                [first, ..] if self.same_texts(equal, current) => at(*first),
+                [first, ..] if *same.entry(text).or_insert_with(|| self.same_texts(equal, current)) => at(*first),
                 [_, ..] if written.get(text.as_str()) == Some(&equal.len()) => at(equal[nth]),
                 _ if is_in_place => at(index),
                 _ => Counterpart::Unclear,
@@ -150,7 +177,7 @@ impl Vault<'_> {
             let mut out: Option<Vec<Zeroizing<String>>> = Some(Vec::new());
             secret::walk(current.get(index)?, &mut |_, value| {
                 if let Some(texts) = &mut out {
-                    match self.keyring.open(self.key, uid, value) {
+                    match self.open(uid, value) {
                         Ok(text) => texts.push(text),
                         Err(_) => out = None,
                     }
@@ -165,6 +192,13 @@ impl Vault<'_> {
             .iter()
             .skip(1)
             .all(|index| texts(*index).as_ref() == Some(&first))
+    }
+
+    /// The text of a stored secret of the document.
+    fn open(&self, uid: &str, stored: &Value) -> Result<Zeroizing<String>, OpenError> {
+        #[cfg(test)]
+        tests::OPENED.with(|opened| opened.set(opened.get() + 1));
+        self.keyring.open(self.key, uid, stored)
     }
 
     fn one(&self, value: &Value, now: Counterpart<'_>) -> Result<Option<Value>, (Code, String)> {
@@ -190,7 +224,7 @@ impl Vault<'_> {
                 return self.keep(kept).map(Some);
             }
             Some(Ok(Secret::Text(text) | Secret::Revealed { text, .. })) => Zeroizing::new(text.to_owned()),
-            Some(Ok(Secret::Stored { .. })) => self.keyring.open(self.key, self.from_uid, value).map_err(|error| {
+            Some(Ok(Secret::Stored { .. })) => self.open(self.from_uid, value).map_err(|error| {
                 (
                     Code::SecretUnknown,
                     format!("the stored secret cannot be read: {error}"),
@@ -200,7 +234,7 @@ impl Vault<'_> {
             None => return Ok(None),
         };
         if let (Some(stored), Some(current)) = (stored_now, self.current)
-            && let Ok(same) = self.keyring.open(self.key, &current.uid, stored)
+            && let Ok(same) = self.open(&current.uid, stored)
             && *same == *text
         {
             return self.keep(stored).map(Some);
@@ -219,8 +253,7 @@ impl Vault<'_> {
         }
         let unreadable = |error: String| (Code::SecretUnknown, error);
         let text = self
-            .keyring
-            .open(self.key, current, stored)
+            .open(current, stored)
             .map_err(|error| unreadable(error.to_string()))?;
         let sealed = self.keyring.seal(self.key, self.uid, &text, self.revision);
         sealed.map_err(|error| unreadable(error.to_string()))
@@ -258,4 +291,68 @@ fn replaced(keyring: &Keyring, document: &Document, value: &Value, form: impl Fn
         Some(form(text.as_ref().map(|text| text.as_str()), version))
     });
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+    use std::sync::Arc;
+
+    use blaze_domain::config::{Labels, Timestamp};
+    use serde_json::json;
+
+    use super::*;
+
+    thread_local! {
+        /// Secrets that were decrypted.
+        pub(super) static OPENED: Cell<usize> = const { Cell::new(0) };
+    }
+
+    fn document(spec: Value) -> Document {
+        Document {
+            key: "Service/s".parse().unwrap(),
+            uid: "u".to_owned(),
+            revision: 1,
+            create_time: Timestamp::default(),
+            update_time: Timestamp::default(),
+            updated_by: String::new(),
+            labels: Labels::new(),
+            annotations: Labels::new(),
+            spec: Arc::new(spec),
+            status: None,
+        }
+    }
+
+    fn stored(keyring: &Keyring, current: Option<&Document>, spec: &Value) -> Result<Value, Vec<FieldFault>> {
+        let mut spec = spec.clone();
+        let key: Key = "Service/s".parse().unwrap();
+        let vault = Vault {
+            keyring,
+            key: &key,
+            uid: "u",
+            current,
+            from_uid: "u",
+            revision: 1,
+        };
+        vault.store(&mut spec).map(|()| spec)
+    }
+
+    #[test]
+    fn many_items_that_look_the_same_are_compared_once() {
+        let keyring = Keyring::with_keys(&[("e1", [7; 32])]).unwrap();
+        let twins: Vec<Value> = (0..3000).map(|_| json!({ "pw": { "$secret": "A" } })).collect();
+        let mut spec = stored(&keyring, None, &json!({ "config": { "list": twins } })).unwrap();
+        let current = document(spec.clone());
+        spec = secret::redact(&spec).into_owned();
+        spec["config"]["list"].as_array_mut().unwrap().pop();
+        OPENED.with(|opened| opened.set(0));
+        let kept = stored(&keyring, Some(&current), &spec).unwrap();
+        assert_eq!(kept["config"]["list"].as_array().unwrap().len(), 2999);
+        assert_eq!(OPENED.with(Cell::get), 3000);
+        // Nor is each that was edited compared with each.
+        for user in spec["config"]["list"].as_array_mut().unwrap() {
+            user["name"] = "x".into();
+        }
+        assert!(stored(&keyring, Some(&current), &spec).is_err(), "one went away");
+    }
 }

@@ -455,8 +455,13 @@ async fn what_is_not_there_is_told_like_other_refusals() {
 async fn in_development_pages_of_other_sites_are_kept_out() {
     let fixture = Fixture::open().await;
     let path = format!("{PATH}List");
-    let posted = fixture.post(&path, &[("origin", "http://evil.example")], &[]).await;
-    assert_eq!(posted.status.code(), tonic::Code::PermissionDenied);
+    // What needs no token is no exception, nor is what is not there.
+    for path in [&path, REFLECTION, "/grpc.health.v1.Health/Check", "/nowhere"] {
+        let posted = fixture.post(path, &[("origin", "http://evil.example")], &[]).await;
+        assert_eq!(posted.status.code(), tonic::Code::PermissionDenied, "{path}");
+    }
+    let own = fixture.post("/grpc.health.v1.Health/Check", &[("origin", "http://localhost")], &[]);
+    assert_eq!(own.await.status.code(), tonic::Code::Ok);
 }
 
 #[tokio::test]

@@ -138,3 +138,98 @@ async fn a_promotion_can_be_reverted_and_the_roll_out_stays_as_it_is() {
         Code::RolloutState
     );
 }
+
+#[tokio::test]
+async fn a_schema_that_is_tried_is_checked_on_the_canaries() {
+    let w = canary_world().await;
+    let tries = |schema: Value| on("Service", "s", &json!({ "schema": schema }));
+    let broken = start(&w, &w.admin, "r", tries(json!({ "type": "objekt" })))
+        .await
+        .unwrap_err();
+    assert_eq!(
+        (broken.code, broken.errors[0].pointer.as_str()),
+        (Code::ValidationFailed, "/spec/patch/schema")
+    );
+    let wrong = json!({ "properties": { "n": { "type": "string" } } });
+    assert_eq!(code(start(&w, &w.admin, "r", tries(wrong)).await), Code::SchemaMismatch);
+    let right = json!({ "properties": { "n": { "maximum": 5 } } });
+    start(&w, &w.admin, "r", tries(right)).await.unwrap();
+    // Where it is tried it holds, and elsewhere not yet.
+    let refused = w
+        .patch("Node/robot-1", json!({ "spec": { "config": { "n": 6 } } }))
+        .await;
+    assert_eq!(code(refused), Code::SchemaMismatch);
+    w.put("Node/robot-2", json!({ "layer": "edge", "config": { "n": 6 } }))
+        .await;
+    let promoted = w.service.promote_rollout(&w.admin, &"r".parse().unwrap(), None).await;
+    assert_eq!(code(promoted), Code::SchemaMismatch);
+}
+
+#[tokio::test]
+async fn a_roll_out_is_judged_by_what_the_whole_request_makes() {
+    let w = world().await;
+    let item = |name: &str, spec: Value, canary: bool| {
+        let mut input = input(name, spec);
+        if canary {
+            input.labels.insert("canary".to_owned(), "true".to_owned());
+        }
+        ApplyItem {
+            input,
+            revision: None,
+            delete: false,
+        }
+    };
+    let apply = async |items: Vec<ApplyItem>| {
+        let request = ApplyRequest {
+            items,
+            ..ApplyRequest::default()
+        };
+        w.service.apply(&w.admin, request, None).await
+    };
+    let rollout = || on("Service", "s", &json!({ "config": { "n": 2 } }));
+    let node = || json!({ "layer": "edge" });
+    let layer = || item("Layer/edge", json!({ "kind": "edge" }), false);
+    // With its target and its node, in whatever order.
+    let all = vec![
+        item("Rollout/r", rollout(), false),
+        item("Node/robot-1", node(), true),
+        item("Service/s", json!({ "config": { "n": 1 } }), false),
+        layer(),
+    ];
+    apply(all).await.unwrap();
+    let status = w.get("Rollout/r").await.unwrap().status.clone().unwrap();
+    assert_eq!(status["canaries"][0]["node"], "robot-1");
+    w.service
+        .abort_rollout(&w.admin, &"r".parse().unwrap(), "", None)
+        .await
+        .unwrap();
+    // A node that is none afterwards.
+    let without = vec![item("Rollout/q", rollout(), false), item("Node/robot-1", node(), false)];
+    let problem = apply(without).await.unwrap_err();
+    assert_eq!(problem.errors[0].pointer, "/spec/canary/node_selector");
+    assert_eq!(problem.errors[0].document, Some(0));
+    // A target that is too large together with the patch.
+    let half = |letter: &str| letter.repeat(140 * 1024);
+    let large = on("Service", "s", &json!({ "config": { "b": half("b") } }));
+    let large = vec![
+        item("Rollout/q", large, false),
+        item("Service/s", json!({ "config": { "a": half("a") } }), false),
+    ];
+    assert_eq!(code(apply(large).await), Code::PayloadTooLarge);
+}
+
+#[tokio::test]
+async fn a_roll_out_that_began_tells_its_revision() {
+    let w = canary_world().await;
+    let spec = on("Service", "s", &json!({ "config": { "n": 2 } }));
+    let started = start(&w, &w.admin, "r", spec).await.unwrap().document.revision;
+    let other = on("Service", "s", &json!({ "config": { "n": 3 } }));
+    let problem = w.try_put("Rollout/r", other, Precondition::Any).await.unwrap_err();
+    assert_eq!((problem.code, problem.revision), (Code::RolloutState, Some(started)));
+    let back = w
+        .service
+        .rollback(&w.admin, &key("Rollout/r"), started, Precondition::None, None)
+        .await
+        .unwrap_err();
+    assert_eq!((back.code, back.revision), (Code::RolloutState, Some(started)));
+}

@@ -101,6 +101,54 @@ async fn items_that_look_the_same_are_told_apart_only_where_that_is_certain() {
 }
 
 #[tokio::test]
+async fn an_edited_item_keeps_its_own_secret_and_never_that_of_another() {
+    // Told by the version of the secret: what was edited has moved to the place of one that is gone.
+    let w = three().await;
+    after(&w, |list| list[1] = user("b", "newer")).await.unwrap();
+    let moved = |list: &mut Vec<Value>| {
+        let mut edited = list[1].clone();
+        edited["port"] = 7.into();
+        *list = vec![edited, user("d", "D"), list[2].clone()];
+    };
+    assert_eq!(after(&w, moved).await.unwrap(), ["bnewer", "dD", "cC"]);
+    // The version is that of one that is still there itself.
+    let w = users(json!([user("a", "A")])).await;
+    after(&w, |list| list.push(user("b", "B"))).await.unwrap();
+    let copied = after(&w, |list| {
+        let copy = list[0].clone();
+        list[1] = copy;
+        list[1]["name"] = "x".into();
+    });
+    assert_eq!(code(copied.await), Code::SecretUnknown);
+    // Of the same version: told by what they still have in common, or not at all.
+    let two = async || users(json!([user("a", "A"), user("b", "B")])).await;
+    let both = |list: &mut Vec<Value>| list.iter_mut().for_each(|user| user["port"] = 7.into());
+    assert_eq!(after(&two().await, both).await.unwrap(), ["aA", "bB"]);
+    let renamed = |list: &mut Vec<Value>| {
+        list[0]["name"] = "x".into();
+        list[1]["name"] = "y".into();
+    };
+    assert_eq!(after(&two().await, renamed).await.unwrap(), ["xA", "yB"]);
+    let one = |list: &mut Vec<Value>| {
+        list[0]["port"] = 7.into();
+        list[1] = user("c", "C");
+    };
+    assert_eq!(after(&two().await, one).await.unwrap(), ["aA", "cC"]);
+    let swapped = after(&two().await, |list| {
+        both(list);
+        list.swap(0, 1);
+    })
+    .await;
+    assert_eq!(code(swapped), Code::SecretUnknown);
+    let replaced = after(&two().await, |list| {
+        list[1]["port"] = 7.into();
+        *list = vec![list[1].clone(), user("c", "C")];
+    })
+    .await;
+    assert_eq!(code(replaced), Code::SecretUnknown);
+}
+
+#[tokio::test]
 async fn a_schema_learns_nothing_of_a_secret() {
     let w = world().await;
     w.put("Service/s", json!({ "config": { "pw": { "$secret": "BOB" } } }))

@@ -25,7 +25,11 @@ async fn refusals_name_only_what_is_seen() {
     };
     let used = delete(false).await;
     assert_eq!(used.code, Code::InUse);
-    assert!(used.detail.contains("Instance/slam/0, 1 other"), "{used}");
+    assert!(
+        used.detail
+            .contains("Instance/slam/0, documents that the token does not see"),
+        "{used}"
+    );
     let cascaded = delete(true).await;
     assert_eq!(cascaded.code, Code::PermissionDenied);
     assert!(!format!("{used:?} {cascaded:?}").contains("ghost"), "{used} {cascaded}");
@@ -134,7 +138,6 @@ async fn an_answer_is_not_given_again_to_another_binding() {
     for (other, expected) in [
         (bound, Code::PermissionDenied),
         (caller(&["operator"], Some("fog")), Code::AlreadyExists),
-        (caller(&["operator"], None), Code::AlreadyExists),
     ] {
         assert_eq!(code(w.service.create(&other, node(), once()).await), expected);
     }

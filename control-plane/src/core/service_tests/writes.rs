@@ -62,12 +62,103 @@ async fn a_refusal_carries_the_revision_of_the_document() {
         .try_put("Layer/x", json!({ "kind": "fog" }), Precondition::Revisions(vec![1]))
         .await
         .unwrap_err();
-    assert_eq!((missing.code, missing.revision), (Code::PreconditionFailed, None));
+    assert_eq!(
+        (missing.code, missing.revision),
+        (Code::PreconditionFailed, Some(2)),
+        "that of the store"
+    );
     let unsaid = w
         .try_put("Layer/edge", json!({ "kind": "fog" }), Precondition::None)
         .await
         .unwrap_err();
     assert_eq!((unsaid.code, unsaid.revision), (Code::PreconditionRequired, Some(1)));
+    // A document that is gone since.
+    w.service
+        .delete(&w.admin, &key("Layer/fog"), Precondition::Any, false)
+        .await
+        .unwrap();
+    let gone = w.service.revert(&w.admin, 2, false, None).await.unwrap_err();
+    assert_eq!((gone.code, gone.revision), (Code::RevisionConflict, Some(3)));
+}
+
+#[tokio::test]
+async fn an_idempotency_key_belongs_to_the_subject_whatever_the_order_of_its_roles() {
+    let w = world().await;
+    let once = |body: u8| {
+        Some(Idempotency {
+            key: "k".to_owned(),
+            path: "/api/v1/layers".to_owned(),
+            body: [body; 32],
+        })
+    };
+    let layer = || input("Layer/edge", json!({ "kind": "edge" }));
+    let create = async |by: &Caller| w.service.create(by, layer(), once(1)).await;
+    create(&caller(&["operator", "viewer"], None)).await.unwrap();
+    assert!(create(&caller(&["viewer", "operator"], None)).await.unwrap().replayed);
+    assert!(create(&caller(&["admin"], None)).await.unwrap().replayed);
+    // Another view is another answer.
+    assert!(create(&caller(&["operator"], Some("edge"))).await.is_err());
+    // The same key at the same time.
+    let other = || {
+        w.service
+            .create(&w.admin, input("Layer/fog", json!({ "kind": "fog" })), once(2))
+    };
+    let second = || {
+        let once = once(2).map(|once| Idempotency {
+            key: "l".to_owned(),
+            ..once
+        });
+        w.service
+            .create(&w.admin, input("Layer/fog", json!({ "kind": "fog" })), once)
+    };
+    assert_eq!(code(other().await), Code::IdempotencyKeyReused);
+    let (one, two) = futures::join!(second(), second());
+    let running = [one, two].into_iter().find_map(Result::err).unwrap();
+    assert_eq!((running.code, running.revision), (Code::IdempotencyInProgress, Some(1)));
+}
+
+#[tokio::test]
+async fn an_answer_names_a_hundred_faults_at_most() {
+    let w = world().await;
+    let names: Vec<String> = (0..300).map(|number| format!("l{number}")).collect();
+    let refused = w
+        .try_put("Service/s", json!({ "layers": names }), Precondition::None)
+        .await
+        .unwrap_err();
+    assert_eq!((refused.code, refused.errors.len()), (Code::ReferenceNotFound, 100));
+    let nodes: Vec<String> = (0..300).map(|number| format!("Node/n{number}")).collect();
+    let items = nodes.iter().map(|name| (name.as_str(), json!({ "layer": "none" })));
+    let refused = w.apply(items.collect()).await.unwrap_err();
+    assert_eq!((refused.code, refused.errors.len()), (Code::ReferenceNotFound, 100));
+}
+
+#[tokio::test]
+async fn a_bound_token_does_not_learn_how_many_hidden_documents_refer_to_one() {
+    let w = world().await;
+    w.robot().await;
+    let bound = caller(&["operator"], Some("edge"));
+    let refused = async |by: &Caller| {
+        let node = key("Node/robot-1");
+        let deleted = w.service.delete(by, &node, Precondition::Any, false).await;
+        let problem = deleted.unwrap_err();
+        assert_eq!(problem.code, Code::InUse);
+        problem.detail
+    };
+    assert!(refused(&bound).await.contains("by Instance/slam/0: "));
+    // Hidden from the layer together with its service.
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    w.put("Service/hidden", json!({ "layers": ["fog"] })).await;
+    for number in 0..3 {
+        w.put(&format!("Instance/hidden/i{number}"), json!({ "node": "robot-1" }))
+            .await;
+    }
+    let detail = refused(&bound).await;
+    assert!(
+        detail.contains("Instance/slam/0, documents that the token does not see"),
+        "{detail}"
+    );
+    assert!(!detail.contains('3'), "{detail}");
+    assert!(refused(&w.admin).await.contains("Instance/hidden/i2"));
 }
 
 #[tokio::test]
