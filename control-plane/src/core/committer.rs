@@ -256,7 +256,8 @@ impl Committer {
         }
         let start = self.log.state();
         // Who is told of an answer may read what it speaks of.
-        let is_ahead = |one: &Work| matches!(one.before, Some(Tried::Before(revision, _)) if revision > start.revision());
+        let is_ahead =
+            |one: &Work| matches!(one.before, Some(Tried::Before(revision, _)) if revision > start.revision());
         if work.iter().any(is_ahead) {
             return Err(Again::Follow);
         }

@@ -29,6 +29,8 @@ pub(super) const MAX_WORK: u64 = 10_000_000;
 pub(super) const MAX_WORK_OF_COMMIT: u64 = 100_000_000;
 /// The same up to which every fault is looked for; beyond it the first one alone, for each takes memory.
 pub(super) const MAX_WORK_OF_ALL_FAULTS: u64 = 1_000_000;
+/// Patterns in one schema: each is compiled, which takes up to a megabyte and its time.
+const MAX_PATTERNS: usize = 200;
 /// Keywords with names, or with values to choose from, that are gone through one after the other.
 const NAMES: &[&str] = &[
     "dependencies",
@@ -67,9 +69,29 @@ impl Effort {
     }
 }
 
+/// How many patterns a schema has, or what looks like one.
+fn patterns(schema: &Value) -> usize {
+    match schema {
+        Value::Object(members) => members
+            .iter()
+            .map(|(name, value)| match (name.as_str(), value) {
+                ("pattern", Value::String(_)) => 1,
+                ("patternProperties", Value::Object(named)) => named.len() + patterns(value),
+                _ => patterns(value),
+            })
+            .sum(),
+        Value::Array(list) => list.iter().map(patterns).sum(),
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => 0,
+    }
+}
+
 /// The steps that a schema takes for each value of a configuration, at most. Refuses one that could take for ever, or the
 /// whole stack, although it is small.
 pub(super) fn steps(schema: &Value) -> Result<u64, String> {
+    let patterns = patterns(schema);
+    if patterns > MAX_PATTERNS {
+        return Err(format!("it has {patterns} patterns; {MAX_PATTERNS} are allowed"));
+    }
     let mut anchors = HashMap::new();
     find_anchors(schema, true, &mut anchors)?;
     let mut estimate = Estimate {

@@ -518,6 +518,20 @@ mod tests {
     }
 
     #[test]
+    fn patterns_are_counted() {
+        let schemas = Schemas::default();
+        let of = |count: usize| {
+            let list: Vec<Value> = (0..count)
+                .map(|number| json!({ "pattern": format!("^{number}$") }))
+                .collect();
+            json!({ "anyOf": list, "properties": { "pattern": { "type": "string" } }, "patternProperties": { "^a": true } })
+        };
+        assert_eq!(schemas.check(&of(199)), Ok(()));
+        let error = schemas.check(&of(200)).unwrap_err();
+        assert!(error.contains("201 patterns"), "{error}");
+    }
+
+    #[test]
     fn a_pattern_takes_linear_time() {
         let schemas = Schemas::default();
         let compiled = schemas.compiled(&json!({ "pattern": "^(a+)+$" })).unwrap();

@@ -70,7 +70,8 @@ fn words(code: Code) -> (&'static str, &'static str) {
             "Read it and change it with PUT or PATCH and If-Match, or choose another name.",
         ),
         Code::InUse => (
-            "Other documents refer to the one that is to be deleted; the detail names some of them.",
+            "Other documents refer to the one that is to be deleted; the detail names some of them, as far as the token \
+             sees them.",
             "Delete them first, or all at once with ?cascade=true.",
         ),
         Code::RevisionConflict => (
@@ -132,13 +133,17 @@ fn words(code: Code) -> (&'static str, &'static str) {
         ),
         Code::ValidationFailed => (
             "The document breaks a rule: an unknown member, a missing one, a value of the wrong type, a name that is \
-             not allowed.",
-            "errors lists every fault with its place as a JSON pointer.",
+             not allowed, a schema that refers to itself at the same value. Or what it makes cannot be checked in \
+             reasonable time: a configuration that is too large for its schema, a change that touches too many effective \
+             configurations of services with a schema at once.",
+            "errors lists up to 100 faults, each with its place as a JSON pointer. What is too costly to check is made \
+             smaller, its schema simpler, or the change in parts.",
         ),
         Code::SchemaMismatch => (
             "With this change the effective configuration of a service would no longer match the service's JSON \
              Schema. Nothing was written.",
-            "errors names the first twenty faults. Correct the value, or change the schema first.",
+            "errors names the first twenty faults (the first one alone, where the check takes long). Correct the value, \
+             or change the schema first.",
         ),
         Code::ReferenceNotFound => (
             "The document refers to one that does not exist: the layer of a node, the service of an instance, the \
@@ -146,7 +151,8 @@ fn words(code: Code) -> (&'static str, &'static str) {
             "Make it first, or write both in one apply; the order does not matter there.",
         ),
         Code::SecretUnknown => (
-            "The document keeps a secret ({\"redacted\": true}) at a place where none is stored.",
+            "The document keeps a secret ({\"redacted\": true}) at a place where none is stored, or in an item of a list \
+             that was changed so that it is not clear which item of before it is.",
             "Write the secret's text: {\"$secret\": \"text\"}.",
         ),
         Code::IdempotencyKeyReused => (

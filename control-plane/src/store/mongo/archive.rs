@@ -308,8 +308,12 @@ impl MongoStore {
     pub(super) async fn read_answers(&self, ids: &[&str]) -> Result<Vec<IdempotencyRow>, StoreError> {
         // What is below the floor was moved; a record that is still there may be one that came too late.
         let floor = signed(self.read_floor().await?);
-        let find = self.tables.events.find(doc! { "answers._id": { "$in": ids }, "last": { "$gt": floor } });
-        let asked = doc! { "$filter": { "input": "$answers", "as": "answer", "cond": { "$in": ["$$answer._id", ids] } } };
+        let find = self
+            .tables
+            .events
+            .find(doc! { "answers._id": { "$in": ids }, "last": { "$gt": floor } });
+        let asked =
+            doc! { "$filter": { "input": "$answers", "as": "answer", "cond": { "$in": ["$$answer._id", ids] } } };
         let find = find.projection(doc! { "answers": asked });
         let logged = collect(find, |found| {
             let answers = rows::members(found, "answers").map(|answer| rows::read_idempotency(answer?));

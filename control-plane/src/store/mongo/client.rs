@@ -87,7 +87,8 @@ impl Tables {
         let hello = limited(USUAL, tables.admin().run_command(doc! { "hello": 1 })).await?;
         if hello.get_str("msg").is_ok_and(|what| what == "isdbgrid") {
             return Err(StoreError::Refused(
-                "this MongoDB is the router of a sharded cluster: name the members of a replica set of its own".to_owned(),
+                "this MongoDB is the router of a sharded cluster: name the members of a replica set of its own"
+                    .to_owned(),
             ));
         }
         if hello.get_str("setName").is_err() {

@@ -14,13 +14,13 @@ use futures::FutureExt as _;
 use mongodb::bson::{Document, doc};
 use tokio::time::Instant;
 
-use super::{MongoStore, collect};
 use super::client::{USUAL, limited};
 use super::errors::write_error;
 use super::fence::since_boot;
 use super::read::Part;
 use super::rows::{self, Guard};
 use super::statements::{RECORD_COMMITS, document_updates};
+use super::{MongoStore, collect};
 use crate::store::StoreError;
 use crate::store::encode::signed;
 
@@ -124,11 +124,16 @@ impl MongoStore {
 
     /// Removes records across a revision under which others lie: they came too late, see [`super::fence`].
     async fn remove_late_below(&self, revision: i64) -> Result<(), StoreError> {
-        let across = doc! { "_id": { "$lte": revision, "$gt": revision - RECORD_COMMITS }, "last": { "$gt": revision } };
+        let across =
+            doc! { "_id": { "$lte": revision, "$gt": revision - RECORD_COMMITS }, "last": { "$gt": revision } };
         let events = &self.tables.events;
         let found = events.find(across).projection(doc! { "last": 1, "batch": 1 });
         let across = collect(found, |found| {
-            Ok((rows::integer(found, "_id")?, rows::integer(found, "last")?, rows::text(found, "batch")?))
+            Ok((
+                rows::integer(found, "_id")?,
+                rows::integer(found, "last")?,
+                rows::text(found, "batch")?,
+            ))
         });
         for (first, last, batch) in across.await? {
             let next = events.find_one(doc! { "_id": { "$gt": first, "$lte": last } });

@@ -249,7 +249,8 @@ impl CommitLog for MongoStore {
         };
         if let (Err(CommitError::Unknown(_)), Some(last)) = (&done, group.last()) {
             // Until these revisions are taken, memory may lack them.
-            self.doubt.fetch_max(last.event.revision.unsigned_abs(), Ordering::AcqRel);
+            self.doubt
+                .fetch_max(last.event.revision.unsigned_abs(), Ordering::AcqRel);
         }
         done
     }

@@ -74,7 +74,8 @@ impl MongoStore {
             let mut place = above;
             while let Some(next) = self.next_change(place).await?.filter(|next| *next <= until) {
                 let end = until.min(next.saturating_add(PIECE));
-                self.remove_versions_of(self.changed_keys(place, end).await?, now).await?;
+                self.remove_versions_of(self.changed_keys(place, end).await?, now)
+                    .await?;
                 place = end;
                 self.write_note(match (is_anew, number) {
                     (true, _) => Trimmed {
