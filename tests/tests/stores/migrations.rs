@@ -1,6 +1,7 @@
 //! Migrations of a database: killed at every point, by several at once, and from the first schema.
 
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -8,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use blaze_config::store::migrate::{Action, Migration, Migrations, Step};
 use blaze_config::store::{Archive as _, CommitLog as _, MongoStore, Op, StoreError, TokenStore as _, Upkeep as _};
 use blaze_domain::config::{Document, Key, Timestamp};
-use blaze_tests::servers::{drop_mongo_database, mongo_insert, shared_mongo, unique_name};
+use blaze_tests::servers::{drop_mongo_database, mongo_command, mongo_insert, shared_mongo, unique_name};
 use serde_json::{Value, json};
 
 use super::support::{Ledger, check, record, write_through};
@@ -238,6 +239,17 @@ async fn a_program_that_is_too_old_refuses_to_start() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_database_of_schema_1_is_read_and_migrated() {
     let database = Database::new();
+    // Collections and indexes as the migration makes them.
+    let folder = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../control-plane/migrations/0001_first.mongodb"
+    );
+    let files = std::fs::read_dir(folder).unwrap();
+    let files: BTreeSet<_> = files.map(|file| file.unwrap().path()).collect();
+    for file in files {
+        let command: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
+        mongo_command(&database.uri, &database.name, &command).unwrap();
+    }
     for line in SCHEMA_1.lines() {
         let line: Value = serde_json::from_str(line).unwrap();
         let table = line["collection"].as_str().unwrap();
