@@ -7,9 +7,10 @@ use blaze_domain::{LayerName, NodeName, ServiceName, TopicName};
 use clap::{Args, Parser, Subcommand};
 
 use crate::admin::TopOptions;
+use crate::config::ConfigCommand;
 use crate::demo::options::DemoOptions;
 use crate::local::{EchoOptions, HzOptions, PublishOptions};
-use crate::output::Format;
+use crate::output::Output;
 use crate::plan::PlanOptions;
 
 /// Joins robots, fog and cloud: see what flows, and why something does not.
@@ -23,8 +24,8 @@ use crate::plan::PlanOptions;
 )]
 pub struct Arguments {
     /// How results are printed
-    #[arg(short, long, global = true, value_enum, default_value_t = Format::Table)]
-    pub output: Format,
+    #[arg(short, long, global = true, value_enum, default_value_t = Output::Table)]
+    pub output: Output,
     /// What to do.
     #[command(subcommand)]
     pub command: Command,
@@ -53,6 +54,9 @@ pub enum Command {
     Hz(HzOptions),
     /// Robot, fog and cloud in one process, with recorded data
     Demo(DemoOptions),
+    /// Commands of the configuration.
+    #[command(flatten)]
+    Config(Box<ConfigCommand>),
     /// Completions for a shell, on standard output
     Completions {
         /// The shell
@@ -215,7 +219,7 @@ mod tests {
             ["blaze", "-o", "json", "why", "imu/data"],
             ["blaze", "why", "imu/data", "-o", "json"],
         ] {
-            assert_eq!(Arguments::try_parse_from(line).unwrap().output, Format::Json);
+            assert_eq!(Arguments::try_parse_from(line).unwrap().output, Output::Json);
         }
     }
 

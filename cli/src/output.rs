@@ -7,14 +7,46 @@ use serde_json::Value;
 
 use crate::exit::CliError;
 
-/// How results are printed.
+/// What `-o` takes. Every command has the formats of [`Format`]; `get` has all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Format {
+pub enum Output {
     /// For people
     Table,
-    /// As the flow answers
+    /// For people, with more columns (`get` alone)
+    Wide,
+    /// KIND/NAME alone, one a line (`get` alone)
+    Name,
+    /// As the server answers
     Json,
     /// The same as YAML
+    Yaml,
+}
+
+impl Output {
+    /// The format of a command that has no names and no more columns.
+    ///
+    /// # Errors
+    /// [`CliError::Usage`] for the other two.
+    pub fn format(self) -> Result<Format, CliError> {
+        match self {
+            Self::Table => Ok(Format::Table),
+            Self::Json => Ok(Format::Json),
+            Self::Yaml => Ok(Format::Yaml),
+            Self::Wide | Self::Name => Err(CliError::Usage(
+                "-o wide and -o name are for `blaze get`; here there are table, json and yaml".to_owned(),
+            )),
+        }
+    }
+}
+
+/// How results are printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// For people.
+    Table,
+    /// As the server answers.
+    Json,
+    /// The same as YAML.
     Yaml,
 }
 
@@ -117,6 +149,14 @@ pub fn number(value: Option<f64>, decimals: usize) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn only_get_has_all_formats() {
+        assert_eq!(Output::Yaml.format().unwrap(), Format::Yaml);
+        for output in [Output::Wide, Output::Name] {
+            assert!(matches!(output.format(), Err(CliError::Usage(_))));
+        }
+    }
 
     const COLUMNS: [(&str, Align); 2] = [("TOPIC", Align::Left), ("HZ", Align::Right)];
 

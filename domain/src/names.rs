@@ -189,6 +189,10 @@ name!(
     InstanceName, check_name
 );
 name!(
+    /// Name of a configuration document of any kind; form as [`LayerName`].
+    DocumentName, check_name
+);
+name!(
     /// Name of a user topic: segments of `A-Z a-z 0-9 _ -` joined by `/`, no leading slash, at most 200 bytes, not below
     /// `blaze/`.
     TopicName, check_topic
@@ -197,6 +201,24 @@ name!(
     /// Name of a channel of a broker: a user topic, or one of BlazeAIoT's own below `blaze/` (control, events, replies).
     ChannelName, check_channel
 );
+
+macro_rules! document_name {
+    ($($type:ident),+) => {
+        $(impl From<&$type> for DocumentName {
+            fn from(name: &$type) -> Self {
+                Self(Arc::clone(&name.0))
+            }
+        }
+
+        impl From<&DocumentName> for $type {
+            fn from(name: &DocumentName) -> Self {
+                Self(Arc::clone(&name.0))
+            }
+        })+
+    };
+}
+// All of them follow the same rule, so that each is the name of a document and the other way round.
+document_name!(LayerName, NodeName, ServiceName, InstanceName);
 
 impl InstanceName {
     /// The instance that is meant when none is named: `0`.

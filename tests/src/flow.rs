@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use crate::admin::Admin;
 use crate::network::Host;
-use crate::process::{Process, Signal, Usage};
+use crate::process::{self, Process, Signal, Usage};
 use crate::wait;
 
 /// Where a flow must say `ready`, on a busy machine.
@@ -364,15 +364,7 @@ impl FlowProcess {
     /// # Errors
     /// When the process has gone.
     pub fn cpu(&self) -> anyhow::Result<Duration> {
-        // CLK_TCK is 100 on every Linux that Rust runs on.
-        const TICKS_PER_S: f64 = 100.0;
-        let text = std::fs::read_to_string(format!("/proc/{}/stat", self.id()))?;
-        let after_name = text.rsplit_once(')').context("no name in /proc/PID/stat")?.1;
-        let fields: Vec<&str> = after_name.split_whitespace().collect();
-        let ticks = |index: usize| -> anyhow::Result<f64> {
-            Ok(fields.get(index).context("a short line")?.parse::<u64>()? as f64)
-        };
-        Ok(Duration::from_secs_f64((ticks(11)? + ticks(12)?) / TICKS_PER_S))
+        process::cpu_time(self.id())
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write as _};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -45,6 +45,21 @@ pub fn hurry() {
     let _ = setpriority_process(None, HIGHEST);
 }
 
+/// CPU time that a process has used, of all its threads, in the program and in the system for it; in steps of 10 ms.
+///
+/// # Errors
+/// When there is no such process.
+pub fn cpu_time(id: u32) -> anyhow::Result<Duration> {
+    // CLK_TCK is 100 on every Linux that Rust runs on.
+    const TICKS_PER_S: f64 = 100.0;
+    let text = std::fs::read_to_string(format!("/proc/{id}/stat"))?;
+    let after_name = text.rsplit_once(')').context("no name in /proc/PID/stat")?.1;
+    let fields: Vec<&str> = after_name.split_whitespace().collect();
+    let ticks =
+        |index: usize| -> anyhow::Result<f64> { Ok(fields.get(index).context("a short line")?.parse::<u64>()? as f64) };
+    Ok(Duration::from_secs_f64((ticks(11)? + ticks(12)?) / TICKS_PER_S))
+}
+
 type Lines = Arc<Mutex<Vec<String>>>;
 
 /// What a process holds of its machine.
@@ -84,6 +99,19 @@ impl Process {
     /// # Errors
     /// When it is not built or does not start.
     pub fn start(name: &str, arguments: &[&str], namespace: Option<&str>) -> anyhow::Result<Self> {
+        Self::launch(name, arguments, namespace, None)
+    }
+
+    /// Starts a program of the workspace that says more than is kept: all of its stderr is written to a file, too.
+    ///
+    /// # Errors
+    /// When it is not built or does not start, or the file cannot be made.
+    pub fn start_logged(name: &str, arguments: &[&str], log: &Path) -> anyhow::Result<Self> {
+        let file = File::create(log).with_context(|| format!("making {}", log.display()))?;
+        Self::launch(name, arguments, None, Some(file))
+    }
+
+    fn launch(name: &str, arguments: &[&str], namespace: Option<&str>, log: Option<File>) -> anyhow::Result<Self> {
         let mut command = network::program(namespace, binary(name)?);
         command
             .args(arguments)
@@ -91,7 +119,10 @@ impl Process {
             .stdout(Stdio::piped())
             .stderr(Stdio::piped());
         let mut child = command.spawn().with_context(|| format!("starting {name}"))?;
-        let log = log_file(name, child.id())?;
+        let log = match log {
+            Some(log) => Some(log),
+            None => log_file(name, child.id())?,
+        };
         let stdout = collect(child.stdout.take(), None);
         let stderr = collect(child.stderr.take(), log);
         Ok(Self {

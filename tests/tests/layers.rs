@@ -11,6 +11,11 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ("blaze-domain", &[]),
     ("blaze-proto", &["blaze-domain"]),
     ("blaze-runtime", &[]),
+    ("blaze-auth", &["blaze-domain"]),
+    (
+        "blaze-config",
+        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-auth"],
+    ),
     ("blaze-brokers", &["blaze-domain", "blaze-proto", "blaze-runtime"]),
     (
         "blaze-flow",
@@ -29,6 +34,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "blaze-brokers",
             "blaze-flow",
             "blaze-sdk",
+            "blaze-auth",
         ],
     ),
     (
@@ -40,6 +46,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "blaze-brokers",
             "blaze-flow",
             "blaze-sdk",
+            "blaze-auth",
         ],
     ),
 ];
@@ -48,14 +55,20 @@ const ALLOWED: &[(&str, &[&str])] = &[
 const OUTSIDE: &[(&str, &[&str])] = &[
     // The tests have a plain DDS program, which knows nothing of BlazeAIoT.
     ("rustdds", &["blaze-brokers", "blaze-tests"]),
-    ("axum", &["blaze-runtime", "blaze-flow"]),
-    ("anyhow", &["blaze-runtime", "blaze-flow", "blaze", "blaze-tests"]),
+    ("axum", &["blaze-runtime", "blaze-flow", "blaze-config"]),
+    (
+        "anyhow",
+        &["blaze-runtime", "blaze-flow", "blaze-config", "blaze", "blaze-tests"],
+    ),
+    ("mongodb", &["blaze-config", "blaze-tests"]),
+    ("rusqlite", &["blaze-config"]),
     (
         "tokio",
         &[
             "blaze-runtime",
             "blaze-brokers",
             "blaze-flow",
+            "blaze-config",
             "blaze-sdk",
             "blaze",
             "blaze-tests",

@@ -86,7 +86,7 @@ async fn suggest_topic(flow: &FlowAddress, wanted: &str) {
 }
 
 /// The name that is most like `wanted`, if one is alike at all.
-fn closest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+pub(crate) fn closest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     names
         .filter(|name| *name != wanted)
         .map(|name| (strsim::jaro_winkler(wanted, name), name))

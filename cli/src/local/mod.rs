@@ -140,7 +140,7 @@ fn lease_error(what: &str, topic: &TopicName, kind: BrokerKind, error: &FlowErro
 }
 
 /// Waits for Ctrl-C or SIGTERM.
-async fn interrupted() -> Result<(), CliError> {
+pub(crate) async fn interrupted() -> Result<(), CliError> {
     let fault = |error: std::io::Error| CliError::Failed(format!("no signal handlers: {error}"));
     let mut interrupt = signal(SignalKind::interrupt()).map_err(fault)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(fault)?;

@@ -51,6 +51,7 @@ use crate::names::{LayerName, NodeName};
 use crate::qos::LayerKind;
 use readers::{parsed, path};
 use walk::{Node, Report, Section};
+pub(crate) use walk::{describe, nearest};
 
 /// Largest payload, as the readers of numbers take it.
 const MAX_BYTES: u32 = MAX_PAYLOAD_BYTES as u32;

@@ -254,7 +254,7 @@ pub(super) fn from_empty<T>(read: fn(&mut Section<'_>) -> T) -> T {
 pub(super) type Choice<'v, T> = (&'static str, fn(&mut Section<'v>) -> Option<T>);
 
 /// What a value is, for people.
-fn describe(value: &Value) -> String {
+pub(crate) fn describe(value: &Value) -> String {
     match value {
         Value::Null => "nothing".to_owned(),
         Value::Bool(value) => format!("{value}"),
@@ -267,7 +267,7 @@ fn describe(value: &Value) -> String {
 }
 
 /// The known word that was probably meant.
-fn nearest(found: &str, known: &[&'static str]) -> Option<&'static str> {
+pub(crate) fn nearest(found: &str, known: &[&'static str]) -> Option<&'static str> {
     if found.len() > 64 {
         return None;
     }

@@ -16,6 +16,8 @@ mod scalar;
 mod tests;
 mod watch;
 mod yaml;
+#[cfg(test)]
+mod yaml_documents_tests;
 
 use std::sync::Arc;
 
@@ -24,6 +26,7 @@ use serde_json::Value;
 pub use document::{Document, MAX_FILE_BYTES, Sources, parse_override};
 pub use place::{LocatedFault, Place};
 pub use watch::{Current, WatchSettings, watch};
+pub use yaml::yaml_documents;
 
 /// A path and what is to be said of it.
 pub type Remark = (String, String);

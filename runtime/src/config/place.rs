@@ -4,6 +4,9 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
 
+/// Begins the detail of the fault that a text has more documents than allowed.
+pub(super) const TOO_MANY_DOCUMENTS: &str = "holds too many documents";
+
 /// Where a value comes from.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Place {
@@ -16,6 +19,8 @@ pub enum Place {
         /// The line.
         line: usize,
     },
+    /// A line of a text that is no file, counted from 1.
+    Line(usize),
     /// A variable of the environment.
     Environment(Arc<str>),
     /// An override on the command line: its path, without the value.
@@ -28,6 +33,7 @@ impl fmt::Display for Place {
             Self::Nowhere => f.write_str("configuration"),
             Self::File { file, line: 0 } => f.write_str(file),
             Self::File { file, line } => write!(f, "{file}:{line}"),
+            Self::Line(line) => write!(f, "line {line}"),
             Self::Environment(name) => write!(f, "environment {name}"),
             Self::Override(path) => write!(f, "--set {path}"),
         }
@@ -43,6 +49,14 @@ pub struct LocatedFault {
     pub path: String,
     /// What is wrong with it.
     pub detail: String,
+}
+
+impl LocatedFault {
+    /// Whether it is that a text has more documents than [`yaml_documents`](super::yaml_documents) was to read.
+    #[must_use]
+    pub fn is_too_many_documents(&self) -> bool {
+        self.path.is_empty() && self.detail.starts_with(TOO_MANY_DOCUMENTS)
+    }
 }
 
 impl fmt::Display for LocatedFault {

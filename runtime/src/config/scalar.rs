@@ -63,7 +63,13 @@ fn decimal(text: &str) -> Result<Value, String> {
     if let Ok(value) = plain.parse::<u64>() {
         return Ok(value.into());
     }
-    let number = plain.parse::<f64>().ok().and_then(Number::from_f64);
+    // An integer that fits neither must not become a float, which would be another number.
+    let is_integer = plain.trim_start_matches('-').bytes().all(|byte| byte.is_ascii_digit());
+    let number = plain
+        .parse::<f64>()
+        .ok()
+        .filter(|_| !is_integer)
+        .and_then(Number::from_f64);
     number
         .map(Value::Number)
         .ok_or_else(|| "is a number too large to hold".to_owned())
@@ -105,7 +111,15 @@ mod tests {
         ] {
             assert_eq!(core_schema(text), Ok(expected), "{text}");
         }
-        for text in [".inf", "-.Inf", ".nan", "1e999", "0xfffffffffffffffff"] {
+        for text in [
+            ".inf",
+            "-.Inf",
+            ".nan",
+            "1e999",
+            "0xfffffffffffffffff",
+            "18446744073709551616",
+            "-9223372036854775809",
+        ] {
             assert!(core_schema(text).is_err(), "{text}");
         }
     }

@@ -1,7 +1,13 @@
-//! YAML text to a tree of values, with the line of every value.
+//! YAML text to trees of values, with the line of every value or fault.
 //!
-//! The core schema of YAML 1.2 (so `on` and `off` are texts), one document. Anchors, aliases, duplicate keys and tags
-//! other than `!!str` are refused with their line: they make a file mean something else than it seems to say.
+//! The core schema of YAML 1.2 (so `on` and `off` are texts). Anchors, aliases, duplicate keys, tags (but `!!str` in the
+//! configuration of a process) and directives other than `%YAML 1.2` are refused with their line: they make a text mean
+//! something else than it seems to say.
+//!
+//! ```text
+//! a file of one document ──[parse]──▶ tree, place of every value, faults        (the configuration of a process)
+//! a text of several ──[yaml_documents]──▶ trees, or every fault                 (documents of the whole system)
+//! ```
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -9,13 +15,15 @@ use std::sync::Arc;
 use saphyr_parser::{Event, Parser, ScalarStyle, Span, Tag};
 use serde_json::{Map, Value};
 
-use super::place::{LocatedFault, Place, Places, join};
+use super::place::{LocatedFault, Place, Places, TOO_MANY_DOCUMENTS, join};
 use super::scalar::core_schema;
 
 /// Deepest nesting.
 pub(super) const MAX_DEPTH: usize = 32;
 /// More faults than these help nobody.
 const MAX_FAULTS: usize = 200;
+/// Longest key, in bytes: faults repeat all keys on the way to them.
+const MAX_KEY_BYTES: usize = 1024;
 
 /// What a text holds.
 pub(super) struct Parsed {
@@ -32,6 +40,8 @@ pub(super) enum Origin {
     File(Arc<str>),
     /// One place for all: a variable or an option.
     Single(Place),
+    /// Each line has its own place, of a text that is no file.
+    Text,
 }
 
 impl Origin {
@@ -42,50 +52,98 @@ impl Origin {
                 line,
             },
             Self::Single(place) => place.clone(),
+            Self::Text => Place::Line(line),
         }
     }
 }
 
-/// Reads a text whose root stands at `root` in the whole document (empty for a file).
+/// Reads a text of one document whose root stands at `root` in the whole document (empty for a file).
 pub(super) fn parse(text: &str, origin: &Origin, root: &str) -> Parsed {
-    let mut builder = Builder {
-        origin,
-        root,
-        stack: Vec::new(),
-        document: None,
-        documents: 0,
-        places: Places::default(),
-        faults: Vec::new(),
-    };
-    builder.places.set(root, origin.place(1));
-    let mut parser = Parser::new_from_str(text);
-    let mut whole = true;
-    while let Some(event) = parser.next_event() {
-        let step = match event {
-            Ok((event, span)) => builder.event(event, span),
-            Err(error) => {
-                builder.fault(
-                    error.marker().line(),
-                    root.to_owned(),
-                    format!("is not YAML: {}", error.info()),
-                );
-                Err(Stop)
-            }
-        };
-        if step.is_err() || builder.faults.len() >= MAX_FAULTS {
-            whole = false;
-            break;
-        }
-    }
+    let mut places = Places::default();
+    places.set(root, origin.place(1));
+    let mut builder = Builder::new(origin, root, Documents::One, Some(places));
+    let whole = builder.read(text);
     Parsed {
         value: whole.then(|| builder.document.unwrap_or(Value::Null)),
-        places: builder.places,
+        places: builder.places.unwrap_or_default(),
         faults: builder.faults,
+    }
+}
+
+/// Reads a text of several documents, split by `---`, such as `apply` takes. Empty documents are left out. Places of faults
+/// are lines of the text.
+///
+/// # Errors
+/// Every fault of form: what is no YAML, repeated keys, anchors, aliases, tags, directives other than `%YAML 1.2`, nesting
+/// deeper than 32, numbers that cannot be held. More than `max_documents` are one fault ([`LocatedFault::is_too_many_documents`]).
+pub fn yaml_documents(text: &str, max_documents: usize) -> Result<Vec<Value>, Vec<LocatedFault>> {
+    let documents = Documents::Many {
+        limit: max_documents,
+        finished: Vec::new(),
+    };
+    let origin = Origin::Text;
+    let mut builder = Builder::new(&origin, "", documents, None);
+    builder.read(text.strip_prefix('\u{feff}').unwrap_or(text));
+    match builder.documents {
+        Documents::Many { finished, .. } if builder.faults.is_empty() => Ok(finished),
+        Documents::Many { .. } | Documents::One => Err(builder.faults),
     }
 }
 
 /// The text cannot be read further.
 struct Stop;
+
+/// Finds directives, which the parser follows and does not tell of. They stand between two documents.
+struct Directives<'a> {
+    /// Where it has come to.
+    rest: &'a str,
+    /// Number of the line that begins there.
+    line: usize,
+    /// The line of the end of the last document.
+    end: usize,
+}
+
+impl<'a> Directives<'a> {
+    fn of(text: &'a str) -> Self {
+        Self {
+            rest: text,
+            line: 1,
+            end: 1,
+        }
+    }
+
+    /// Lines of directives that are not taken, before a document that begins.
+    fn refused(&mut self, event: &Event<'_>, span: Span) -> Vec<usize> {
+        let mut refused = Vec::new();
+        match event {
+            Event::DocumentEnd => self.end = span.start.line(),
+            Event::DocumentStart(true) => {
+                while self.line < span.start.line() && !self.rest.is_empty() {
+                    let (number, line) = (self.line, self.next_line());
+                    let directive = line.split(" #").next().unwrap_or_default();
+                    let is_known = directive.split_whitespace().eq(["%YAML", "1.2"]);
+                    if number >= self.end && line.starts_with('%') && !is_known {
+                        refused.push(number);
+                    }
+                }
+            }
+            _ => {}
+        }
+        refused
+    }
+
+    /// Lines end as YAML has it: with line feed, carriage return, or both.
+    fn next_line(&mut self) -> &'a str {
+        let end = self.rest.find(['\n', '\r']).unwrap_or(self.rest.len());
+        let (line, rest) = self.rest.split_at(end);
+        self.rest = rest
+            .strip_prefix("\r\n")
+            .or_else(|| rest.strip_prefix(['\n', '\r']))
+            .unwrap_or_default();
+        self.line += 1;
+        line
+    }
+}
 
 /// A collection that is still open.
 enum Open {
@@ -105,22 +163,69 @@ struct Key {
     repeated: bool,
 }
 
-struct Frame {
-    path: String,
-    open: Open,
+/// How many documents a text may hold.
+enum Documents {
+    One,
+    Many {
+        limit: usize,
+        /// Those that are complete and not empty.
+        finished: Vec<Value>,
+    },
 }
 
 struct Builder<'a> {
     origin: &'a Origin,
     root: &'a str,
-    stack: Vec<Frame>,
+    /// What is open, from the root on; together they are the path of what is read now.
+    stack: Vec<Open>,
     document: Option<Value>,
-    documents: usize,
-    places: Places,
+    documents: Documents,
+    started: usize,
+    /// `None`: nobody asks for them.
+    places: Option<Places>,
     faults: Vec<LocatedFault>,
 }
 
-impl Builder<'_> {
+impl<'a> Builder<'a> {
+    fn new(origin: &'a Origin, root: &'a str, documents: Documents, places: Option<Places>) -> Self {
+        Self {
+            origin,
+            root,
+            stack: Vec::new(),
+            document: None,
+            documents,
+            started: 0,
+            places,
+            faults: Vec::new(),
+        }
+    }
+
+    /// Reads a text; whether to its end.
+    fn read(&mut self, text: &str) -> bool {
+        let mut parser = Parser::new_from_str(text);
+        let mut directives = Directives::of(text);
+        while let Some(event) = parser.next_event() {
+            let step = match event {
+                Ok((event, span)) => {
+                    for line in directives.refused(&event, span) {
+                        let detail = "directives other than %YAML 1.2 are not allowed";
+                        self.fault(line, self.root.to_owned(), detail);
+                    }
+                    self.event(event, span)
+                }
+                Err(error) => {
+                    let detail = format!("is not YAML: {}", error.info());
+                    self.fault(error.marker().line(), self.root.to_owned(), detail);
+                    Err(Stop)
+                }
+            };
+            if step.is_err() || self.faults.len() >= MAX_FAULTS {
+                return false;
+            }
+        }
+        true
+    }
+
     fn fault(&mut self, line: usize, path: String, detail: impl Into<String>) {
         self.faults.push(LocatedFault {
             place: self.origin.place(line),
@@ -132,24 +237,20 @@ impl Builder<'_> {
     fn event(&mut self, event: Event<'_>, span: Span) -> Result<(), Stop> {
         let line = span.start.line();
         match event {
-            Event::Nothing | Event::StreamStart | Event::StreamEnd | Event::DocumentEnd => Ok(()),
-            Event::DocumentStart(_) => {
-                self.documents += 1;
-                if self.documents > 1 {
-                    self.fault(line, self.root.to_owned(), "holds a second document; one is allowed");
-                    return Err(Stop);
-                }
-                Ok(())
-            }
+            Event::Nothing | Event::StreamStart | Event::StreamEnd => Ok(()),
+            Event::DocumentStart(_) => self.start_document(line),
+            Event::DocumentEnd => self.end_document(line),
             Event::Alias(_) => self.alias(line),
             Event::Scalar(text, style, anchor, tag) => {
                 self.refuse_anchor(anchor, line);
                 if self.wants_key() {
+                    self.refuse_tag(tag.as_deref(), line);
                     return self.key(text.into_owned(), line);
                 }
-                let (path, line) = self.next_place(line);
-                let value = self.scalar(&text, style, tag.as_deref(), line, &path);
-                self.put(&path, line, value);
+                let line = self.line_of_value(line);
+                self.note_place(line);
+                let value = self.scalar(&text, style, tag.as_deref(), line);
+                self.put(value);
                 Ok(())
             }
             Event::SequenceStart(anchor, tag) => self.open(Open::List(Vec::new()), anchor, tag.as_deref(), line),
@@ -168,29 +269,54 @@ impl Builder<'_> {
         }
     }
 
+    fn start_document(&mut self, line: usize) -> Result<(), Stop> {
+        self.started += 1;
+        if matches!(self.documents, Documents::One) && self.started > 1 {
+            self.fault(line, self.root.to_owned(), "holds a second document; one is allowed");
+            return Err(Stop);
+        }
+        Ok(())
+    }
+
+    fn end_document(&mut self, line: usize) -> Result<(), Stop> {
+        let Documents::Many { limit, finished } = &mut self.documents else {
+            return Ok(());
+        };
+        let limit = *limit;
+        match self.document.take() {
+            None | Some(Value::Null) => Ok(()),
+            Some(_) if finished.len() >= limit => {
+                self.fault(
+                    line,
+                    String::new(),
+                    format!("{TOO_MANY_DOCUMENTS}: at most {limit} are allowed"),
+                );
+                Err(Stop)
+            }
+            Some(document) => {
+                finished.push(document);
+                Ok(())
+            }
+        }
+    }
+
     fn wants_key(&self) -> bool {
-        matches!(
-            self.stack.last(),
-            Some(Frame {
-                open: Open::Map { key: None, .. },
-                ..
-            })
-        )
+        matches!(self.stack.last(), Some(Open::Map { key: None, .. }))
     }
 
     fn key(&mut self, name: String, line: usize) -> Result<(), Stop> {
-        let Some(Frame {
-            path,
-            open: Open::Map { key, seen, .. },
-        }) = self.stack.last_mut()
-        else {
+        if name.len() > MAX_KEY_BYTES {
+            let detail = format!("has a key of {} bytes, at most {MAX_KEY_BYTES} are allowed", name.len());
+            self.fault(line, self.here(), detail);
+            return Err(Stop);
+        }
+        let Some(Open::Map { key, seen, .. }) = self.stack.last_mut() else {
             return Err(Stop);
         };
         let repeated = !seen.insert(name.clone());
-        let at = join(path, &name);
         *key = Some(Key { name, line, repeated });
         if repeated {
-            self.fault(line, at, "is given twice");
+            self.fault(line, self.here(), "is given twice");
         }
         Ok(())
     }
@@ -200,13 +326,14 @@ impl Builder<'_> {
             self.fault(line, self.here(), "an alias cannot be a key");
             return Err(Stop);
         }
-        let (path, line) = self.next_place(line);
+        let line = self.line_of_value(line);
         self.fault(
             line,
-            path.clone(),
+            self.here(),
             "aliases (*name) are not allowed: write the value out",
         );
-        self.put(&path, line, Value::Null);
+        self.note_place(line);
+        self.put(Value::Null);
         Ok(())
     }
 
@@ -216,26 +343,24 @@ impl Builder<'_> {
             self.fault(line, self.here(), "a key must be text");
             return Err(Stop);
         }
-        let (path, line) = self.next_place(line);
+        let line = self.line_of_value(line);
         if self.stack.len() >= MAX_DEPTH {
-            self.fault(line, path, format!("is nested deeper than {MAX_DEPTH}"));
+            self.fault(line, self.here(), format!("is nested deeper than {MAX_DEPTH}"));
             return Err(Stop);
         }
         if tag.is_some() {
-            self.fault(line, path.clone(), "tags are not allowed");
+            self.fault(line, self.here(), "tags are not allowed");
         }
-        self.note_place(&path, line);
-        self.stack.push(Frame { path, open });
+        self.note_place(line);
+        self.stack.push(open);
         Ok(())
     }
 
     fn close(&mut self) {
-        if let Some(Frame { path, open }) = self.stack.pop() {
-            let value = match open {
-                Open::List(items) => Value::Array(items),
-                Open::Map { entries, .. } => Value::Object(entries),
-            };
-            self.put(&path, 0, value);
+        match self.stack.pop() {
+            Some(Open::List(items)) => self.put(Value::Array(items)),
+            Some(Open::Map { entries, .. }) => self.put(Value::Object(entries)),
+            None => {}
         }
     }
 
@@ -249,51 +374,61 @@ impl Builder<'_> {
         }
     }
 
-    /// The path of what is read now, for faults.
+    /// Of scalars and keys.
+    fn refuse_tag(&mut self, tag: Option<&Tag>, line: usize) {
+        let Some(tag) = tag else { return };
+        let detail = match self.documents {
+            Documents::One if tag.is_yaml_core_schema() && tag.suffix == "str" => return,
+            Documents::One => "tags other than !!str are not allowed",
+            Documents::Many { .. } => "tags are not allowed",
+        };
+        self.fault(line, self.here(), detail);
+    }
+
+    /// The path of what is read now. It is put together only where it is needed, for it may be long.
     fn here(&self) -> String {
+        let mut path = self.root.to_owned();
+        for open in &self.stack {
+            match open {
+                Open::Map { key: Some(key), .. } => path = join(&path, &key.name),
+                Open::Map { key: None, .. } => {}
+                Open::List(items) => path.push_str(&format!("[{}]", items.len())),
+            }
+        }
+        path
+    }
+
+    /// Line of the next value. A value of a mapping has the line of its key: there a person looks first, and an absent
+    /// value has no line of its own.
+    fn line_of_value(&self, line: usize) -> usize {
         match self.stack.last() {
-            None => self.root.to_owned(),
-            Some(frame) => match &frame.open {
-                Open::Map { key: Some(key), .. } => join(&frame.path, &key.name),
-                Open::Map { key: None, .. } => frame.path.clone(),
-                Open::List(items) => format!("{}[{}]", frame.path, items.len()),
-            },
+            Some(Open::Map { key: Some(key), .. }) => key.line,
+            Some(Open::Map { key: None, .. } | Open::List(_)) | None => line,
         }
     }
 
-    /// Path and line of the next value. A value of a mapping has the line of its key: there a person looks first, and
-    /// an absent value has no line of its own.
-    fn next_place(&self, line: usize) -> (String, usize) {
-        let line = match self.stack.last() {
-            Some(Frame {
-                open: Open::Map { key: Some(key), .. },
-                ..
-            }) => key.line,
-            _ => line,
-        };
-        (self.here(), line)
-    }
-
-    /// The first place of a path stays, so that a repeated key does not hide the first one.
-    fn note_place(&mut self, path: &str, line: usize) {
-        if line > 0 && (path == self.root || !self.places.knows(path)) {
-            self.places.set(path, self.origin.place(line));
+    /// Notes where the next value stands. The first place of a path stays, so that a repeated key does not hide the first
+    /// one.
+    fn note_place(&mut self, line: usize) {
+        if self.places.is_none() {
+            return;
+        }
+        let (path, place) = (self.here(), self.origin.place(line));
+        if let Some(places) = self
+            .places
+            .as_mut()
+            .filter(|places| path == self.root || !places.knows(&path))
+        {
+            places.set(&path, place);
         }
     }
 
     /// A value is complete: it goes into the open collection.
-    fn put(&mut self, path: &str, line: usize, value: Value) {
-        self.note_place(path, line);
+    fn put(&mut self, value: Value) {
         match self.stack.last_mut() {
             None => self.document = Some(value),
-            Some(Frame {
-                open: Open::List(items),
-                ..
-            }) => items.push(value),
-            Some(Frame {
-                open: Open::Map { entries, key, .. },
-                ..
-            }) => {
+            Some(Open::List(items)) => items.push(value),
+            Some(Open::Map { entries, key, .. }) => {
                 if let Some(key) = key.take().filter(|key| !key.repeated) {
                     entries.insert(key.name, value);
                 }
@@ -301,131 +436,19 @@ impl Builder<'_> {
         }
     }
 
-    fn scalar(&mut self, text: &str, style: ScalarStyle, tag: Option<&Tag>, line: usize, path: &str) -> Value {
-        let text_tag = tag.is_some_and(|tag| tag.is_yaml_core_schema() && tag.suffix == "str");
-        if tag.is_some() && !text_tag {
-            self.fault(line, path.to_owned(), "tags other than !!str are not allowed");
-        }
-        if text_tag || style != ScalarStyle::Plain {
+    fn scalar(&mut self, text: &str, style: ScalarStyle, tag: Option<&Tag>, line: usize) -> Value {
+        let has_tag = tag.is_some();
+        self.refuse_tag(tag, line);
+        if has_tag || style != ScalarStyle::Plain {
             return Value::String(text.to_owned());
         }
         core_schema(text).unwrap_or_else(|detail| {
-            self.fault(line, path.to_owned(), detail);
+            self.fault(line, self.here(), detail);
             Value::Null
         })
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-    use serde_json::json;
-
-    use super::*;
-
-    fn read(text: &str) -> Parsed {
-        parse(text, &Origin::File(Arc::from("f")), "")
-    }
-
-    fn value(text: &str) -> Value {
-        let parsed = read(text);
-        assert_eq!(parsed.faults, [], "{text}");
-        parsed.value.unwrap()
-    }
-
-    fn faults(text: &str) -> Vec<String> {
-        read(text).faults.iter().map(ToString::to_string).collect()
-    }
-
-    #[test]
-    fn quotes_and_tags_make_text() {
-        let text = "a: 150\nb: \"150\"\nc: 'true'\nd: !!str 150\ne:\nf: off\n";
-        let expected = json!({ "a": 150, "b": "150", "c": "true", "d": "150", "e": null, "f": "off" });
-        assert_eq!(value(text), expected);
-        assert_eq!(value(""), Value::Null);
-        assert_eq!(value("# only a comment\n"), Value::Null);
-    }
-
-    #[test]
-    fn every_value_has_its_line() {
-        let parsed = read("a: 1\nb:\n  c: [x,\n    y]\n  d:\n    - e: 5\n      f:\n    - 7\n");
-        let line = |path: &str| parsed.places.locate(path).to_string();
-        for (path, expected) in [
-            ("", "f:1"),
-            ("a", "f:1"),
-            ("b", "f:2"),
-            ("b.c", "f:3"),
-            ("b.c[0]", "f:3"),
-            ("b.c[1]", "f:4"),
-            ("b.d", "f:5"),
-            ("b.d[0]", "f:6"),
-            ("b.d[0].e", "f:6"),
-            ("b.d[0].f", "f:7"),
-            ("b.d[1]", "f:8"),
-            ("b.d[9]", "f:5"),
-        ] {
-            assert_eq!(line(path), expected, "{path}");
-        }
-    }
-
-    #[test]
-    fn what_misleads_is_refused_with_its_line() {
-        assert_eq!(faults("a: 1\nb: 2\na: 3\n"), ["f:3: a: is given twice"]);
-        assert_eq!(
-            faults("a: &x 1\nb: *x\nc: !thing 4\nd: .inf\n"),
-            [
-                "f:1: a: anchors (&name) are not allowed: write the value out",
-                "f:2: b: aliases (*name) are not allowed: write the value out",
-                "f:3: c: tags other than !!str are not allowed",
-                "f:4: d: is not a finite number",
-            ]
-        );
-        assert_eq!(
-            faults("a: 1\n---\nb: 2\n"),
-            ["f:2: holds a second document; one is allowed"]
-        );
-        assert_eq!(faults("a:\n  ? [x]\n  : 1\n"), ["f:2: a: a key must be text"]);
-        assert!(
-            faults("a: 1\nb: [1, 2\nc: 3\n")[0].starts_with("f:3: is not YAML: "),
-            "{:?}",
-            faults("b: [1")
-        );
-        assert_eq!(value("a: 1\nb: {}\n"), json!({ "a": 1, "b": {} }));
-    }
-
-    #[test]
-    fn a_repeated_key_does_not_replace_the_first() {
-        let parsed = read("a: { x: 1 }\na: { x: 2 }\n");
-        assert_eq!(parsed.value, Some(json!({ "a": { "x": 1 } })));
-        assert_eq!(parsed.places.locate("a.x").to_string(), "f:1");
-    }
-
-    #[test]
-    fn depth_is_bounded() {
-        let deep = |n: usize| format!("{}1{}", "[".repeat(n), "]".repeat(n));
-        assert!(read(&deep(MAX_DEPTH)).faults.is_empty());
-        assert_eq!(read(&deep(MAX_DEPTH + 1)).faults.len(), 1);
-        assert_eq!(read(&"[".repeat(1 << 20)).faults.len(), 1);
-        assert!(!read(&"? ".repeat(1 << 19)).faults.is_empty());
-        assert!(!read(&"- ".repeat(1 << 19)).faults.is_empty());
-        assert!(!read(&"&a ".repeat(1 << 18)).faults.is_empty());
-    }
-
-    proptest! {
-        #[test]
-        fn no_text_panics(text in "[-?:,\\[\\]{}#&*!|>'\"%@` \n\ta-c0-9.~]{0,60}") {
-            let _ = read(&text);
-        }
-
-        #[test]
-        fn no_characters_panic(text in any::<String>()) {
-            let _ = read(&text);
-        }
-
-        #[test]
-        fn json_is_yaml(numbers in prop::collection::vec(any::<i64>(), 0..5), text in "[a-z \"\\\\\n\u{e4}]{0,20}") {
-            let tree = json!({ "numbers": numbers, "text": text, "inner": { "list": [[], {}, null, true] } });
-            prop_assert_eq!(value(&serde_json::to_string_pretty(&tree).unwrap()), tree);
-        }
-    }
-}
+#[path = "yaml_tests.rs"]
+mod tests;

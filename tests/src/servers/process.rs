@@ -35,10 +35,22 @@ impl ServerProcess {
     /// # Errors
     /// When the folder for temporary files cannot be written.
     pub(super) fn new(name: &'static str) -> anyhow::Result<Self> {
-        let folder = tempfile::Builder::new()
-            .prefix(&format!("blaze-test-{name}-"))
-            .tempdir()
-            .context("a folder for a server")?;
+        Self::new_in(name, None)
+    }
+
+    /// The same with a folder inside another; without one among temporary files.
+    ///
+    /// # Errors
+    /// When the other folder cannot be written.
+    pub(super) fn new_in(name: &'static str, parent: Option<&Path>) -> anyhow::Result<Self> {
+        let mut builder = tempfile::Builder::new();
+        let prefix = format!("blaze-test-{name}-");
+        builder.prefix(&prefix);
+        let folder = match parent {
+            Some(parent) => builder.tempdir_in(parent),
+            None => builder.tempdir(),
+        };
+        let folder = folder.context("a folder for a server")?;
         let child = Mutex::new(None);
         Ok(Self { name, folder, child })
     }

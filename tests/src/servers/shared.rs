@@ -6,7 +6,10 @@
 use std::sync::OnceLock;
 
 use super::endpoint::Endpoint;
-use super::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, installed, kafka_wire, redis};
+use super::{
+    KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer, installed, kafka_wire,
+    mongo, mongo_wire, redis,
+};
 
 type Once<T> = OnceLock<Result<T, String>>;
 
@@ -45,6 +48,22 @@ pub fn shared_kafka() -> anyhow::Result<String> {
 pub fn shared_kafka_cloud() -> anyhow::Result<String> {
     static OWN: Once<KafkaServer> = OnceLock::new();
     kafka_at("BLAZE_TEST_KAFKA_CLOUD", &OWN)
+}
+
+/// `mongodb://…` of the MongoDB replica set that all tests share. Use databases of names from [`super::unique_name`].
+///
+/// # Errors
+/// As [`shared_redis`].
+pub fn shared_mongo() -> anyhow::Result<String> {
+    static OWN: Once<MongoServer> = OnceLock::new();
+    let name = "BLAZE_TEST_MONGODB_URI";
+    let Some(uri) = address(name) else {
+        return Ok(started(&OWN, || MongoServer::start(MongoOptions::default()))?.uri());
+    };
+    // An address of one's own may hold a password, TLS or several hosts: then the test itself finds out.
+    let answers = mongo::loopback_port(&uri).is_none_or(|port| mongo_wire::is_writable(&Endpoint::loopback(port)));
+    anyhow::ensure!(answers, "{}", silent(name, &uri));
+    Ok(uri)
 }
 
 fn redis_at(name: &str, kind: RedisKind, own: &'static Once<RedisServer>) -> anyhow::Result<String> {

@@ -4,7 +4,9 @@
 
 #![allow(clippy::unwrap_used, reason = "the helpers of a test fail like the test")]
 
+mod etcd;
 #[cfg(feature = "kafka")]
 mod kafka;
+mod mongo;
 mod redis;
 mod shared;

@@ -1,0 +1,299 @@
+//! `blaze apply`.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use blaze_domain::config::Kind;
+use clap::Args;
+use serde_json::Value;
+use tokio::time::{Instant, sleep};
+
+use super::call::Call;
+use super::client::Client;
+use super::files::{self, MAX_BYTES, Source};
+use super::kinds::{BASE, key_of, name_of};
+use super::options::ServerOptions;
+use super::text::{cell, count, member, note, parse_duration, print};
+use crate::exit::{CliError, Exit};
+use crate::output::{Align, Format, render_table, terminal_width};
+
+/// Pauses between two looks at the workers.
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+
+/// Options of `blaze apply`.
+#[derive(Debug, Args)]
+pub struct ApplyOptions {
+    /// File, directory (its *.yaml, *.yml and *.json) or - for standard input; may be repeated. All go in one request
+    #[arg(short = 'f', long = "file", value_name = "FILE|DIR|-", required = true)]
+    pub files: Vec<PathBuf>,
+    /// Only say what would happen
+    #[arg(long)]
+    pub dry_run: bool,
+    /// Delete what these labels match and is not among the files
+    #[arg(long, value_name = "SELECTOR")]
+    pub prune: Option<String>,
+    /// How many documents --prune deletes; needed for more than 20
+    #[arg(long, value_name = "COUNT", requires = "prune")]
+    pub prune_confirm: Option<u64>,
+    /// Wait so long (30s, 5m) until every connected worker of the layers concerned has the revision; else exit with 1
+    #[arg(long, value_name = "DURATION", value_parser = parse_duration, conflicts_with = "dry_run")]
+    pub wait: Option<Duration>,
+    /// Which server.
+    #[command(flatten)]
+    pub server: ServerOptions,
+}
+
+/// Applies.
+///
+/// # Errors
+/// [`CliError`].
+pub(super) async fn run(options: &ApplyOptions, format: Format) -> Result<Exit, CliError> {
+    let sources = files::read(&options.files)?;
+    let client = Client::of(&options.server)?;
+    let request = Request {
+        dry_run: options.dry_run,
+        prune: options.prune.as_deref(),
+        prune_confirm: options.prune_confirm,
+    };
+    let answer = send(&client, &sources, &request).await?;
+    print(&answer, format, table)?;
+    note(format, &summary(&answer));
+    if let Some(longest) = options.wait {
+        wait(&client, &answer, &sources, longest, format).await?;
+    }
+    Ok(Exit::Done)
+}
+
+/// How documents are applied.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Request<'a> {
+    pub(super) dry_run: bool,
+    pub(super) prune: Option<&'a str>,
+    pub(super) prune_confirm: Option<u64>,
+}
+
+/// Sends documents in one request; what is wrong with one is told with its file and line.
+///
+/// # Errors
+/// [`CliError`].
+pub(super) async fn send(client: &Client, sources: &[Source], request: &Request<'_>) -> Result<Value, CliError> {
+    if sources.is_empty() {
+        return Err(CliError::Usage("the files hold no documents".to_owned()));
+    }
+    let body: Value = sources.iter().map(|source| source.value.clone()).collect();
+    send_array(client, &body, request).await.map_err(|error| match error {
+        CliError::Problem(refusal) => {
+            let places = sources
+                .iter()
+                .map(|source| format!("{}: {}", source.origin, name_of(&source.key)))
+                .collect();
+            CliError::Problem(Box::new(refusal.with_sources(places)))
+        }
+        other => other,
+    })
+}
+
+/// Sends an array of documents.
+///
+/// # Errors
+/// [`CliError`].
+pub(super) async fn send_array(client: &Client, body: &Value, request: &Request<'_>) -> Result<Value, CliError> {
+    let bytes = body.to_string().len();
+    if bytes > MAX_BYTES {
+        return Err(CliError::Invalid(format!(
+            "the documents have {bytes} bytes as JSON, more than {} MiB: split them",
+            MAX_BYTES / 1024 / 1024
+        )));
+    }
+    let mut call = Call::post(format!("{BASE}/apply"), body)
+        .query_if("dry_run", request.dry_run.then_some("true"))
+        .query_if("prune", request.prune)
+        .query_if("prune_confirm", request.prune_confirm.map(|count| count.to_string()));
+    if request.dry_run {
+        call = call.harmless();
+    }
+    match client.send(&call).await {
+        Ok(answer) if answer.body.get("results").is_some_and(Value::is_array) => Ok(answer.body),
+        Ok(_) => Err(client.odd("the answer has no `results`")),
+        Err(CliError::Problem(refusal)) if refusal.code() == "limit_exceeded" && request.prune.is_some() => {
+            let hint = "so many documents are deleted with --prune-confirm COUNT alone";
+            Err(CliError::Problem(Box::new(refusal.with_hint(hint))))
+        }
+        Err(error) => Err(error),
+    }
+}
+
+/// The results of an answer of `/apply`.
+pub(super) fn results(answer: &Value) -> &[Value] {
+    answer
+        .get("results")
+        .and_then(Value::as_array)
+        .map_or(&[][..], Vec::as_slice)
+}
+
+/// How a result calls its document.
+pub(super) fn result_name(result: &Value) -> String {
+    key_of(result).map_or_else(|_| cell(result.get("name")), |key| name_of(&key))
+}
+
+/// One line per document.
+pub(super) fn table(answer: &Value) -> String {
+    let columns = [
+        ("DOCUMENT", Align::Left),
+        ("ACTION", Align::Left),
+        ("REVISION", Align::Right),
+        ("CHANGES", Align::Right),
+    ];
+    let row = |result: &Value| {
+        let changes = result.get("changes").and_then(Value::as_array).map_or(0, Vec::len);
+        vec![
+            result_name(result),
+            member(result, "action"),
+            cell(result.get("revision")),
+            changes.to_string(),
+        ]
+    };
+    render_table(&columns, results(answer).iter().map(row).collect(), terminal_width())
+}
+
+/// One sentence about all documents.
+pub(super) fn summary(answer: &Value) -> String {
+    let mut parts = Vec::new();
+    for action in ["created", "updated", "deleted", "unchanged"] {
+        let number = results(answer)
+            .iter()
+            .filter(|result| member(result, "action") == action)
+            .count();
+        if number > 0 {
+            parts.push(format!("{number} {action}"));
+        }
+    }
+    let dry = answer.get("dry_run").and_then(Value::as_bool).unwrap_or(false);
+    let begin = if dry { "nothing was written; it would be: " } else { "" };
+    let total = answer.get("affected_total").and_then(Value::as_u64).unwrap_or(0);
+    let affected = count(usize::try_from(total).unwrap_or(usize::MAX), "configuration");
+    format!(
+        "{begin}{}; revision {}; {affected} affected",
+        parts.join(", "),
+        cell(answer.get("revision"))
+    )
+}
+
+/// Layers whose workers must have the revision; `None`: all.
+fn layers(answer: &Value, sources: &[Source]) -> Option<BTreeSet<String>> {
+    let mut layers = BTreeSet::new();
+    let affected = answer
+        .get("affected")
+        .and_then(Value::as_array)
+        .map_or(&[][..], Vec::as_slice);
+    let total = answer.get("affected_total").and_then(Value::as_u64).unwrap_or(0);
+    if total > affected.len() as u64 {
+        return None;
+    }
+    for place in affected {
+        layers.insert(place.get("layer")?.as_str()?.to_owned());
+    }
+    // Results stand in the order of the request. A layer and its nodes concern its workers although no service runs there.
+    for (index, result) in results(answer).iter().enumerate() {
+        if !matches!(member(result, "action").as_str(), "created" | "updated") {
+            continue;
+        }
+        let layer = match key_of(result) {
+            Ok(key) if key.kind() == Kind::Layer => Some(key.name().to_string()),
+            Ok(key) if key.kind() == Kind::Node => {
+                let source = sources.get(index).filter(|source| source.key == key);
+                let named = source.and_then(|source| source.value.pointer("/spec/layer")?.as_str());
+                named.map(str::to_owned)
+            }
+            Ok(_) | Err(_) => None,
+        };
+        layers.extend(layer);
+    }
+    Some(layers)
+}
+
+/// Waits until all connected workers concerned have the revision of an answer.
+async fn wait(
+    client: &Client,
+    answer: &Value,
+    sources: &[Source],
+    longest: Duration,
+    format: Format,
+) -> Result<(), CliError> {
+    let changed = results(answer)
+        .iter()
+        .any(|result| member(result, "action") != "unchanged");
+    let Some(revision) = answer.get("revision").and_then(Value::as_u64).filter(|_| changed) else {
+        return Ok(());
+    };
+    let layers = layers(answer, sources);
+    let until = Instant::now() + longest;
+    let mut pause = FIRST_PAUSE;
+    loop {
+        let behind = match client.workers().await {
+            Ok(workers) => {
+                let concerned = concerned(&workers, layers.as_ref());
+                let behind = behind(&concerned, revision);
+                if behind.is_empty() {
+                    note(format, &everywhere(concerned.len(), revision));
+                    return Ok(());
+                }
+                behind
+            }
+            // The revision is written; whether the workers have it may show again in a moment.
+            Err(error @ (CliError::NoServer { .. } | CliError::Foreign { .. })) => vec![error.to_string()],
+            Err(CliError::Problem(refusal)) if refusal.status >= 500 => vec![refusal.to_string()],
+            Err(error) => {
+                return Err(error.advised(format!(
+                    "Revision {revision} is written; which workers have it could not be asked."
+                )));
+            }
+        };
+        let now = Instant::now();
+        if now >= until {
+            return Err(CliError::Failed(format!(
+                "revision {revision} is written, but not everywhere after {} s:\n  {}",
+                longest.as_secs_f64(),
+                behind.join("\n  ")
+            )));
+        }
+        sleep(pause.min(until - now)).await;
+        pause = (pause * 2).min(LONGEST_PAUSE);
+    }
+}
+
+fn everywhere(workers: usize, revision: u64) -> String {
+    match workers {
+        0 => format!("revision {revision} is written; no worker concerned is connected"),
+        workers => format!("{} concerned: all have revision {revision}", count(workers, "worker")),
+    }
+}
+
+/// Connected workers of some layers.
+fn concerned<'w>(workers: &'w Value, layers: Option<&BTreeSet<String>>) -> Vec<&'w Value> {
+    let items = workers.get("items").and_then(Value::as_array);
+    let is_concerned = |worker: &&Value| {
+        let connected = worker.get("connected").and_then(Value::as_bool).unwrap_or(false);
+        let layer = worker.get("layer").and_then(Value::as_str).unwrap_or_default();
+        connected && layers.is_none_or(|layers| layers.contains(layer))
+    };
+    items.into_iter().flatten().filter(is_concerned).collect()
+}
+
+/// Those that have not yet reached a revision, in words.
+fn behind(workers: &[&Value], revision: u64) -> Vec<String> {
+    workers
+        .iter()
+        .filter(|worker| worker.get("revision").and_then(Value::as_u64).unwrap_or(0) < revision)
+        .map(|worker| {
+            let place = format!("{}/{}", member(worker, "layer"), cell(worker.get("node")));
+            format!("the worker of {place} is at revision {}", cell(worker.get("revision")))
+        })
+        .collect()
+}
+
+#[cfg(test)]
+#[path = "apply_tests.rs"]
+mod tests;

@@ -1,0 +1,331 @@
+//! What it costs to check a configuration against a schema, known before it is done.
+//!
+//! ```text
+//! schema ─▶ steps for one value, at most ─┐
+//!                                         ├─▶ steps × values ─▶ of one place, of all places of a commit: at most so many
+//! configuration ─▶ values in it ──────────┘
+//! ```
+
+use std::collections::HashMap;
+
+use blaze_domain::config::MAX_DEPTH;
+use serde_json::{Map, Value};
+
+use super::schema::{ONE, find_anchors, own_dialect, resolve};
+
+/// Subschemas that may be looked at on the way to one leaf of a configuration. References that meet again multiply it.
+const MAX_STEPS: u64 = 10_000;
+/// How many of them may lie within each other: each takes a part of the stack.
+const MAX_NESTING: usize = 512;
+/// Subschemas that `uniqueItems` counts as: it looks at all that a list holds.
+const UNIQUE_STEPS: u64 = 50;
+/// Names, or values to choose from, of one keyword that take as long as one subschema.
+const NAMES_PER_STEP: usize = 10;
+/// Bytes of a text that take as long as one value.
+const BYTES_PER_VALUE: usize = 100;
+/// Steps that may be needed for one effective configuration: about half a second.
+pub(super) const MAX_WORK: u64 = 10_000_000;
+/// The same for all effective configurations that one commit concerns: nobody can write meanwhile.
+pub(super) const MAX_WORK_OF_COMMIT: u64 = 100_000_000;
+/// The same up to which every fault is looked for; beyond it the first one alone, for each takes memory.
+pub(super) const MAX_WORK_OF_ALL_FAULTS: u64 = 1_000_000;
+/// Patterns in one schema: each is compiled, which takes up to a megabyte and its time.
+const MAX_PATTERNS: usize = 200;
+/// Keywords with names, or with values to choose from, that are gone through one after the other.
+const NAMES: &[&str] = &[
+    "dependencies",
+    "dependentRequired",
+    "dependentSchemas",
+    "enum",
+    "properties",
+    "required",
+];
+
+/// What checking one leaf of a configuration comes to, at most.
+#[derive(Clone, Copy)]
+struct Effort {
+    steps: u64,
+    nesting: usize,
+}
+
+impl Effort {
+    const NONE: Self = Self { steps: 0, nesting: 0 };
+    const ONE: Self = Self { steps: 1, nesting: 1 };
+
+    /// Both are looked at.
+    fn and(self, other: Self) -> Self {
+        Self {
+            steps: self.steps.saturating_add(other.steps),
+            nesting: self.nesting.max(other.nesting),
+        }
+    }
+
+    /// One of them is looked at.
+    fn or(self, other: Self) -> Self {
+        Self {
+            steps: self.steps.max(other.steps),
+            nesting: self.nesting.max(other.nesting),
+        }
+    }
+}
+
+/// How many patterns a schema has, or what looks like one.
+fn patterns(schema: &Value) -> usize {
+    match schema {
+        Value::Object(members) => members
+            .iter()
+            .map(|(name, value)| match (name.as_str(), value) {
+                ("pattern", Value::String(_)) => 1,
+                ("patternProperties", Value::Object(named)) => named.len() + patterns(value),
+                _ => patterns(value),
+            })
+            .sum(),
+        Value::Array(list) => list.iter().map(patterns).sum(),
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => 0,
+    }
+}
+
+/// The steps that a schema takes for each value of a configuration, at most. Refuses one that could take for ever, or the
+/// whole stack, although it is small.
+pub(super) fn steps(schema: &Value) -> Result<u64, String> {
+    let patterns = patterns(schema);
+    if patterns > MAX_PATTERNS {
+        return Err(format!("it has {patterns} patterns; {MAX_PATTERNS} are allowed"));
+    }
+    let mut anchors = HashMap::new();
+    find_anchors(schema, true, &mut anchors)?;
+    let mut estimate = Estimate {
+        root: schema,
+        anchors,
+        known: HashMap::new(),
+    };
+    estimate.effort(schema, MAX_DEPTH, 1).map(|effort| effort.steps)
+}
+
+/// Values of a configuration; a long text counts as several.
+pub(super) fn values(config: &Value) -> u64 {
+    let text = |text: &str| u64::try_from(text.len() / BYTES_PER_VALUE).unwrap_or(u64::MAX);
+    let within = match config {
+        Value::Null | Value::Bool(_) | Value::Number(_) => 0,
+        Value::String(found) => text(found),
+        Value::Array(items) => items.iter().map(values).sum(),
+        Value::Object(members) => members.iter().map(|(name, value)| text(name) + values(value)).sum(),
+    };
+    1 + within
+}
+
+struct Estimate<'s> {
+    root: &'s Value,
+    anchors: HashMap<&'s str, &'s Value>,
+    /// By subschema, and how many levels of the configuration may still come; nothing while it is being worked out.
+    known: HashMap<(*const Value, usize), Option<Effort>>,
+}
+
+impl<'s> Estimate<'s> {
+    fn effort(&mut self, schema: &'s Value, levels: usize, nesting: usize) -> Result<Effort, String> {
+        let members = match schema {
+            Value::Object(members) => members,
+            // No form of this dialect, but one that is still followed where a reference leads to it.
+            Value::Array(list) => return self.all(list.iter(), levels, nesting),
+            Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => return Ok(Effort::ONE),
+        };
+        let id = (std::ptr::from_ref(schema), levels);
+        if let Some(Some(known)) = self.known.get(&id) {
+            return Ok(*known);
+        }
+        if nesting > MAX_NESTING {
+            return Err(too_much());
+        }
+        // A reference may lead to what is not looked at as a schema otherwise.
+        if let Some(dialect) = own_dialect(members) {
+            return Err(dialect);
+        }
+        self.known.insert(id, None);
+        let mut here = self.here(members, levels, nesting)?;
+        let below = match levels {
+            0 => Effort::NONE,
+            _ => self.below(members, levels - 1, nesting)?,
+        };
+        if members.contains_key("unevaluatedProperties") || members.contains_key("unevaluatedItems") {
+            // To know what is left over, everything is looked at once more.
+            here = here.and(here);
+        }
+        let within = here.and(below);
+        let effort = Effort {
+            steps: within.steps.saturating_add(own_steps(members)),
+            nesting: within.nesting + 1,
+        };
+        if effort.steps > MAX_STEPS || effort.nesting > MAX_NESTING {
+            return Err(too_much());
+        }
+        self.known.insert(id, Some(effort));
+        Ok(effort)
+    }
+
+    /// What is looked at for the same value.
+    fn here(&mut self, members: &'s Map<String, Value>, levels: usize, nesting: usize) -> Result<Effort, String> {
+        let mut here = Effort::NONE;
+        for (name, value) in members {
+            let more = match (name.as_str(), value) {
+                ("$ref" | "$dynamicRef", Value::String(reference)) => self.referred(reference, levels, nesting)?,
+                ("not" | "if" | "then" | "else", value) => self.effort(value, levels, nesting + 1)?,
+                ("allOf" | "anyOf" | "oneOf", Value::Array(list)) => self.all(list.iter(), levels, nesting)?,
+                ("dependentSchemas", Value::Object(named)) => self.all(named.values(), levels, nesting)?,
+                // Of an older dialect, and applied all the same; a list in it holds names.
+                ("dependencies", Value::Object(named)) => {
+                    let schemas = named.values().filter(|value| !value.is_array());
+                    self.all(schemas, levels, nesting)?
+                }
+                _ => Effort::NONE,
+            };
+            here = here.and(more);
+        }
+        Ok(here)
+    }
+
+    /// What is looked at for the members and items of the value, of which so many levels may still come.
+    fn below(&mut self, members: &'s Map<String, Value>, levels: usize, nesting: usize) -> Result<Effort, String> {
+        let mut below = Effort::NONE;
+        for (name, value) in members {
+            let more = match (name.as_str(), value) {
+                // A member has one name, and an item one place.
+                ("properties", Value::Object(named)) => self.any(named.values(), levels, nesting)?,
+                ("prefixItems", Value::Array(list)) => self.any(list.iter(), levels, nesting)?,
+                ("patternProperties", Value::Object(named)) => self.all(named.values(), levels, nesting)?,
+                ("not" | "if" | "then" | "else", _) => Effort::NONE,
+                (name, value) if ONE.contains(&name) || name == "additionalItems" => {
+                    self.effort(value, levels, nesting + 1)?
+                }
+                _ => Effort::NONE,
+            };
+            below = below.and(more);
+        }
+        Ok(below)
+    }
+
+    fn all(
+        &mut self,
+        mut schemas: impl Iterator<Item = &'s Value>,
+        levels: usize,
+        nesting: usize,
+    ) -> Result<Effort, String> {
+        schemas.try_fold(Effort::NONE, |sum, one| {
+            Ok(sum.and(self.effort(one, levels, nesting + 1)?))
+        })
+    }
+
+    fn any(
+        &mut self,
+        mut schemas: impl Iterator<Item = &'s Value>,
+        levels: usize,
+        nesting: usize,
+    ) -> Result<Effort, String> {
+        schemas.try_fold(Effort::NONE, |most, one| {
+            Ok(most.or(self.effort(one, levels, nesting + 1)?))
+        })
+    }
+
+    /// What a reference leads to. What leads back to a subschema that is being looked at for the same value would be looked
+    /// at for ever, and how often the other references on the way double it cannot be told.
+    fn referred(&mut self, reference: &str, levels: usize, nesting: usize) -> Result<Effort, String> {
+        let target = resolve(self.root, &self.anchors, reference).ok_or_else(|| {
+            let known = "#, #/… (without percent-encoding) or #anchor";
+            format!("$ref {reference:?} leads nowhere; it is {known}")
+        })?;
+        if let Some(None) = self.known.get(&(std::ptr::from_ref(target), levels)) {
+            return Err(format!(
+                "$ref {reference:?} leads back to itself at the same value; a schema may refer to itself only for what is \
+                 within the value: below properties, items or the like"
+            ));
+        }
+        self.effort(target, levels, nesting + 1)
+    }
+}
+
+/// Steps of a subschema without those within it.
+fn own_steps(members: &Map<String, Value>) -> u64 {
+    let names = members.iter().filter(|(name, _)| NAMES.contains(&name.as_str()));
+    let count = |value: &Value| match value {
+        Value::Array(list) => list.len(),
+        Value::Object(named) => named.len(),
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => 0,
+    };
+    let names: usize = names.map(|(_, value)| count(value)).sum();
+    let unique = members.get("uniqueItems").and_then(Value::as_bool) == Some(true);
+    let names = u64::try_from(names / NAMES_PER_STEP).unwrap_or(u64::MAX);
+    names.saturating_add(1 + if unique { UNIQUE_STEPS } else { 0 })
+}
+
+fn too_much() -> String {
+    format!(
+        "its references meet again and again: more than {MAX_STEPS} subschemas for one value, or {MAX_NESTING} within \
+         each other"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn a_configuration_counts_by_its_values_and_long_texts() {
+        assert_eq!(values(&json!({ "a": 1, "b": [true, null, { "c": "text" }] })), 7);
+        assert_eq!(values(&json!("x".repeat(1000))), 11);
+    }
+
+    #[test]
+    fn names_to_go_through_count() {
+        let names: Vec<String> = (0..200).map(|number| format!("n{number}")).collect();
+        assert_eq!(steps(&json!({ "enum": names })), Ok(21));
+        assert_eq!(steps(&json!({ "type": "object", "required": ["a"] })), Ok(1));
+    }
+
+    #[test]
+    fn dependencies_of_the_older_dialects_count() {
+        let twice = |target: String| json!({ "dependencies": { "a": { "$ref": target }, "b": { "$ref": target } } });
+        let mut defs: Map<String, Value> = (0..30)
+            .map(|number| (format!("d{number}"), twice(format!("#/$defs/d{}", number + 1))))
+            .collect();
+        defs.insert("d30".to_owned(), json!(true));
+        let error = steps(&json!({ "$ref": "#/$defs/d0", "$defs": defs })).unwrap_err();
+        assert!(error.contains("meet again"), "{error}");
+        assert_eq!(steps(&json!({ "dependencies": { "a": ["b"] } })), Ok(1));
+    }
+
+    #[test]
+    fn what_leads_back_to_itself_at_the_same_value_is_refused() {
+        let refused = |schema: &Value| {
+            let error = steps(schema).unwrap_err();
+            assert!(error.contains("leads back to itself"), "{error}");
+        };
+        refused(&json!({ "$ref": "#" }));
+        refused(&json!({ "allOf": [{ "$ref": "#" }, { "$ref": "#" }] }));
+        refused(&json!({ "not": { "$ref": "#" } }));
+        refused(&json!({ "dependencies": { "a": { "$ref": "#" } } }));
+        refused(&json!({ "$anchor": "top", "anyOf": [true, { "$dynamicRef": "#top" }] }));
+        // Each level refers to all of its own and to the next, so that it seems cheap as long as it is not known.
+        let level = |number: usize| {
+            let own = (0..30).map(|_| json!({ "$ref": format!("#/$defs/l{number}") }));
+            let next = (0..30).map(|_| json!({ "$ref": format!("#/$defs/l{}", number + 1) }));
+            (
+                format!("l{number}"),
+                json!({ "anyOf": own.chain(next).collect::<Vec<Value>>() }),
+            )
+        };
+        let mut defs: Map<String, Value> = (0..10).map(level).collect();
+        defs.insert("l10".to_owned(), json!(true));
+        refused(&json!({ "$ref": "#/$defs/l0", "$defs": defs }));
+    }
+
+    #[test]
+    fn a_reference_is_not_read_in_two_ways() {
+        // A validator decodes it, and would come to the other one.
+        let defs = json!({ "a%25b": true, "a%b": { "type": "string" } });
+        assert!(steps(&json!({ "$ref": "#/$defs/a%25b", "$defs": defs })).is_err());
+        let anchors = json!({ "one": { "$anchor": "a" }, "two": { "$anchor": "a", "type": "string" } });
+        let error = steps(&json!({ "$ref": "#a", "$defs": anchors })).unwrap_err();
+        assert!(error.contains("twice"), "{error}");
+    }
+}

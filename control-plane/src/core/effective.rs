@@ -1,0 +1,178 @@
+//! The effective configuration of a service at a place.
+
+use blaze_domain::config::merge::{Part, Source};
+use blaze_domain::config::selector::LabelSelector;
+use blaze_domain::config::{Document, Key, canonical, merge, secret};
+use blaze_domain::{DocumentName, LayerName, NodeName, ServiceName};
+use serde_json::Value;
+use std::sync::Arc;
+
+use super::state::State;
+
+/// The documents whose configurations are merged, weakest first.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Sources {
+    pub(crate) service: Option<Arc<Document>>,
+    pub(crate) layer: Option<Arc<Document>>,
+    pub(crate) node: Option<Arc<Document>>,
+    pub(crate) instance: Option<Arc<Document>>,
+    /// The roll-out that changed one of them.
+    pub(crate) rollout: Option<DocumentName>,
+    /// Whose overrides count.
+    service_name: Option<ServiceName>,
+}
+
+/// For whom, in names.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(crate) struct At {
+    pub(crate) service: Option<ServiceName>,
+    pub(crate) instance: Option<DocumentName>,
+    pub(crate) layer: Option<LayerName>,
+    pub(crate) node: Option<NodeName>,
+}
+
+impl Sources {
+    /// The documents that count at a place; a roll-out counts on its canary nodes.
+    pub(crate) fn at(state: &State, at: &At) -> Self {
+        let document = |key: Key| state.get(&key).map(|held| Arc::clone(&held.document));
+        let mut sources = Self {
+            service: at.service.as_ref().and_then(|name| document(Key::service(name))),
+            layer: at.layer.as_ref().and_then(|name| document(Key::layer(name))),
+            node: at.node.as_ref().and_then(|name| document(Key::node(name))),
+            instance: match (&at.service, &at.instance) {
+                (Some(service), Some(instance)) => document(Key::instance(service.clone(), instance.clone())),
+                _ => None,
+            },
+            rollout: None,
+            service_name: at.service.clone(),
+        };
+        sources.roll_out(state);
+        sources
+    }
+
+    /// Where an instance's own document places it.
+    pub(crate) fn placed(state: &State, service: &ServiceName, instance: &Document) -> At {
+        let placement = super::placement::placement(state, instance);
+        At {
+            service: Some(service.clone()),
+            instance: Some(instance.key.name().clone()),
+            layer: placement.layer,
+            node: placement.node,
+        }
+    }
+
+    fn roll_out(&mut self, state: &State) {
+        let Some(node) = self.node.clone() else { return };
+        let parts = [&mut self.service, &mut self.layer, &mut self.node, &mut self.instance];
+        for part in parts {
+            let Some(key) = part.as_ref().map(|document| document.key.clone()) else {
+                continue;
+            };
+            for held in state.active_on(&key) {
+                let rollout = &held.document;
+                if let Some(patch) = rollout.spec_member("patch")
+                    && let Some(document) = part.as_ref()
+                    && is_canary(rollout, &node)
+                {
+                    *part = Some(Arc::new(patched(document, patch)));
+                    self.rollout = Some(rollout.key.name().clone());
+                }
+            }
+        }
+    }
+
+    /// The parts, weakest first, each with the document that it is of.
+    pub(crate) fn parts(&self) -> Vec<(&Document, bool, &Value)> {
+        let service = self.service_name.as_ref().map(ServiceName::as_str);
+        let mut out = Vec::with_capacity(6);
+        for (document, with_overrides) in [
+            (&self.service, false),
+            (&self.layer, true),
+            (&self.node, true),
+            (&self.instance, false),
+        ] {
+            let Some(document) = document else { continue };
+            if let Some(config) = document.config() {
+                out.push((&**document, false, config));
+            }
+            if with_overrides && let Some(config) = service.and_then(|service| document.overrides(service)) {
+                out.push((&**document, true, config));
+            }
+        }
+        out
+    }
+
+    /// The effective configuration, secrets as they are in the documents.
+    pub(crate) fn merged(&self) -> Value {
+        let mut out = Value::Object(serde_json::Map::new());
+        for (_, _, value) in self.parts() {
+            merge::merge_patch(&mut out, value);
+        }
+        out
+    }
+
+    /// The same with each part changed first, for secrets in other forms.
+    pub(crate) fn merged_with(&self, form: impl Fn(&Document, &Value) -> Value) -> Value {
+        let mut out = Value::Object(serde_json::Map::new());
+        for (document, _, value) in self.parts() {
+            merge::merge_patch(&mut out, &form(document, value));
+        }
+        out
+    }
+
+    /// Where each key comes from.
+    pub(crate) fn explain(&self, form: impl Fn(&Document, &Value) -> Value) -> Value {
+        let values: Vec<Value> = self
+            .parts()
+            .iter()
+            .map(|(document, _, value)| form(document, value))
+            .collect();
+        let parts: Vec<Part<'_>> = self
+            .parts()
+            .iter()
+            .zip(&values)
+            .map(|((document, is_override, _), value)| Part {
+                source: Source {
+                    kind: document.key.kind(),
+                    service: document.key.service_name().map(ToString::to_string),
+                    name: document.key.name().to_string(),
+                    revision: document.revision,
+                    is_override: *is_override,
+                },
+                value,
+            })
+            .collect();
+        merge::explain(&parts)
+    }
+
+    /// The hash that tells whether the configuration is another one.
+    pub(crate) fn hash(&self) -> String {
+        canonical::hash(&secret::for_hash(&self.merged()))
+    }
+
+    /// An upper bound of the size, in bytes.
+    pub(crate) fn size_bound(&self) -> usize {
+        self.parts().iter().map(|(_, _, value)| value.to_string().len()).sum()
+    }
+}
+
+/// Whether a node is one that a roll-out tries its change on.
+pub(crate) fn is_canary(rollout: &Document, node: &Document) -> bool {
+    canaries(rollout).is_some_and(|selector| selector.matches(&node.labels))
+}
+
+/// The nodes that a roll-out tries its change on.
+pub(crate) fn canaries(rollout: &Document) -> Option<LabelSelector> {
+    let canary = rollout.spec_member("canary")?;
+    canary.get("node_selector")?.as_str()?.parse().ok()
+}
+
+/// A document with a roll-out's change in its spec. Secrets of the change were encrypted for the roll-out, so they are
+/// not carried over here: a roll-out may not change secrets.
+pub(crate) fn patched(document: &Document, patch: &Value) -> Document {
+    let mut out = document.clone();
+    let mut spec = (*document.spec).clone();
+    merge::merge_patch(&mut spec, patch);
+    out.spec = Arc::new(spec);
+    out
+}

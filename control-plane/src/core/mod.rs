@@ -1,0 +1,37 @@
+//! The use cases of the main service: pure rules in the middle, one committer, a log of recent commits.
+//!
+//! ```text
+//! REST, gRPC ─▶ service ─▶ queue ─▶ committer ─[evaluate: state + request → changes]─▶ Store::commit ─▶ state, log ─▶ watch
+//!                  │                                                                        ▲
+//!                  └── reads: state (after a barrier: what the store acknowledged is applied)  └─ follower: commits of others
+//! ```
+
+mod affected;
+mod barrier;
+mod check;
+mod committer;
+mod cost;
+mod edited;
+mod effective;
+mod evaluate;
+mod log;
+mod page;
+mod placement;
+mod refs;
+mod report;
+mod rollouts;
+mod schema;
+mod secrets;
+pub mod service;
+#[cfg(test)]
+mod service_tests;
+mod state;
+pub mod testing;
+pub mod types;
+mod view;
+mod watch;
+
+pub use committer::{CommitReport, OnCommit};
+pub use service::{ConfigService, CoreOptions, DiffReport};
+pub use types::*;
+pub use watch::WatchStream;

@@ -1,0 +1,993 @@
+//! The core from outside, on a store in memory.
+
+mod rollouts;
+mod secrets;
+mod views;
+mod writes;
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use blaze_domain::config::{Code, Document, Key, Labels, Problem};
+use blaze_runtime::Supervisor;
+use futures::{FutureExt as _, StreamExt as _};
+use serde_json::{Value, json};
+
+use super::types::*;
+use super::{ConfigService, testing};
+use crate::auth::{Claims, Right};
+use crate::store::{AuditQuery, SqliteStore, Store};
+
+struct World {
+    service: ConfigService,
+    admin: Caller,
+    _supervisor: Supervisor,
+}
+
+async fn world() -> World {
+    let supervisor = Supervisor::new("test");
+    let service = testing::service(&supervisor).await.unwrap();
+    World {
+        admin: caller(&["admin"], None),
+        service,
+        _supervisor: supervisor,
+    }
+}
+
+fn caller(roles: &[&str], layer: Option<&str>) -> Caller {
+    Caller {
+        claims: Arc::new(Claims {
+            subject: "ops".to_owned(),
+            roles: roles.iter().map(|role| (*role).to_owned()).collect(),
+            layer: layer.map(|layer| layer.parse().unwrap()),
+            expires_s: None,
+            token_id: None,
+        }),
+        request_id: "r-1".to_owned(),
+        address: IpAddr::V4(Ipv4Addr::LOCALHOST),
+    }
+}
+
+fn key(text: &str) -> Key {
+    text.parse().unwrap()
+}
+
+fn input(name: &str, spec: Value) -> DocumentInput {
+    DocumentInput {
+        key: key(name),
+        labels: Labels::new(),
+        annotations: Labels::new(),
+        spec,
+    }
+}
+
+impl World {
+    async fn put(&self, name: &str, spec: Value) -> Arc<Document> {
+        self.try_put(name, spec, Precondition::Any).await.unwrap().document
+    }
+
+    async fn try_put(&self, name: &str, spec: Value, precondition: Precondition) -> Result<Written, Problem> {
+        let exists = self.get(name).await.is_ok();
+        let precondition = if exists || precondition != Precondition::Any {
+            precondition
+        } else {
+            Precondition::None
+        };
+        let answer = self
+            .service
+            .replace(&self.admin, input(name, spec), precondition)
+            .await?;
+        Ok(answer.value)
+    }
+
+    async fn get(&self, name: &str) -> Result<Arc<Document>, Problem> {
+        let read = ReadOptions::default();
+        Ok(self.service.get(&self.admin, &key(name), &read).await?.value)
+    }
+
+    async fn patch(&self, name: &str, patch: Value) -> Result<Arc<Document>, Problem> {
+        let answer = self
+            .service
+            .patch(&self.admin, &key(name), patch, Precondition::Any)
+            .await?;
+        Ok(answer.value.document)
+    }
+
+    async fn apply(&self, items: Vec<(&str, Value)>) -> Result<ApplyReport, Problem> {
+        let items = items.into_iter().map(|(name, spec)| ApplyItem {
+            input: input(name, spec),
+            revision: None,
+            delete: false,
+        });
+        let request = ApplyRequest {
+            items: items.collect(),
+            ..ApplyRequest::default()
+        };
+        Ok(self.service.apply(&self.admin, request, None).await?.value)
+    }
+
+    async fn effective(&self, place: Place) -> Effective {
+        let read = ReadOptions::default();
+        self.service
+            .effective(&self.admin, &place, true, &read)
+            .await
+            .unwrap()
+            .value
+    }
+
+    /// A robot in an edge layer with a service that has one instance.
+    async fn robot(&self) {
+        let report = self
+            .apply(vec![
+                (
+                    "Layer/edge",
+                    json!({ "kind": "edge", "config": { "a": 1, "b": 1 }, "overrides": { "slam": { "c": 3 } } }),
+                ),
+                ("Node/robot-1", json!({ "layer": "edge", "config": { "b": 2 } })),
+                (
+                    "Service/slam",
+                    json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } }),
+                ),
+                (
+                    "Instance/slam/0",
+                    json!({ "node": "robot-1", "config": { "camera": { "rate_hz": 10 } } }),
+                ),
+            ])
+            .await
+            .unwrap();
+        assert_eq!(report.revision, 1);
+    }
+}
+
+fn slam() -> Place {
+    Place {
+        service: Some("slam".parse().unwrap()),
+        instance: Some("0".parse().unwrap()),
+        ..Place::default()
+    }
+}
+
+fn code<T: std::fmt::Debug>(result: Result<T, Problem>) -> Code {
+    result.unwrap_err().code
+}
+
+#[tokio::test]
+async fn a_document_is_made_read_changed_and_deleted() {
+    let w = world().await;
+    let made = w.put("Layer/edge", json!({ "kind": "edge" })).await;
+    assert_eq!((made.revision, made.updated_by.as_str()), (1, "ops"));
+    assert_eq!(w.get("Layer/edge").await.unwrap(), made);
+    // The same again changes nothing, also where `{}` is written out.
+    let same = w.put("Layer/edge", json!({ "kind": "edge", "config": {} })).await;
+    assert_eq!(same.revision, 1);
+    let patched = w
+        .patch("Layer/edge", json!({ "labels": { "site": "lab" } }))
+        .await
+        .unwrap();
+    assert_eq!((patched.revision, patched.uid == made.uid), (2, true));
+    assert_eq!(w.service.revision(), 2);
+    w.service
+        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, false)
+        .await
+        .unwrap();
+    assert_eq!(code(w.get("Layer/edge").await), Code::NotFound);
+    let again = w.put("Layer/edge", json!({ "kind": "edge" })).await;
+    assert_ne!(again.uid, made.uid);
+}
+
+#[tokio::test]
+async fn preconditions_are_insisted_on() {
+    let w = world().await;
+    let spec = || json!({ "kind": "edge" });
+    let other = || json!({ "kind": "fog" });
+    assert_eq!(
+        code(w.try_put("Layer/edge", spec(), Precondition::Revisions(vec![1])).await),
+        Code::PreconditionFailed
+    );
+    assert_eq!(
+        code(
+            w.service
+                .patch(&w.admin, &key("Layer/edge"), json!({}), Precondition::None)
+                .await
+        ),
+        Code::NotFound
+    );
+    w.put("Layer/edge", spec()).await;
+    assert_eq!(
+        code(w.try_put("Layer/edge", other(), Precondition::None).await),
+        Code::PreconditionRequired
+    );
+    assert_eq!(
+        code(w.try_put("Layer/edge", other(), Precondition::Absent).await),
+        Code::PreconditionFailed
+    );
+    let stale = w
+        .try_put("Layer/edge", other(), Precondition::Revisions(vec![7]))
+        .await
+        .unwrap_err();
+    assert_eq!((stale.code, stale.revision), (Code::PreconditionFailed, Some(1)));
+    assert_eq!(
+        code(w.service.create(&w.admin, input("Layer/edge", spec()), None).await),
+        Code::AlreadyExists
+    );
+    let written = w
+        .try_put("Layer/edge", other(), Precondition::Revisions(vec![7, 1]))
+        .await
+        .unwrap();
+    assert_eq!((written.created, written.document.revision), (false, 2));
+}
+
+#[tokio::test]
+async fn the_effective_configuration_is_merged_in_order_and_explained() {
+    let w = world().await;
+    w.robot().await;
+    let effective = w.effective(slam()).await;
+    assert_eq!(
+        effective.config,
+        json!({ "a": 1, "b": 2, "c": 3, "camera": { "rate_hz": 10 } })
+    );
+    assert_eq!(
+        effective.place.node.as_ref().map(ToString::to_string).as_deref(),
+        Some("robot-1")
+    );
+    let explain = effective.explain.unwrap();
+    assert_eq!(explain["/camera/rate_hz"]["kind"], "Instance");
+    assert_eq!(explain["/camera/rate_hz"]["overridden"][0]["value"], 30);
+    assert_eq!(explain["/c"]["override"], true);
+    let mut unknown = slam();
+    unknown.service = Some("slamm".parse().unwrap());
+    let refused = w
+        .service
+        .effective(&w.admin, &unknown, false, &ReadOptions::default())
+        .await
+        .unwrap_err();
+    assert_eq!(refused.code, Code::NotFound);
+    assert!(refused.detail.contains("did you mean slam?"), "{refused}");
+}
+
+#[tokio::test]
+async fn references_must_exist_and_hold() {
+    let w = world().await;
+    let missing = w
+        .try_put("Node/robot-1", json!({ "layer": "edge" }), Precondition::None)
+        .await
+        .unwrap_err();
+    assert_eq!(missing.code, Code::ReferenceNotFound);
+    assert_eq!(missing.errors[0].pointer, "/spec/layer");
+    w.robot().await;
+    let used = w
+        .service
+        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, false)
+        .await;
+    assert_eq!(code(used), Code::InUse);
+    w.service
+        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, true)
+        .await
+        .unwrap();
+    for gone in ["Layer/edge", "Node/robot-1", "Instance/slam/0"] {
+        assert_eq!(code(w.get(gone).await), Code::NotFound, "{gone}");
+    }
+    assert!(w.get("Service/slam").await.is_ok());
+    assert_eq!(w.service.revision(), 2);
+}
+
+#[tokio::test]
+async fn a_schema_guards_every_write_that_could_break_it() {
+    let w = world().await;
+    w.robot().await;
+    let schema = json!({
+        "type": "object", "required": ["camera"],
+        "properties": { "camera": { "type": "object", "properties": { "rate_hz": { "type": "integer", "maximum": 30 } } } },
+    });
+    w.patch("Service/slam", json!({ "spec": { "schema": schema } }))
+        .await
+        .unwrap();
+    for (name, patch) in [
+        (
+            "Instance/slam/0",
+            json!({ "spec": { "config": { "camera": { "rate_hz": 31 } } } }),
+        ),
+        (
+            "Node/robot-1",
+            json!({ "spec": { "overrides": { "slam": { "camera": { "rate_hz": "fast" } } } } }),
+        ),
+        (
+            "Layer/edge",
+            json!({ "spec": { "overrides": { "slam": { "camera": 5 } } } }),
+        ),
+        (
+            "Service/slam",
+            json!({ "spec": { "config": { "camera": { "rate_hz": 99 } } } }),
+        ),
+    ] {
+        let refused = w.patch(name, patch).await.unwrap_err();
+        assert_eq!(refused.code, Code::SchemaMismatch, "{name}");
+        assert!(!refused.detail.contains("99"), "values are not told: {refused}");
+    }
+    let bad = w
+        .patch("Service/slam", json!({ "spec": { "schema": { "type": "objekt" } } }))
+        .await
+        .unwrap_err();
+    assert_eq!(
+        (bad.code, bad.errors[0].pointer.as_str()),
+        (Code::ValidationFailed, "/spec/schema")
+    );
+}
+
+#[tokio::test]
+async fn apply_is_all_or_nothing() {
+    let w = world().await;
+    w.robot().await;
+    let refused = w
+        .apply(vec![
+            ("Layer/fog", json!({ "kind": "fog" })),
+            ("Node/fog-1", json!({ "layer": "foog" })),
+        ])
+        .await
+        .unwrap_err();
+    assert_eq!(
+        (refused.code, refused.errors[0].document),
+        (Code::ReferenceNotFound, Some(1))
+    );
+    assert!(refused.detail.contains("did you mean Layer/fog?"), "{refused}");
+    assert_eq!(code(w.get("Layer/fog").await), Code::NotFound);
+    let twice = w
+        .apply(vec![
+            ("Layer/x", json!({ "kind": "fog" })),
+            ("Layer/x", json!({ "kind": "fog" })),
+        ])
+        .await;
+    assert_eq!(code(twice), Code::ValidationFailed);
+    let report = w
+        .apply(vec![
+            ("Node/robot-1", json!({ "layer": "edge", "config": { "b": 5 } })),
+            ("Layer/fog", json!({ "kind": "fog" })),
+            (
+                "Service/slam",
+                json!({ "config": { "a": 0, "camera": { "rate_hz": 30 } } }),
+            ),
+        ])
+        .await
+        .unwrap();
+    let actions: Vec<&str> = report.results.iter().map(|result| result.action.as_str()).collect();
+    assert_eq!(actions, ["updated", "created", "unchanged"]);
+    assert_eq!(report.results[0].changes[0].path, "/spec/config/b");
+    assert!(
+        report
+            .affected
+            .iter()
+            .any(|place| place.instance.is_some() && place.node.is_some()),
+        "{report:?}"
+    );
+    assert_eq!(report.revision, 2);
+}
+
+#[tokio::test]
+async fn pruning_needs_confirmation_beyond_twenty() {
+    let w = world().await;
+    for number in 0..22 {
+        let mut one = input(&format!("Layer/l{number}"), json!({ "kind": "fog" }));
+        one.labels.insert("app".to_owned(), "x".to_owned());
+        w.service.create(&w.admin, one, None).await.unwrap();
+    }
+    let request = |confirm| ApplyRequest {
+        prune: Some("app=x".to_owned()),
+        prune_confirm: confirm,
+        ..ApplyRequest::default()
+    };
+    let refused = w.service.apply(&w.admin, request(None), None).await.unwrap_err();
+    assert_eq!(refused.code, Code::LimitExceeded);
+    assert!(refused.detail.contains("22"), "{refused}");
+    let report = w.service.apply(&w.admin, request(Some(22)), None).await.unwrap().value;
+    assert_eq!(report.results.len(), 22);
+}
+
+/// A world on a store that may hold something, with these keys.
+async fn world_on(store: &Arc<SqliteStore>, keys: &[(&str, [u8; 32])]) -> World {
+    let supervisor = Supervisor::new("test");
+    let store = Arc::clone(store) as Arc<dyn Store>;
+    World {
+        admin: caller(&["admin"], None),
+        service: testing::service_on(&supervisor, store, keys).await.unwrap(),
+        _supervisor: supervisor,
+    }
+}
+
+#[tokio::test]
+async fn what_is_written_leaves_an_old_key_behind_and_what_has_no_key_is_not_shown_as_empty() {
+    let supervisor = Supervisor::new("store");
+    let store = Arc::new(SqliteStore::in_memory(&supervisor).await.unwrap());
+    let (old, new) = (("e1", [7; 32]), ("e2", [8; 32]));
+    let w = world_on(&store, &[old]).await;
+    for name in ["Service/a", "Service/b"] {
+        w.put(name, json!({ "config": { "password": { "$secret": "canary" } } }))
+            .await;
+    }
+    let w = world_on(&store, &[new, old]).await;
+    let again = json!({ "config": { "password": { "$secret": { "redacted": true, "version": 1 } } } });
+    assert_eq!(
+        w.put("Service/a", again).await.revision,
+        1,
+        "a new key alone is no change"
+    );
+    w.patch("Service/a", json!({ "spec": { "description": "x" } }))
+        .await
+        .unwrap();
+
+    let w = world_on(&store, &[new]).await;
+    let reveal = ReadOptions {
+        reveal: true,
+        ..ReadOptions::default()
+    };
+    let password = async |name: &str| {
+        let shown = w.service.get(&w.admin, &key(name), &reveal).await.unwrap().value;
+        shown.spec["config"]["password"]["$secret"].clone()
+    };
+    assert_eq!(password("Service/a").await, json!({ "text": "canary", "version": 1 }));
+    let kept = password("Service/b").await;
+    assert_eq!(kept, json!({ "redacted": true, "version": 2 }));
+    // Who writes it back as it was shown does not lose it.
+    let back = json!({ "description": "y", "config": { "password": { "$secret": kept } } });
+    w.put("Service/b", back).await;
+    let w = world_on(&store, &[new, old]).await;
+    let clear = w.service.get(&w.admin, &key("Service/b"), &reveal).await.unwrap().value;
+    assert_eq!(clear.spec["config"]["password"]["$secret"]["text"], "canary");
+}
+
+#[tokio::test]
+async fn secrets_are_kept_encrypted_and_shown_redacted() {
+    let w = world().await;
+    let canary = "canary-7d1f";
+    let spec = |secret: Value| json!({ "config": { "db": { "password": secret } } });
+    let made = w.put("Service/slam", spec(json!({ "$secret": canary }))).await;
+    let redacted = json!({ "$secret": { "redacted": true, "version": 1 } });
+    assert_eq!(made.spec.pointer("/config/db/password"), Some(&redacted));
+    // What was read may be written back: the text stays.
+    let same = w.put("Service/slam", spec(redacted.clone())).await;
+    assert_eq!(same.revision, 1);
+    let changed = w
+        .patch("Service/slam", json!({ "spec": { "description": "x" } }))
+        .await
+        .unwrap();
+    assert_eq!(changed.spec.pointer("/config/db/password"), Some(&redacted));
+    let reveal = ReadOptions {
+        reveal: true,
+        ..ReadOptions::default()
+    };
+    let clear = w
+        .service
+        .get(&w.admin, &key("Service/slam"), &reveal)
+        .await
+        .unwrap()
+        .value;
+    let shown = json!({ "$secret": { "text": canary, "version": 1 } });
+    assert_eq!(clear.spec.pointer("/config/db/password"), Some(&shown));
+    let unknown = w.try_put("Service/other", spec(redacted), Precondition::None).await;
+    assert_eq!(code(unknown), Code::SecretUnknown);
+    let operator = caller(&["operator"], None);
+    assert_eq!(
+        code(w.service.get(&operator, &key("Service/slam"), &reveal).await),
+        Code::PermissionDenied
+    );
+    // A new text has a new version, and a rollback brings the old one back.
+    let newer = w.put("Service/slam", spec(json!({ "$secret": "other" }))).await;
+    assert_eq!(
+        newer.spec.pointer("/config/db/password/$secret/version"),
+        Some(&json!(3))
+    );
+    w.service
+        .rollback(&w.admin, &key("Service/slam"), 1, Precondition::None, None)
+        .await
+        .unwrap();
+    let clear = w
+        .service
+        .get(&w.admin, &key("Service/slam"), &reveal)
+        .await
+        .unwrap()
+        .value;
+    assert_eq!(
+        clear.spec.pointer("/config/db/password/$secret/text"),
+        Some(&json!(canary))
+    );
+    let history = w
+        .service
+        .history(&w.admin, &key("Service/slam"), None, "", true, &ReadOptions::default())
+        .await
+        .unwrap();
+    assert!(!format!("{history:?}").contains(canary));
+    let audit = w
+        .service
+        .audit(&w.admin, AuditQuery::default(), "", &ReadOptions::default())
+        .await
+        .unwrap();
+    assert!(!format!("{audit:?}").contains(canary));
+    assert!(audit.value.items.iter().any(|entry| entry.action == "reveal"));
+}
+
+#[tokio::test]
+async fn a_commit_is_reverted_unless_its_documents_changed_since() {
+    let w = world().await;
+    w.robot().await;
+    let before = w.get("Node/robot-1").await.unwrap();
+    w.apply(vec![
+        ("Node/robot-1", json!({ "layer": "edge", "type": "mobile" })),
+        ("Layer/fog", json!({ "kind": "fog" })),
+    ])
+    .await
+    .unwrap();
+    let report = w.service.revert(&w.admin, 2, false, None).await.unwrap();
+    assert_eq!(report.revision, 3);
+    assert_eq!(w.get("Node/robot-1").await.unwrap().spec, before.spec);
+    assert_eq!(code(w.get("Layer/fog").await), Code::NotFound);
+    assert_eq!(
+        code(w.service.revert(&w.admin, 2, false, None).await),
+        Code::RevisionConflict
+    );
+    assert_eq!(code(w.service.revert(&w.admin, 99, false, None).await), Code::NotFound);
+}
+
+#[tokio::test]
+async fn the_same_request_twice_is_done_once() {
+    let w = world().await;
+    let once = |body: u8| {
+        Some(Idempotency {
+            key: "k".to_owned(),
+            path: "/api/v1/layers".to_owned(),
+            body: [body; 32],
+        })
+    };
+    let layer = || input("Layer/edge", json!({ "kind": "edge" }));
+    let first = w.service.create(&w.admin, layer(), once(1)).await.unwrap();
+    let again = w.service.create(&w.admin, layer(), once(1)).await.unwrap();
+    assert_eq!((again.replayed, again.revision), (true, first.revision));
+    assert_eq!(again.value, first.value);
+    assert_eq!(
+        code(w.service.create(&w.admin, layer(), once(2)).await),
+        Code::IdempotencyKeyReused
+    );
+    assert_eq!(w.service.revision(), 1);
+}
+
+#[tokio::test]
+async fn a_request_whose_caller_left_is_not_done_again() {
+    let w = world().await;
+    let create = || {
+        let once = Idempotency {
+            key: "k".to_owned(),
+            path: "/api/v1/layers".to_owned(),
+            body: [1; 32],
+        };
+        w.service
+            .create(&w.admin, input("Layer/edge", json!({ "kind": "edge" })), Some(once))
+    };
+    // Asked once, it stands in the queue; then whoever asked is gone.
+    assert!(create().now_or_never().is_none());
+    loop {
+        match create().await {
+            Err(problem) if problem.code == Code::IdempotencyInProgress => tokio::task::yield_now().await,
+            again => {
+                assert!(again.unwrap().replayed);
+                break;
+            }
+        }
+    }
+    assert_eq!(w.service.revision(), 1);
+}
+
+#[tokio::test]
+async fn pages_show_one_revision() {
+    let w = world().await;
+    for number in 0..5 {
+        w.put(&format!("Layer/l{number}"), json!({ "kind": "fog" })).await;
+    }
+    let mut query = ListQuery {
+        kind: Some(blaze_domain::config::Kind::Layer),
+        limit: Some(2),
+        ..ListQuery::default()
+    };
+    let mut names = Vec::new();
+    loop {
+        let page = w.service.list(&w.admin, &query, &ReadOptions::default()).await.unwrap();
+        assert_eq!(page.revision, 5);
+        names.extend(page.value.items.iter().map(|document| document.key.name().to_string()));
+        if page.value.next_page_token.is_empty() {
+            break;
+        }
+        query.page_token = page.value.next_page_token;
+        // What changes in between is not part of this list.
+        w.service
+            .delete(
+                &w.admin,
+                &key(&format!("Layer/l{}", 5 - names.len() / 2)),
+                Precondition::Any,
+                false,
+            )
+            .await
+            .unwrap_or(Answer {
+                revision: 0,
+                replayed: false,
+                value: (),
+            });
+    }
+    assert_eq!(names, ["l0", "l1", "l2", "l3", "l4"]);
+    query.limit = Some(0);
+    assert_eq!(
+        code(w.service.list(&w.admin, &query, &ReadOptions::default()).await),
+        Code::InvalidRequest
+    );
+}
+
+#[tokio::test]
+async fn a_page_of_large_documents_is_shorter() {
+    let w = world().await;
+    let text = "x".repeat(200 * 1024);
+    let (documents, versions) = (50, 45);
+    for number in 0..documents {
+        let spec = json!({ "config": { "text": text, "number": number } });
+        w.put(&format!("Service/s{number:02}"), spec).await;
+    }
+    let mut query = ListQuery {
+        limit: Some(1000),
+        ..ListQuery::default()
+    };
+    let mut pages = Vec::new();
+    loop {
+        let page = w
+            .service
+            .list(&w.admin, &query, &ReadOptions::default())
+            .await
+            .unwrap()
+            .value;
+        pages.push(page.items.len());
+        query.page_token = page.next_page_token;
+        if query.page_token.is_empty() {
+            break;
+        }
+    }
+    assert_eq!((pages.len(), pages.iter().sum::<usize>()), (2, documents), "{pages:?}");
+
+    for number in 1..versions {
+        w.put("Service/s00", json!({ "config": { "text": text, "number": number } }))
+            .await;
+    }
+    let of = async |full, limit, token: &str| {
+        let (key, read) = (key("Service/s00"), ReadOptions::default());
+        let history = w.service.history(&w.admin, &key, Some(limit), token, full, &read).await;
+        history.unwrap().value
+    };
+    assert_eq!(of(false, 1000, "").await.items.len(), versions);
+    let first = of(true, 1000, "").await;
+    let second = of(true, 1000, &first.next_page_token).await;
+    let seen: Vec<u64> = first
+        .items
+        .iter()
+        .chain(&second.items)
+        .map(|entry| entry.revision)
+        .collect();
+    assert_eq!((seen.len(), second.next_page_token.as_str()), (versions, ""));
+    assert!(seen.is_sorted_by(|a, b| a > b) && first.items.len() < versions);
+    assert_eq!(of(true, 3, "").await.items.len(), 3);
+}
+
+/// Revision and changes of the next commit; bookmarks are passed over.
+async fn next(stream: &mut super::WatchStream) -> (u64, Vec<(&'static str, String)>) {
+    let wait = async {
+        loop {
+            match stream.next().await {
+                Some(WatchItem::Commit(commit)) => {
+                    let changes = commit
+                        .changes
+                        .iter()
+                        .map(|(op, document)| (op.as_str(), document.key.to_string()));
+                    return (commit.revision, changes.collect());
+                }
+                Some(WatchItem::Bookmark(_)) => {}
+                other => panic!("the stream ended: {other:?}"),
+            }
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(10), wait)
+        .await
+        .expect("a commit within 10 s")
+}
+
+#[tokio::test]
+async fn a_watch_tells_every_commit_from_a_revision_on() {
+    let w = world().await;
+    w.robot().await;
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    let query = WatchQuery {
+        since: Some(0),
+        ..WatchQuery::default()
+    };
+    let mut stream = w.service.watch(&w.admin, &query).await.unwrap().value;
+    let (revision, changes) = next(&mut stream).await;
+    assert_eq!((revision, changes.len()), (1, 4));
+    assert_eq!(next(&mut stream).await, (2, vec![("create", "Layer/fog".to_owned())]));
+    w.service
+        .delete(&w.admin, &key("Layer/fog"), Precondition::Any, false)
+        .await
+        .unwrap();
+    assert_eq!(next(&mut stream).await, (3, vec![("delete", "Layer/fog".to_owned())]));
+}
+
+#[tokio::test]
+async fn what_leaves_a_filter_is_told_also_when_it_moves_with_its_node() {
+    let w = world().await;
+    w.robot().await;
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    let query = |layer: &str| WatchQuery {
+        layer: Some(layer.parse().unwrap()),
+        since: Some(2),
+        ..WatchQuery::default()
+    };
+    let mut edge = w.service.watch(&w.admin, &query("edge")).await.unwrap().value;
+    let mut fog = w.service.watch(&w.admin, &query("fog")).await.unwrap().value;
+    w.patch("Node/robot-1", json!({ "spec": { "layer": "fog" } }))
+        .await
+        .unwrap();
+    let both = |op: &'static str| vec![(op, "Node/robot-1".to_owned()), (op, "Instance/slam/0".to_owned())];
+    assert_eq!(next(&mut edge).await, (3, both("leave")));
+    assert_eq!(next(&mut fog).await, (3, both("update")));
+}
+
+#[tokio::test]
+async fn a_watch_of_what_is_trimmed_is_refused_with_where_to_begin() {
+    let w = world().await;
+    for number in 0..6 {
+        w.put(&format!("Layer/l{number}"), json!({ "kind": "fog" })).await;
+    }
+    assert_eq!(w.service.trim(&w.admin, 4, None).await.unwrap().value, 3);
+    let query = |since| WatchQuery {
+        since: Some(since),
+        ..WatchQuery::default()
+    };
+    let refused = w.service.watch(&w.admin, &query(2)).await.err().unwrap();
+    assert_eq!(
+        (refused.code, refused.oldest_revision, refused.revision),
+        (Code::RevisionTrimmed, Some(3), Some(6))
+    );
+    let mut stream = w.service.watch(&w.admin, &query(3)).await.unwrap().value;
+    assert_eq!(next(&mut stream).await.0, 4);
+}
+
+#[tokio::test]
+async fn a_bound_token_sees_and_changes_its_own_layer_alone() {
+    let w = world().await;
+    w.robot().await;
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    w.put("Service/cloud-only", json!({ "layers": ["fog"] })).await;
+    let bound = caller(&["operator"], Some("edge"));
+    let read = ReadOptions::default();
+    for (name, seen) in [
+        ("Layer/edge", true),
+        ("Node/robot-1", true),
+        ("Service/slam", true),
+        ("Instance/slam/0", true),
+        ("Layer/fog", false),
+        ("Service/cloud-only", false),
+        ("Node/absent", false),
+    ] {
+        let result = w.service.get(&bound, &key(name), &read).await;
+        match seen {
+            true => assert!(result.is_ok(), "{name}"),
+            false => assert_eq!(code(result), Code::PermissionDenied, "{name}"),
+        }
+    }
+    let patch = async |name: &str, spec: Value| {
+        let patch = json!({ "spec": spec });
+        w.service.patch(&bound, &key(name), patch, Precondition::Any).await
+    };
+    assert_eq!(
+        code(patch("Service/slam", json!({ "description": "x" })).await),
+        Code::PermissionDenied
+    );
+    assert_eq!(
+        code(patch("Node/robot-1", json!({ "layer": "fog" })).await),
+        Code::PermissionDenied
+    );
+    assert!(patch("Node/robot-1", json!({ "type": "mobile" })).await.is_ok());
+    w.put("Node/server", json!({ "layer": "fog" })).await;
+    // Of many documents, those outside are refused before anything is told of them.
+    let apply = async |name: &str, spec: Value, revision: Option<u64>, delete: bool| {
+        let items = vec![ApplyItem {
+            input: input(name, spec),
+            revision,
+            delete,
+        }];
+        let request = ApplyRequest {
+            items,
+            ..ApplyRequest::default()
+        };
+        w.service.apply(&bound, request, None).await
+    };
+    let fog = || json!({ "layer": "fog" });
+    for outside in [
+        apply("Node/server", fog(), None, false).await,
+        apply("Node/server", fog(), Some(1), false).await,
+        apply("Node/absent", fog(), Some(1), false).await,
+        apply("Node/absent", json!({}), None, true).await,
+        apply("Service/slam", json!({}), None, false).await,
+    ] {
+        assert_eq!(code(outside), Code::PermissionDenied);
+    }
+    // What is placed nowhere counts everywhere: a roll-out on it is none of one layer's.
+    w.put("Instance/slam/anywhere", json!({})).await;
+    let rollout = json!({
+        "target": { "kind": "Instance", "service": "slam", "name": "anywhere" }, "patch": { "config": { "a": 5 } },
+        "canary": { "node_selector": "!absent" },
+    });
+    let started = w.service.create(&bound, input("Rollout/r", rollout), None).await;
+    assert_eq!(code(started), Code::PermissionDenied);
+    // Who may make tokens could make one that is bound to nothing.
+    let admin = caller(&["admin"], Some("edge"));
+    let token = TokenRequest {
+        subject: "x".to_owned(),
+        roles: vec!["admin".to_owned()],
+        layer: None,
+        expires_in_s: 60,
+    };
+    assert_eq!(
+        code(w.service.create_token(&admin, token).await),
+        Code::PermissionDenied
+    );
+    assert_eq!(code(w.service.revoke_token(&admin, "x").await), Code::PermissionDenied);
+    assert_eq!(code(w.service.tokens(&admin, &read).await), Code::PermissionDenied);
+    assert_eq!(
+        code(w.service.audit(&admin, AuditQuery::default(), "", &read).await),
+        Code::PermissionDenied
+    );
+    assert_eq!(code(w.service.trim(&admin, 1, None).await), Code::PermissionDenied);
+    assert!(
+        w.service
+            .authorize(&caller(&["viewer"], None).claims, Right::Write)
+            .is_err()
+    );
+    assert!(
+        w.service
+            .authorize(&caller(&["admin", "wizard"], None).claims, Right::Read)
+            .is_err()
+    );
+}
+
+#[tokio::test]
+async fn a_roll_out_counts_on_its_canaries_until_it_is_promoted() {
+    let w = world().await;
+    w.robot().await;
+    let mut second = input("Node/robot-2", json!({ "layer": "edge" }));
+    second.labels.insert("canary".to_owned(), "true".to_owned());
+    w.service.create(&w.admin, second, None).await.unwrap();
+    let spec = json!({
+        "target": { "kind": "Service", "name": "slam" },
+        "patch": { "config": { "camera": { "rate_hz": 5 } } },
+        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+    });
+    let started = w
+        .service
+        .create(&w.admin, input("Rollout/slower", spec.clone()), None)
+        .await
+        .unwrap()
+        .value;
+    assert_eq!(started.document.status.as_ref().unwrap()["phase"], "canary");
+    let on = |node: &str| Place {
+        service: Some("slam".parse().unwrap()),
+        node: Some(node.parse().unwrap()),
+        ..Place::default()
+    };
+    assert_eq!(w.effective(on("robot-2")).await.config["camera"]["rate_hz"], 5);
+    assert_eq!(w.effective(on("robot-2")).await.rollout.as_deref(), Some("slower"));
+    assert_eq!(w.effective(on("robot-1")).await.config["camera"]["rate_hz"], 30);
+    assert_eq!(
+        code(w.service.create(&w.admin, input("Rollout/other", spec), None).await),
+        Code::RolloutActive
+    );
+    let name = "slower".parse().unwrap();
+    w.service.promote_rollout(&w.admin, &name, None).await.unwrap();
+    assert_eq!(w.effective(on("robot-1")).await.config["camera"]["rate_hz"], 5);
+    assert_eq!(
+        code(w.service.abort_rollout(&w.admin, &name, "late", None).await),
+        Code::RolloutState
+    );
+}
+
+#[tokio::test]
+async fn a_change_is_tried_only_where_its_target_counts() {
+    let w = world().await;
+    w.robot().await;
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    for (name, layer) in [("robot-2", "edge"), ("server", "fog")] {
+        let mut node = input(&format!("Node/{name}"), json!({ "layer": layer }));
+        node.labels.insert("canary".to_owned(), "true".to_owned());
+        w.service.create(&w.admin, node, None).await.unwrap();
+    }
+    w.put("Service/inner", json!({ "layers": ["fog"] })).await;
+    let spec = |kind: &str, name: &str| {
+        json!({
+            "target": { "kind": kind, "name": name }, "patch": { "config": { "a": 5 } },
+            "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+        })
+    };
+    for (kind, name, expected) in [
+        ("Service", "slam", &["robot-2", "server"][..]),
+        ("Service", "inner", &["server"]),
+        ("Layer", "edge", &["robot-2"]),
+        ("Node", "server", &["server"]),
+    ] {
+        let rollout = input(&format!("Rollout/to-{name}"), spec(kind, name));
+        let started = w.service.create(&w.admin, rollout, None).await.unwrap().value;
+        let canaries = started.document.status.as_ref().unwrap()["canaries"]
+            .as_array()
+            .unwrap()
+            .clone();
+        let names: Vec<&str> = canaries.iter().map(|canary| canary["node"].as_str().unwrap()).collect();
+        assert_eq!(names, expected, "{kind} {name}");
+    }
+    let nowhere = input("Rollout/nowhere", spec("Node", "robot-1"));
+    assert_eq!(
+        code(w.service.create(&w.admin, nowhere, None).await),
+        Code::ValidationFailed
+    );
+}
+
+#[tokio::test]
+async fn many_writers_with_preconditions_lose_nothing() {
+    let w = world().await;
+    w.put("Service/counter", json!({ "config": { "n": 0 } })).await;
+    let one = async |_: usize| {
+        let mut done = 0;
+        while done < 25 {
+            let now = w.get("Service/counter").await.unwrap();
+            let n = now.spec["config"]["n"].as_u64().unwrap();
+            let next = json!({ "config": { "n": n + 1 } });
+            match w
+                .try_put("Service/counter", next, Precondition::Revisions(vec![now.revision]))
+                .await
+            {
+                Ok(_) => done += 1,
+                Err(problem) => assert_eq!(problem.code, Code::PreconditionFailed),
+            }
+        }
+    };
+    futures::future::join_all((0..8).map(one)).await;
+    assert_eq!(w.get("Service/counter").await.unwrap().spec["config"]["n"], 200);
+    assert_eq!(w.service.revision(), 201);
+}
+
+#[tokio::test]
+async fn a_watch_ends_in_time_although_there_is_more_to_tell() {
+    let w = world().await;
+    for number in 0..5 {
+        w.put(&format!("Layer/l{number}"), json!({ "kind": "fog" })).await;
+    }
+    let query = WatchQuery {
+        since: Some(0),
+        timeout_s: Some(1),
+        ..WatchQuery::default()
+    };
+    let mut stream = w.service.watch(&w.admin, &query).await.unwrap().value;
+    assert_eq!(next(&mut stream).await.0, 1);
+    tokio::time::pause();
+    tokio::time::advance(Duration::from_secs(2)).await;
+    assert!(matches!(stream.next().await, Some(WatchItem::Bookmark(1))));
+    assert!(matches!(stream.next().await, Some(WatchItem::End(None))));
+    assert!(stream.next().await.is_none());
+}
+
+#[tokio::test]
+async fn a_watch_begins_at_the_revision_that_is_waited_for() {
+    let w = world().await;
+    let read = ReadOptions {
+        cached: true,
+        min_revision: Some(2),
+        ..ReadOptions::default()
+    };
+    let query = WatchQuery::default();
+    let writes = async {
+        for name in ["Layer/a", "Layer/b"] {
+            w.put(name, json!({ "kind": "fog" })).await;
+        }
+    };
+    let (watch, ()) = tokio::join!(w.service.watch_with(&w.admin, &query, &read), writes);
+    assert_eq!(watch.unwrap().revision, 2);
+}

@@ -1,0 +1,19 @@
+//! BlazeConfig main service: the configuration of layers, nodes, services and instances of the whole system.
+//!
+//! ```text
+//! listen ─▶ api: rest, grpc ─▶ core: rules, committer, watches ─▶ store: SQLite, MongoDB
+//!                │                    │
+//!                └── auth ────────────┴── secrets
+//! ```
+//!
+//! Interfaces translate and decide nothing; the core decides and does no I/O of its own; a store keeps commits in order.
+
+pub mod api;
+pub mod auth;
+pub mod core;
+pub mod listen;
+pub mod metrics;
+pub mod process;
+mod reload;
+pub mod secrets;
+pub mod store;

@@ -1,0 +1,142 @@
+//! The BlazeConfig main service: parse, build, run.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use blaze_config::process::{Command, Setup, run};
+use blaze_domain::node_file::{Fault, NodeFile};
+use blaze_runtime::config::{Schema, Sources, load_typed, parse_override};
+use blaze_runtime::supervisor::{block_on, exit_code};
+use blaze_runtime::{logs, say};
+use clap::{Parser, Subcommand};
+
+/// A commit makes and drops thousands of small texts and map nodes on other threads than it began on: with the allocator
+/// of glibc that took two fifths of its time.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+/// BlazeConfig: the configuration of layers, nodes, services and instances, over REST and gRPC.
+#[derive(Parser)]
+#[command(name = "blaze-config", version)]
+struct Arguments {
+    /// The node file; else BLAZE_CONFIG, ./blaze.yaml, /etc/blaze/blaze.yaml (the last two not with --dev).
+    #[arg(long, value_name = "FILE", global = true)]
+    config: Option<PathBuf>,
+    /// Only check the configuration, with the key and certificate files that it names: every fault on stderr, exit code 0
+    /// or 64. The store is not looked at.
+    #[arg(long)]
+    check: bool,
+    /// text or json; else as the node file says.
+    #[arg(long, value_name = "FORMAT", value_parser = ["text", "json"], global = true)]
+    log_format: Option<String>,
+    /// Overrides one key, as control_plane.rest.listen=127.0.0.1:0; may be repeated.
+    #[arg(long, value_name = "KEY=VALUE", value_parser = parse_override, global = true)]
+    set: Vec<(String, String)>,
+    /// For trying things out: loopback alone, no token needed, in memory unless a store is named, no node file needed.
+    #[arg(long)]
+    dev: bool,
+    /// What to do; serve if nothing is said.
+    #[command(subcommand)]
+    command: Option<Task>,
+}
+
+/// What to do.
+#[derive(Subcommand)]
+enum Task {
+    /// Serve REST and gRPC (default).
+    Serve,
+    /// Bring the store to the schema of this program.
+    Migrate {
+        /// Only say what would be done.
+        #[arg(long)]
+        dry_run: bool,
+    },
+    /// Write everything that is true at one revision to a file; the service may go on meanwhile.
+    Backup {
+        /// The file; it must not exist.
+        file: PathBuf,
+    },
+    /// Fill an empty store from a backup; every client lists again.
+    Restore {
+        /// The file.
+        file: PathBuf,
+    },
+    /// Encrypt all secrets with the first key, also those of the history.
+    Reencrypt,
+}
+
+fn main() -> ExitCode {
+    let mut arguments = Arguments::parse();
+    let mut overrides = std::mem::take(&mut arguments.set);
+    if let Some(format) = &arguments.log_format {
+        overrides.push(("log.format".to_owned(), format.clone()));
+    }
+    let names_store = overrides.iter().any(|(key, _)| key.starts_with("control_plane.store"));
+    let mut sources = Sources::of_process(arguments.config, overrides);
+    if arguments.dev {
+        // Whatever lies in this folder must not be served without tokens by accident.
+        sources.search.clear();
+        sources.file_may_be_absent = true;
+    }
+    let loaded = match load_typed(&sources, &schema()) {
+        Ok(loaded) => loaded,
+        Err(faults) => {
+            faults.iter().for_each(|fault| say(format_args!("{fault}")));
+            return ExitCode::from(exit_code::CONFIGURATION);
+        }
+    };
+    for warning in &loaded.warnings {
+        say(format_args!("warning: {warning}"));
+    }
+    let file = loaded.value;
+    let named = loaded.document.value().pointer("/control_plane/store").is_some();
+    let setup = Setup {
+        section: file.control_plane.clone(),
+        dev: arguments.dev,
+        in_memory: arguments.dev && !named && !names_store,
+    };
+    let checked = if arguments.check {
+        setup.check_all()
+    } else {
+        setup.check()
+    };
+    if let Err(faults) = checked {
+        faults.iter().for_each(|fault| say(format_args!("{fault}")));
+        return ExitCode::from(exit_code::CONFIGURATION);
+    }
+    if arguments.check {
+        return ExitCode::SUCCESS;
+    }
+    let format = match file.log.format.as_str() {
+        "json" => logs::LogFormat::Json,
+        _ => logs::LogFormat::Text,
+    };
+    if let Err(error) = logs::init(file.log.level.as_str(), format) {
+        say(format_args!("blaze-config failed: {error}"));
+        return ExitCode::from(exit_code::FAILED);
+    }
+    let command = match arguments.command {
+        None | Some(Task::Serve) => Command::Serve,
+        Some(Task::Migrate { dry_run }) => Command::Migrate { dry_run },
+        Some(Task::Backup { file }) => Command::Backup(file),
+        Some(Task::Restore { file }) => Command::Restore(file),
+        Some(Task::Reencrypt) => Command::Reencrypt,
+    };
+    match block_on(run(setup, command)) {
+        Ok(code) => code,
+        Err(error) => {
+            say(format_args!("blaze-config failed: {error}"));
+            ExitCode::from(exit_code::FAILED)
+        }
+    }
+}
+
+/// The node file as this program reads it.
+fn schema() -> Schema<NodeFile> {
+    let remark = |fault: Fault| (fault.path, fault.detail);
+    Arc::new(move |value| match NodeFile::read(value) {
+        Ok((file, warnings)) => Ok((file, warnings.into_iter().map(remark).collect())),
+        Err(faults) => Err(faults.into_iter().map(remark).collect()),
+    })
+}

@@ -1,0 +1,184 @@
+//! The connection to the replica set.
+
+use std::future::IntoFuture;
+use std::time::Duration;
+
+use mongodb::bson::{Document, doc};
+use mongodb::options::{ClientOptions, DatabaseOptions, ReadConcern, ReadPreference, SelectionCriteria, WriteConcern};
+use mongodb::{Client, Collection, Database};
+
+use super::errors::store_error;
+use crate::store::StoreError;
+
+/// Most connections to one server. The committer has one, reads share one query, follow and upkeep have theirs.
+const CONNECTIONS: u32 = 32;
+/// Until a server is found, where the URI says nothing else: a lost store shows within two seconds.
+const SELECTION: Duration = Duration::from_millis(1_500);
+/// Until a connection stands, where the URI says nothing else.
+const CONNECT: Duration = Duration::from_secs(2);
+/// Between two looks at each server, where the URI says nothing else.
+const HEARTBEAT: Duration = Duration::from_secs(1);
+/// Longest name of a database.
+const NAME_BYTES: usize = 63;
+
+/// A read that many wait for.
+pub(super) const QUICK: Duration = Duration::from_secs(2);
+/// Any other read or write.
+pub(super) const USUAL: Duration = Duration::from_secs(10);
+/// Reading everything.
+pub(super) const LONG: Duration = Duration::from_secs(120);
+
+/// The collections of a store. All of them read what no crash can take back, and write so that no crash can.
+#[derive(Clone)]
+pub(super) struct Tables {
+    pub(super) client: Client,
+    pub(super) database: Database,
+    /// Store identity, lease, notes.
+    pub(super) meta: Collection<Document>,
+    /// Which steps of migrations are done.
+    pub(super) migrations: Collection<Document>,
+    /// The log: one record per commit.
+    pub(super) events: Collection<Document>,
+    /// One record per change.
+    pub(super) versions: Collection<Document>,
+    /// What is now, and the floor.
+    pub(super) documents: Collection<Document>,
+    pub(super) audit: Collection<Document>,
+    pub(super) idempotency: Collection<Document>,
+    pub(super) tokens: Collection<Document>,
+    /// By which our transactions are known among those on the server.
+    pub(super) app_name: String,
+}
+
+impl Tables {
+    /// Connects, and makes sure that it is a replica set.
+    ///
+    /// # Errors
+    /// [`StoreError::Refused`] for a wrong URI, name or password, and a server that is alone;
+    /// [`StoreError::Unavailable`] if none answers.
+    pub(super) async fn connect(uri: &str, name: &str) -> Result<Self, StoreError> {
+        check_name(name)?;
+        let app_name = format!("blaze-config/{name}");
+        let mut options = ClientOptions::parse(uri).await.map_err(store_error)?;
+        options.app_name = Some(app_name.clone());
+        options.server_selection_timeout.get_or_insert(SELECTION);
+        options.connect_timeout.get_or_insert(CONNECT);
+        options.heartbeat_freq.get_or_insert(HEARTBEAT);
+        options.max_pool_size.get_or_insert(CONNECTIONS);
+        // What a URI says of consistency would break promises of ours.
+        options.read_concern = None;
+        options.write_concern = None;
+        options.selection_criteria = None;
+        let client = Client::with_options(options).map_err(store_error)?;
+        let database = client.database_with_options(name, database_options());
+        let tables = Self {
+            meta: database.collection("meta"),
+            migrations: database.collection("migrations"),
+            events: database.collection("events"),
+            versions: database.collection("versions"),
+            documents: database.collection("documents"),
+            audit: database.collection("audit"),
+            idempotency: database.collection("idempotency"),
+            tokens: database.collection("tokens"),
+            client,
+            database,
+            app_name,
+        };
+        let hello = limited(USUAL, tables.admin().run_command(doc! { "hello": 1 })).await?;
+        if hello.get_str("msg").is_ok_and(|what| what == "isdbgrid") {
+            return Err(StoreError::Refused(
+                "this MongoDB is the router of a sharded cluster: name the members of a replica set of its own"
+                    .to_owned(),
+            ));
+        }
+        if hello.get_str("setName").is_err() {
+            return Err(StoreError::Refused(
+                "this MongoDB is no replica set, and has no transactions: start mongod with `--replSet rs0`, run \
+                 `rs.initiate()` once (one member is enough)"
+                    .to_owned(),
+            ));
+        }
+        Ok(tables)
+    }
+
+    /// For commands that belong to no database.
+    pub(super) fn admin(&self) -> Database {
+        self.client.database("admin")
+    }
+}
+
+/// Every read is answered by the primary, from what a majority of the members has: whoever was told of a commit before
+/// the read began is told of it again. One case is open: a primary that was cut off from the others and does not know it
+/// yet (at most 10 s, until its lease as primary ends) may answer with what was true when it was cut off. It cannot
+/// acknowledge commits. `linearizable` reads would close this for 100 ms each, which is why they are not used.
+fn database_options() -> DatabaseOptions {
+    let mut durable = WriteConcern::majority();
+    durable.journal = Some(true);
+    DatabaseOptions::builder()
+        .read_concern(ReadConcern::majority())
+        .write_concern(durable)
+        .selection_criteria(SelectionCriteria::ReadPreference(ReadPreference::Primary))
+        .build()
+}
+
+fn check_name(name: &str) -> Result<(), StoreError> {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
+    if name.is_empty() || name.len() > NAME_BYTES || !name.chars().all(allowed) {
+        return Err(StoreError::Refused(format!(
+            "{name:?} is no name of a database: 1 to {NAME_BYTES} of A-Z, a-z, 0-9, _ and -"
+        )));
+    }
+    Ok(())
+}
+
+/// Waits for the driver, which has no limit of its own once a request is sent.
+///
+/// # Errors
+/// [`StoreError::Unavailable`] at the limit, else what the driver says.
+pub(super) async fn limited<T>(
+    limit: Duration,
+    work: impl IntoFuture<Output = mongodb::error::Result<T>>,
+) -> Result<T, StoreError> {
+    match tokio::time::timeout(limit, work.into_future()).await {
+        Ok(done) => done.map_err(store_error),
+        Err(_) => Err(too_slow(limit)),
+    }
+}
+
+/// As [`limited`], for work of several steps.
+///
+/// # Errors
+/// As [`limited`].
+pub(super) async fn limited_steps<T>(
+    limit: Duration,
+    work: impl Future<Output = Result<T, StoreError>>,
+) -> Result<T, StoreError> {
+    tokio::time::timeout(limit, work)
+        .await
+        .unwrap_or_else(|_| Err(too_slow(limit)))
+}
+
+fn too_slow(limit: Duration) -> StoreError {
+    StoreError::Unavailable(format!("MongoDB: no answer within {} ms", limit.as_millis()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_databases_are_checked_before_anything_is_asked() {
+        check_name("blaze_main-2").unwrap();
+        for wrong in ["", "a/b", "a.b", "$cmd", "ä", "a b", &"x".repeat(64)] {
+            assert!(matches!(check_name(wrong), Err(StoreError::Refused(_))), "{wrong}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_uri_that_is_none_is_refused() {
+        for uri in ["mongodb://", "http://127.0.0.1", "mongodb://h/?w=x&nonsense"] {
+            let found = Tables::connect(uri, "x").await.err();
+            assert!(found.is_some(), "{uri}");
+        }
+    }
+}

@@ -1,0 +1,256 @@
+//! Removing what nobody needs any more. What expires by itself (audit, answers, tokens) is removed by the server.
+//!
+//! ```text
+//! documents brought to the floor ─▶ step by step, each one transaction: what outlives the log is copied, the floor rises
+//!                                ─▶ versions to spare are removed ─▶ records below the floor are removed, later
+//! ```
+//!
+//! Readers take the log first and what was copied last, so they miss nothing; what is below the floor they take from the
+//! copies alone.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use mongodb::bson::{Document, doc};
+
+use super::client::{LONG, USUAL, limited};
+use super::fold::advance;
+use super::read::Part;
+use super::rows::{Guard, Record};
+use super::statements::{RECORD_COMMITS, update_command};
+use super::{MongoStore, collect, collect_within, rows};
+use crate::store::encode::{signed, unsigned};
+use crate::store::retain::{Trimmed, to_spare};
+use crate::store::rows::VersionRow;
+use crate::store::upkeep::now;
+use crate::store::{AUDIT_KEPT_MS, StoreError};
+
+/// Records that one step moves, and versions that one command removes.
+const STEP: usize = 1_000;
+/// Revisions that are looked through before that is noted.
+const PIECE: i64 = 10_000;
+/// Bytes of the rows of one command, about.
+const BYTES: usize = 8 * 1024 * 1024;
+
+impl MongoStore {
+    /// Raises the floor, which readers see before anything goes, then removes.
+    pub(super) async fn trim_to(&self, floor: u64, keep: u32) -> Result<u64, StoreError> {
+        let head = signed(self.read_head().await?);
+        let wanted = signed(floor).min(head);
+        let mut guard = self.fold_until(wanted).await?;
+        while guard.floor < wanted {
+            self.move_some(guard, wanted, keep).await?;
+            guard = self.read_guard().await?;
+        }
+        let now = Trimmed {
+            floor: guard.floor,
+            head,
+            keep,
+        };
+        self.remove_versions(now).await?;
+        self.remove_records(guard.floor).await?;
+        unsigned(guard.floor)
+    }
+
+    /// One step. If another process was faster, it has done nothing.
+    async fn move_some(&self, guard: Guard, wanted: i64, keep: u32) -> Result<(), StoreError> {
+        let part = Part {
+            after: guard.floor,
+            records: STEP,
+            whole: true,
+        };
+        let (records, _) = self.read_records(part).await?;
+        let floor = records.last().map_or(wanted, |record| record.last.min(wanted));
+        let mut commands = vec![advance(guard, doc! { rows::FLOOR: floor })];
+        commands.extend(copies(records, guard.floor, floor, keep));
+        self.guarded(commands).await?;
+        Ok(())
+    }
+
+    /// In pieces, each of which is noted, so that a long history is got through at last.
+    async fn remove_versions(&self, now: Trimmed) -> Result<(), StoreError> {
+        let before = self.read_note().await?;
+        let is_anew = before.keep != now.keep;
+        for (number, (above, until)) in before.ranges_until(now).into_iter().enumerate() {
+            let mut place = above;
+            while let Some(next) = self.next_change(place).await?.filter(|next| *next <= until) {
+                let end = until.min(next.saturating_add(PIECE));
+                self.remove_versions_of(self.changed_keys(place, end).await?, now)
+                    .await?;
+                place = end;
+                self.write_note(match (is_anew, number) {
+                    (true, _) => Trimmed {
+                        floor: place.min(now.floor),
+                        head: place,
+                        ..now
+                    },
+                    (false, 0) if above == before.floor => Trimmed { floor: place, ..before },
+                    (false, _) => Trimmed { head: place, ..now },
+                })
+                .await?;
+            }
+        }
+        self.write_note(now).await
+    }
+
+    async fn remove_versions_of(&self, keys: BTreeSet<String>, now: Trimmed) -> Result<(), StoreError> {
+        let mut doomed = Vec::new();
+        for key in keys {
+            let gone = to_spare(&self.revisions_of(&key, now).await?, now.floor, now.keep);
+            doomed.extend(gone.into_iter().map(|revision| rows::version_id(&key, revision)));
+            if doomed.len() >= STEP {
+                self.remove_named(std::mem::take(&mut doomed)).await?;
+            }
+        }
+        self.remove_named(doomed).await
+    }
+
+    /// The next revision that has versions, or a record in the log that reaches it.
+    async fn next_change(&self, above: i64) -> Result<Option<i64>, StoreError> {
+        let kept = self.tables.versions.find_one(doc! { "revision": { "$gt": above } });
+        let kept = kept.sort(doc! { "revision": 1 }).projection(doc! { "revision": 1 });
+        let kept = limited(USUAL, kept).await?;
+        let kept = kept.map(|found| rows::integer(&found, "revision")).transpose()?;
+        let near = doc! { "_id": { "$gt": above.saturating_sub(RECORD_COMMITS) }, "last": { "$gt": above } };
+        let logged = self.tables.events.find_one(near).sort(doc! { "_id": 1 });
+        let logged = limited(USUAL, logged.projection(doc! { "_id": 1 })).await?;
+        let logged = logged.map(|found| rows::integer(&found, "_id")).transpose()?;
+        let logged = logged.map(|first| first.max(above + 1));
+        Ok(kept.into_iter().chain(logged).min())
+    }
+
+    /// Revisions of the versions of a document, newest first; of those in the log, as many as count.
+    async fn revisions_of(&self, key: &str, now: Trimmed) -> Result<Vec<i64>, StoreError> {
+        let find = self
+            .tables
+            .versions
+            .find(rows::versions_below(key, i64::MAX))
+            .projection(doc! { "_id": 1 });
+        let kept = collect(find, |found| Ok(rows::split_version_id(&rows::text(found, "_id")?)?.1));
+        let mut revisions: BTreeSet<i64> = kept.await?.into_iter().collect();
+        let find = self
+            .tables
+            .events
+            .find(doc! { "docs.key": key, "_id": { "$gt": now.floor - RECORD_COMMITS } })
+            .sort(doc! { "_id": -1 })
+            .limit(i64::from(now.keep).max(1))
+            .projection(doc! { "docs.key": 1, "docs.revision": 1 });
+        let logged = collect(find, |found| {
+            let mut mine = Vec::new();
+            for change in rows::members(found, "docs") {
+                let change = change?;
+                if change.get_str("key").is_ok_and(|found| found == key) {
+                    mine.push(rows::integer(change, "revision")?);
+                }
+            }
+            Ok(mine)
+        });
+        let logged = logged.await?.into_iter().flatten();
+        revisions.extend(logged.filter(|revision| *revision > now.floor));
+        Ok(revisions.into_iter().rev().collect())
+    }
+
+    async fn remove_named(&self, ids: Vec<String>) -> Result<(), StoreError> {
+        if !ids.is_empty() {
+            limited(USUAL, self.tables.versions.delete_many(doc! { "_id": { "$in": ids } })).await?;
+        }
+        Ok(())
+    }
+
+    /// Documents that changed above one revision and up to another.
+    async fn changed_keys(&self, above: i64, until: i64) -> Result<BTreeSet<String>, StoreError> {
+        let range = doc! { "revision": { "$gt": above, "$lte": until } };
+        let find = self.tables.versions.find(range).projection(doc! { "_id": 1 });
+        let kept = collect_within(LONG, find, |found| {
+            Ok(rows::split_version_id(&rows::text(found, "_id")?)?.0.to_owned())
+        });
+        let mut keys: BTreeSet<String> = kept.await?.into_iter().collect();
+        let range = doc! { "_id": { "$gt": above.saturating_sub(RECORD_COMMITS), "$lte": until } };
+        let find = self.tables.events.find(range).projection(doc! { "docs.key": 1 });
+        let logged = collect_within(LONG, find, |found| {
+            let docs = rows::members(found, "docs");
+            docs.map(|change| rows::text(change?, "key"))
+                .collect::<Result<Vec<_>, _>>()
+        });
+        keys.extend(logged.await?.into_iter().flatten());
+        Ok(keys)
+    }
+
+    async fn write_note(&self, done: Trimmed) -> Result<(), StoreError> {
+        let note = doc! { "$set": { "floor": done.floor, "head": done.head, "keep": i64::from(done.keep) } };
+        let note = self
+            .tables
+            .meta
+            .update_one(doc! { "_id": "trimmed" }, note)
+            .upsert(true);
+        limited(USUAL, note).await?;
+        Ok(())
+    }
+
+    /// How far the last trimming came; what is not there means that everything is looked at.
+    async fn read_note(&self) -> Result<Trimmed, StoreError> {
+        let found = limited(USUAL, self.tables.meta.find_one(doc! { "_id": "trimmed" })).await?;
+        Ok(found.as_ref().and_then(note).unwrap_or_default())
+    }
+}
+
+/// Commands that copy what outlives the commits above one revision and up to another.
+fn copies(records: Vec<Record>, above: i64, until: i64, keep: u32) -> Vec<Document> {
+    let now = now().as_millis();
+    let mut tables: BTreeMap<&str, Vec<Document>> = BTreeMap::new();
+    let mut versions = Vec::new();
+    for record in records {
+        // Both are moved with the end of their record, so that each is moved once.
+        if record.last <= until {
+            let audit = record.audit.iter().filter(|row| row.time > now - AUDIT_KEPT_MS);
+            tables.entry("audit").or_default().extend(audit.map(|row| {
+                let mut new = rows::audit(row);
+                new.remove("_id");
+                doc! { "q": { "_id": &row.id }, "u": new, "upsert": true }
+            }));
+            let answers = record.answers.iter().filter(|row| row.expires > now);
+            tables.entry("idempotency").or_default().extend(answers.map(|row| {
+                let mut new = rows::idempotency(row);
+                new.remove("_id");
+                doc! { "q": { "_id": &row.id }, "u": new, "upsert": true }
+            }));
+        }
+        versions.extend(record.versions);
+    }
+    versions.retain(|row| row.revision > above && row.revision <= until);
+    let updates = worth_keeping(&versions, keep).into_iter().map(|row| {
+        let mut new = rows::version(row);
+        new.remove("_id");
+        doc! { "q": { "_id": rows::version_id(&row.key, row.revision) }, "u": new, "upsert": true }
+    });
+    tables.insert("versions", updates.collect());
+    let mut commands = Vec::new();
+    for (table, updates) in tables {
+        commands.extend(chunks(updates).into_iter().map(|some| update_command(table, some)));
+    }
+    commands
+}
+
+/// The newest of each document: those before them are to spare as soon as these are below the floor.
+fn worth_keeping(versions: &[VersionRow], keep: u32) -> Vec<&VersionRow> {
+    let most = usize::try_from(keep).unwrap_or(usize::MAX).max(1);
+    let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+    let newest = versions.iter().rev().filter(|row| {
+        let count = counts.entry(row.key.as_str()).or_default();
+        *count += 1;
+        *count <= most
+    });
+    newest.collect()
+}
+
+/// Updates in commands below the limit of the server.
+fn chunks(updates: Vec<Document>) -> Vec<Vec<Document>> {
+    super::upkeep::chunks(updates, BYTES)
+}
+
+fn note(found: &Document) -> Option<Trimmed> {
+    Some(Trimmed {
+        floor: rows::integer(found, "floor").ok()?,
+        head: rows::integer(found, "head").ok()?,
+        keep: u32::try_from(rows::integer(found, "keep").ok()?).ok()?,
+    })
+}

@@ -1,0 +1,64 @@
+#!/usr/bin/env python3
+"""Writes python.lock: the versions and checksums of all Python packages that the tests use.
+
+  scripts/services.d/lock_python.py schemathesis==4.32.5 openapi-python-client==0.29.1
+
+The packages are those for Linux on x86_64 and the Pythons below, as the configured registry has them.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")
+PLATFORMS = ("manylinux_2_28_x86_64", "manylinux2014_x86_64", "manylinux_2_17_x86_64", "any")
+LOCK = Path(__file__).with_name("python.lock")
+HEAD = """\
+# Python packages of the tests, for scripts/services. Written by:
+# scripts/services.d/lock_python.py {wanted}
+"""
+
+
+def resolved(wanted: list[str], python: str) -> dict[str, tuple[str, str]]:
+    """Version and SHA-256 of every package that one Python needs."""
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report.json"
+        platforms = [word for platform in PLATFORMS for word in ("--platform", platform)]
+        subprocess.run(
+            [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--target", folder,
+             "--only-binary=:all:", "--python-version", python, *platforms, "--report", report, *wanted],
+            check=True,
+        )  # fmt: skip
+        found = {}
+        for package in json.loads(report.read_text())["install"]:
+            data = package["metadata"]
+            found[data["name"].lower().replace("_", "-")] = (
+                data["version"],
+                package["download_info"]["archive_info"]["hashes"]["sha256"],
+            )
+        return found
+
+
+def main(wanted: list[str]) -> int:
+    if not wanted or any("==" not in package for package in wanted):
+        print(__doc__, file=sys.stderr)
+        return 2
+    packages: dict[str, dict[str, list[str]]] = {}
+    for python in PYTHONS:
+        for name, (version, checksum) in resolved(wanted, python).items():
+            checksums = packages.setdefault(name, {}).setdefault(version, [])
+            if checksum not in checksums:
+                checksums.append(checksum)
+    lines = [HEAD.format(wanted=" ".join(wanted))]
+    for name in sorted(packages):
+        [(version, checksums)] = packages[name].items()
+        hashes = "".join(f" \\\n    --hash=sha256:{checksum}" for checksum in checksums)
+        lines.append(f"{name}=={version}{hashes}\n")
+    LOCK.write_text("".join(lines))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

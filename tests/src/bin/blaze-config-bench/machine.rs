@@ -1,0 +1,123 @@
+//! Where it was measured.
+
+use std::fs::File;
+use std::io::{Seek as _, Write as _};
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::Context as _;
+use blaze_tests::servers::EtcdServer;
+use serde::Serialize;
+
+/// File systems that keep nothing on a disk.
+const IN_MEMORY: [&str; 2] = ["tmpfs", "ramfs"];
+/// Writes that are synced to see what that costs.
+const SYNCS: usize = 50;
+const BLOCK: [u8; 4096] = [7; 4096];
+
+/// What figures depend on.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Machine {
+    pub(crate) processor: String,
+    pub(crate) processors: usize,
+    pub(crate) memory_mib: u64,
+    pub(crate) file_system: String,
+    /// Whether all data is lost with the power: then writes mean nothing.
+    pub(crate) in_memory: bool,
+    /// To write 4 KiB in place and sync them, at the median.
+    pub(crate) sync_ms: f64,
+    pub(crate) etcd: String,
+    /// Programs that wanted a processor in the minute before.
+    pub(crate) load_average: f64,
+    /// Whether this program, and so the rest of the workspace beside it, was built with optimisation.
+    pub(crate) optimised: bool,
+}
+
+/// Looks at the machine and at the disk of a folder.
+///
+/// # Errors
+/// When the folder cannot be written, or etcd is not installed.
+pub(crate) fn describe(folder: &Path) -> anyhow::Result<Machine> {
+    let processor = value_of("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".to_owned());
+    let memory = value_of("/proc/meminfo", "MemTotal").unwrap_or_default();
+    let memory_kib: u64 = memory.trim_end_matches(" kB").parse().unwrap_or(0);
+    let mounts = std::fs::read_to_string("/proc/self/mounts")?;
+    let folder = folder.canonicalize()?;
+    let file_system = file_system(&mounts, &folder).unwrap_or("unknown");
+    Ok(Machine {
+        processor,
+        processors: std::thread::available_parallelism()?.get(),
+        memory_mib: memory_kib / 1024,
+        file_system: file_system.to_owned(),
+        in_memory: IN_MEMORY.contains(&file_system),
+        sync_ms: sync_ms(&folder)?,
+        etcd: EtcdServer::version()?,
+        load_average: load_average().unwrap_or_default(),
+        optimised: !cfg!(debug_assertions),
+    })
+}
+
+fn load_average() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/loadavg").ok()?;
+    text.split(' ').next()?.parse().ok()
+}
+
+fn value_of(file: &str, name: &str) -> Option<String> {
+    let text = std::fs::read_to_string(file).ok()?;
+    let mut pairs = text.lines().filter_map(|line| line.split_once(':'));
+    let (_, value) = pairs.find(|(found, _)| found.trim() == name)?;
+    Some(value.trim().to_owned())
+}
+
+/// Type of the file system of a folder: that of the deepest mount above it, the last one where two are the same.
+fn file_system<'a>(mounts: &'a str, folder: &Path) -> Option<&'a str> {
+    let fields = mounts.lines().map(|line| line.split(' ').collect::<Vec<_>>());
+    let above = fields.filter_map(|fields| match fields[..] {
+        [_, place, kind, ..] if folder.starts_with(place) => Some((Path::new(place).components().count(), kind)),
+        _ => None,
+    });
+    above.max_by_key(|(depth, _)| *depth).map(|(_, kind)| kind)
+}
+
+/// In place, as a log does that was given its room before: a file that grows costs more.
+fn sync_ms(folder: &Path) -> anyhow::Result<f64> {
+    let path = folder.join("sync");
+    let mut file = File::create(&path)?;
+    file.write_all(&vec![0; SYNCS * BLOCK.len()])?;
+    file.sync_all()?;
+    file.rewind()?;
+    let mut times = Vec::with_capacity(SYNCS);
+    for _ in 0..SYNCS {
+        let begin = Instant::now();
+        file.write_all(&BLOCK)?;
+        file.sync_data()?;
+        times.push(begin.elapsed());
+    }
+    std::fs::remove_file(path)?;
+    times.sort_unstable();
+    Ok(times.get(SYNCS / 2).context("no write")?.as_secs_f64() * 1e3)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_deepest_mount_is_the_one_that_counts() {
+        let mounts = "/dev/vda / ext4 rw 0 0\ntmpfs /tmp tmpfs rw 0 0\n/dev/vdb /tmp/x xfs rw 0 0\n";
+        for (folder, expected) in [
+            ("/home/a", "ext4"),
+            ("/tmp/y", "tmpfs"),
+            ("/tmp/x/z", "xfs"),
+            ("/tmpx", "ext4"),
+        ] {
+            assert_eq!(file_system(mounts, Path::new(folder)), Some(expected), "{folder}");
+        }
+    }
+
+    #[test]
+    fn the_disk_is_tried() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(sync_ms(folder.path()).unwrap() > 0.0);
+    }
+}

@@ -1,0 +1,816 @@
+//! Secrets are put, changed, brought back, compared, watched, refused and backed up. Their texts are given out to who asks
+//! for them and may have them, and are nowhere else.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use blaze_proto::v1;
+use reqwest::Method;
+use serde_json::{Value, json};
+use tonic_types::StatusExt as _;
+
+use blaze_tests::servers::mongo_command;
+use blaze_tests::wait;
+
+use super::client::{Answer, Client, Rest, Via};
+use super::sse::Events;
+use super::stage::{Main, Stage, Store, blocking, within};
+
+/// The beginning of every secret text, and of nothing else.
+const CANARY: &str = "kanarienvogel-7d1f";
+/// Stands beside the secrets: where this is, a secret would have been found too.
+const PLAIN: &str = "sperling-20b6";
+
+/// A text that nobody may see.
+fn secret(number: u32) -> Value {
+    json!({ "$secret": text(number) })
+}
+
+fn text(number: u32) -> String {
+    format!("{CANARY}-{number}")
+}
+
+/// A spec with a secret deep in its configuration, and in a list.
+fn spec(number: u32) -> Value {
+    json!({ "config": { "plain": PLAIN, "db": { "password": secret(number) }, "list": [{ "key": secret(number + 1) }] } })
+}
+
+/// Fails where a secret is found, also as a plain encoding of it.
+fn clean(what: &str, text: &str) {
+    // All but the last of its bytes, in each of the three ways that base64 may cut them.
+    let encoded = (0..3).map(|skip| {
+        let bytes = &CANARY.as_bytes()[skip..];
+        STANDARD.encode(&bytes[..bytes.len() / 3 * 3])
+    });
+    for canary in encoded.chain([CANARY.to_owned()]) {
+        if let Some(at) = text.find(&canary) {
+            let (from, to) = (
+                text.floor_char_boundary(at.saturating_sub(300)),
+                text.ceil_char_boundary(at + 100),
+            );
+            panic!("{what} holds the secret: {}", &text[from..to]);
+        }
+    }
+}
+
+/// A process, and who asks it; every answer is looked at.
+struct World {
+    main: Arc<Main>,
+    log: PathBuf,
+    rest: Rest,
+    grpc: Client,
+    viewer: Rest,
+}
+
+impl World {
+    fn new(stage: &Stage) -> Self {
+        let (main, log) = stage.start_talkative("main");
+        let token = stage.admin_token();
+        Self {
+            grpc: Client::new(Via::Grpc, &main, &token),
+            rest: Rest::new(&token),
+            viewer: Rest::new(&stage.token("nosy", "viewer", None)),
+            main,
+            log,
+        }
+    }
+
+    async fn ask(
+        &self,
+        rest: &Rest,
+        method: Method,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: Option<&Value>,
+    ) -> Answer {
+        let headers: Vec<(&str, String)> = headers
+            .iter()
+            .map(|(name, value)| (*name, (*value).to_owned()))
+            .collect();
+        let answer = rest
+            .send(self.main.at().rest, method.clone(), path, &headers, body)
+            .await
+            .unwrap();
+        clean(&format!("{method} {path}"), &answer.text);
+        answer
+    }
+
+    /// A change that must be made.
+    async fn write(&self, method: Method, path: &str, headers: &[(&str, &str)], body: &Value) -> Answer {
+        let answer = self.ask(&self.rest, method, path, headers, Some(body)).await;
+        assert!(answer.status < 300, "{path}: {}", answer.text);
+        answer
+    }
+
+    async fn read(&self, path: &str) -> Answer {
+        let answer = self.ask(&self.rest, Method::GET, path, &[], None).await;
+        assert_eq!(answer.status, 200, "{path}: {}", answer.text);
+        answer
+    }
+
+    /// A request of raw bytes, as who makes mistakes sends it.
+    async fn send(&self, method: Method, path: &str, media: &str, body: String) -> u16 {
+        let url = format!("http://{}{path}", self.main.at().rest);
+        let request = self
+            .rest
+            .http
+            .request(method.clone(), url)
+            .bearer_auth(&self.rest.token);
+        let response = request
+            .header("content-type", media)
+            .header("if-match", "*")
+            .body(body)
+            .send()
+            .await
+            .unwrap();
+        let status = response.status().as_u16();
+        clean(&format!("{method} {path}"), &response.text().await.unwrap());
+        status
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_secret_is_nowhere_on_sqlite() {
+    let stage = Arc::new(Stage::sqlite());
+    let world = World::new(&stage);
+    everything(&world).await;
+    end(&stage, &world).await;
+    // The files of the store, the log and the backup, and whatever else there is.
+    let mut plain = 0;
+    for entry in std::fs::read_dir(stage.folder.path()).unwrap() {
+        let path = entry.unwrap().path();
+        let bytes = std::fs::read(&path).unwrap();
+        let content = String::from_utf8_lossy(&bytes);
+        clean(&path.display().to_string(), &content);
+        plain += usize::from(content.contains(PLAIN));
+    }
+    // The file of the store and the backup.
+    assert!(plain >= 2, "{PLAIN} is in {plain} files");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_secret_is_nowhere_on_mongodb() {
+    let stage = Arc::new(Stage::mongo());
+    let world = World::new(&stage);
+    everything(&world).await;
+    end(&stage, &world).await;
+    for name in ["backup", "main.log"] {
+        clean(name, &read_file(&stage.path(name)));
+    }
+    let Store::Mongo { server, database } = &stage.store else {
+        panic!("it is MongoDB")
+    };
+    let ask = |command: &Value| mongo_command(&server.uri(), database, command).unwrap();
+    let batch = |answer: &bson::Document| {
+        answer
+            .get_document("cursor")
+            .unwrap()
+            .get_array("firstBatch")
+            .unwrap()
+            .clone()
+    };
+    let tables = batch(&ask(&json!({ "listCollections": 1, "cursor": { "batchSize": 1000 } })));
+    let mut plain = 0;
+    for table in &tables {
+        let name = table.as_document().unwrap().get_str("name").unwrap();
+        let rows = batch(&ask(&json!({ "find": name, "batchSize": 100_000, "limit": 100_000 })));
+        let content = format!("{rows:?}");
+        clean(name, &content);
+        plain += usize::from(content.contains(PLAIN));
+    }
+    // In the log at least; documents and versions follow later.
+    assert!(
+        tables.len() > 4 && plain >= 1,
+        "{PLAIN} is in {plain} of {} collections",
+        tables.len()
+    );
+}
+
+fn read_file(path: &Path) -> String {
+    String::from_utf8_lossy(&std::fs::read(path).unwrap()).into_owned()
+}
+
+async fn everything(world: &World) {
+    let begin = written(world).await;
+    by_grpc(world).await;
+    refused(world).await;
+    read(world, begin).await;
+    read_by_grpc(world, begin).await;
+    watched(world).await;
+    revealed(world).await;
+}
+
+/// Backs up while it runs, waits until all is logged, and kills it: what is in the files stays as it is.
+async fn end(stage: &Arc<Stage>, world: &World) {
+    let (_, metrics) = world.main.admin().get("/metrics").unwrap();
+    clean("metrics", &metrics);
+    assert!(metrics.contains("blaze_config_requests_total"));
+    let (file, of_stage) = (stage.path("backup"), Arc::clone(stage));
+    let name = file.to_str().unwrap().to_owned();
+    let said = blocking(move || of_stage.command(&["backup", &name]).unwrap()).await;
+    clean("what the backup says", &said);
+    assert!(read_file(&file).contains(PLAIN));
+    // Its line is behind those of all that was asked before.
+    let mark = "the-last-request";
+    world
+        .ask(
+            &world.rest,
+            Method::GET,
+            "/api/v1/nodes",
+            &[("x-request-id", mark)],
+            None,
+        )
+        .await;
+    let log = world.log.clone();
+    blocking(move || {
+        wait::until(
+            "the last line",
+            Duration::from_secs(20),
+            || read_file(&log).contains(mark),
+            String::new,
+        )
+        .unwrap();
+    })
+    .await;
+    clean("stdout", &world.main.printed());
+    let log = read_file(&world.log);
+    clean("the log", &log);
+    let lines = |level: &str| log.lines().filter(|line| line.contains(level)).count();
+    println!("{} lines of log, {} of them TRACE", log.lines().count(), lines("TRACE"));
+    assert!(lines("TRACE") > 100 && lines("DEBUG") > 20 && lines("INFO") > 20);
+    let main = Arc::clone(&world.main);
+    blocking(move || main.kill()).await;
+}
+
+/// Secrets in documents of every kind that can have them, by every way of REST. The revision of the first.
+async fn written(world: &World) -> u64 {
+    let first = world
+        .write(
+            Method::POST,
+            "/api/v1/layers",
+            &[],
+            &json!({ "name": "edge", "spec": { "kind": "edge" } }),
+        )
+        .await;
+    let begin = first.revision.unwrap();
+    let any = [("if-match", "*")];
+    let once = [("idempotency-key", "once")];
+    let body = json!({ "name": "slam", "spec": spec(10) });
+    for replayed in [false, true] {
+        let answer = world.write(Method::POST, "/api/v1/services", &once, &body).await;
+        assert!(answer.text.contains("redacted"), "{replayed}: {}", answer.text);
+    }
+    let layer = json!({ "spec": { "kind": "edge", "config": spec(20)["config"], "overrides": { "slam": spec(22)["config"] } } });
+    world.write(Method::PUT, "/api/v1/layers/edge", &any, &layer).await;
+    let node = json!({ "name": "robot", "spec": { "layer": "edge", "config": spec(24)["config"], "overrides": { "slam": spec(26)["config"] } } });
+    world.write(Method::POST, "/api/v1/nodes", &[], &node).await;
+    let instance = json!({ "name": "0", "spec": { "node": "robot", "config": spec(28)["config"] } });
+    world
+        .write(Method::POST, "/api/v1/services/slam/instances", &[], &instance)
+        .await;
+    // Changed in each way, and written back as it was read.
+    world
+        .write(Method::PUT, "/api/v1/services/slam", &any, &json!({ "spec": spec(30) }))
+        .await;
+    let patch = json!({ "spec": { "config": { "db": { "password": secret(32) } } } });
+    world.write(Method::PATCH, "/api/v1/services/slam", &any, &patch).await;
+    let shown = world.read("/api/v1/services/slam").await.body;
+    world
+        .write(
+            Method::PUT,
+            "/api/v1/services/slam",
+            &any,
+            &json!({ "spec": shown["spec"], "labels": { "a": "b" } }),
+        )
+        .await;
+    let documents = json!([
+        { "kind": "Service", "name": "slam", "spec": spec(40) },
+        { "kind": "Service", "name": "map", "spec": spec(42) },
+    ]);
+    for path in ["/api/v1/apply?dry_run=true", "/api/v1/apply"] {
+        let answer = world
+            .write(Method::POST, path, &[("idempotency-key", "apply")], &documents)
+            .await;
+        assert!(answer.text.contains("/spec/config/db/password"), "{}", answer.text);
+    }
+    let yaml = format!(
+        "kind: Service\nname: map\nspec:\n  config: {{ db: {{ password: {{ $secret: {} }} }} }}\n",
+        text(44)
+    );
+    assert_eq!(
+        world
+            .send(Method::POST, "/api/v1/apply", "application/yaml", yaml)
+            .await,
+        200
+    );
+    let last = world.read("/api/v1/services/map").await.body["revision"]
+        .as_u64()
+        .unwrap();
+    world
+        .write(
+            Method::POST,
+            "/api/v1/services/slam/rollback",
+            &[],
+            &json!({ "revision": begin + 1 }),
+        )
+        .await;
+    world
+        .write(Method::POST, "/api/v1/revert", &[], &json!({ "revision": last }))
+        .await;
+    // Gone, and back from what it was.
+    world
+        .write(Method::DELETE, "/api/v1/services/map", &any, &Value::Null)
+        .await;
+    world
+        .write(
+            Method::POST,
+            "/api/v1/services/map/rollback",
+            &[],
+            &json!({ "revision": last }),
+        )
+        .await;
+    begin
+}
+
+fn reference(name: &str) -> Option<v1::Ref> {
+    Some(v1::Ref {
+        kind: v1::Kind::Service.into(),
+        name: name.to_owned(),
+        service: String::new(),
+    })
+}
+
+async fn by_grpc(world: &World) {
+    let client = &world.grpc;
+    let mut grpc = client.grpc().await.unwrap();
+    let document = |name: &str, spec: &Value| {
+        Some(v1::Document {
+            r#ref: reference(name),
+            spec_json: spec.to_string(),
+            ..v1::Document::default()
+        })
+    };
+    let any = Some(v1::Precondition {
+        is: Some(v1::precondition::Is::Any(true)),
+    });
+    let create = v1::CreateRequest {
+        document: document("plan", &spec(50)),
+        request_id: "once".to_owned(),
+    };
+    for _ in 0..2 {
+        let made = grpc.create(client.signed(create.clone())).await.unwrap().into_inner();
+        clean("Create", &format!("{made:?}"));
+    }
+    let replace = v1::ReplaceRequest {
+        document: document("plan", &spec(52)),
+        precondition: any,
+    };
+    let made = grpc.replace(client.signed(replace)).await.unwrap().into_inner();
+    clean("Replace", &format!("{made:?}"));
+    let patch = v1::PatchRequest {
+        r#ref: reference("plan"),
+        merge_patch_json: json!({ "spec": { "config": { "new": secret(54) } } }).to_string(),
+        precondition: any,
+    };
+    clean(
+        "Patch",
+        &format!("{:?}", grpc.patch(client.signed(patch)).await.unwrap().into_inner()),
+    );
+    let apply = v1::ApplyRequest {
+        items: vec![v1::ApplyItem {
+            document: document("plan", &spec(56)),
+            delete: false,
+        }],
+        ..v1::ApplyRequest::default()
+    };
+    clean(
+        "Apply",
+        &format!("{:?}", grpc.apply(client.signed(apply)).await.unwrap().into_inner()),
+    );
+    let rollback = v1::RollbackRequest {
+        r#ref: reference("plan"),
+        revision: made.revision,
+        ..v1::RollbackRequest::default()
+    };
+    clean(
+        "Rollback",
+        &format!(
+            "{:?}",
+            grpc.rollback(client.signed(rollback)).await.unwrap().into_inner()
+        ),
+    );
+    // What is refused, says why without it.
+    for bad in [
+        json!({ "config": { "a": { "$secret": text(60), "b": 1 } } }),
+        json!({ "config": secret(61) }),
+        json!({ "config": {}, "extra": secret(62) }),
+    ] {
+        let replace = v1::ReplaceRequest {
+            document: document("plan", &bad),
+            precondition: any,
+        };
+        let status = grpc.replace(client.signed(replace)).await.unwrap_err();
+        clean(
+            "a refusal of gRPC",
+            &format!("{status:?} {:?}", status.get_error_details()),
+        );
+    }
+    for (spec_json, merge_patch_json) in [(format!("{{\"a\": \"{}", text(63)), format!("[\"{}\"", text(64)))] {
+        let bad = v1::Document {
+            r#ref: reference("plan"),
+            spec_json,
+            ..v1::Document::default()
+        };
+        let create = v1::CreateRequest {
+            document: Some(bad),
+            request_id: String::new(),
+        };
+        let status = grpc.create(client.signed(create)).await.unwrap_err();
+        clean(
+            "a refusal of gRPC",
+            &format!("{status:?} {:?}", status.get_error_details()),
+        );
+        let patch = v1::PatchRequest {
+            r#ref: reference("plan"),
+            merge_patch_json,
+            precondition: any,
+        };
+        let status = grpc.patch(client.signed(patch)).await.unwrap_err();
+        clean(
+            "a refusal of gRPC",
+            &format!("{status:?} {:?}", status.get_error_details()),
+        );
+    }
+}
+
+/// Requests that hold a secret and are refused, for every reason that there is.
+async fn refused(world: &World) {
+    let strict = json!({ "spec": {
+        "config": { "plain": PLAIN },
+        "schema": {
+            "type": "object",
+            "properties": {
+                "short": { "type": "string", "maxLength": 3 },
+                "number": { "type": "integer" },
+                "word": { "enum": ["a", "b"] },
+                "fixed": { "const": 1 },
+                "pattern": { "type": "string", "pattern": "^[0-9]+$" },
+                "not": { "not": { "type": "string" } },
+                "any": { "anyOf": [{ "type": "integer" }, { "maxLength": 2 }] },
+                "one": { "oneOf": [{ "type": "string" }, { "minLength": 1 }] },
+                "format": { "type": "array", "items": { "type": "integer" }, "uniqueItems": true },
+                "closed": { "type": "object", "properties": {}, "additionalProperties": false },
+            },
+        },
+    } });
+    world.write(Method::PUT, "/api/v1/services/strict", &[], &strict).await;
+    let service = "/api/v1/services/strict";
+    // What a schema says of its text is not asked: the answer would tell of it.
+    for name in ["short", "word", "fixed", "pattern", "not", "any", "one"] {
+        let patch = json!({ "spec": { "config": { name: secret(99) } } });
+        let answer = world
+            .ask(&world.rest, Method::PATCH, service, &[("if-match", "*")], Some(&patch))
+            .await;
+        assert_eq!(answer.status, 200, "{name}: {}", answer.text);
+    }
+    for (config, code) in [
+        (json!({ "number": secret(100) }), "schema_mismatch"),
+        (json!({ "format": [secret(110), secret(110)] }), "schema_mismatch"),
+        (json!({ "closed": { "x": secret(111) } }), "schema_mismatch"),
+        (json!({ "a": { "$secret": text(112), "b": 1 } }), "validation_failed"),
+        (json!({ "a": { "$secret": [text(113)] } }), "validation_failed"),
+        (
+            json!({ "a": { "$secret": { "text": text(114), "version": "x" } } }),
+            "validation_failed",
+        ),
+        (
+            json!({ "a": { "$secret": { "key": text(115), "nonce": text(115), "data": text(115), "version": 1 } } }),
+            "validation_failed",
+        ),
+        (secret(116), "validation_failed"),
+        (json!({ "worker": { "lease_ms": secret(117) } }), "validation_failed"),
+        (
+            json!({ "unknown": { "$secret": { "redacted": true, "version": 1 } }, "a": secret(118) }),
+            "secret_unknown",
+        ),
+    ] {
+        let body = json!({ "spec": { "config": config } });
+        let answer = world
+            .ask(&world.rest, Method::PATCH, service, &[("if-match", "*")], Some(&body))
+            .await;
+        assert_eq!((answer.status, answer.code().as_str()), (422, code), "{}", answer.text);
+        // The same as one of many, and where only what would happen is asked.
+        let many = json!([{ "kind": "Service", "name": "strict", "spec": { "config": body["spec"]["config"], "schema": strict["spec"]["schema"] } }]);
+        let answer = world
+            .ask(
+                &world.rest,
+                Method::POST,
+                "/api/v1/apply?dry_run=true",
+                &[],
+                Some(&many),
+            )
+            .await;
+        assert_eq!(answer.status, 422, "{}", answer.text);
+    }
+    for body in [
+        json!({ "spec": { "config": {} }, "extra": secret(120) }),
+        json!({ "spec": { "config": {} }, "labels": { "a": secret(121) } }),
+        json!({ "spec": { "config": {}, "description": secret(122) } }),
+        json!({ "spec": secret(123) }),
+        json!({ "spec": [secret(124)] }),
+        json!({ "name": "another", "spec": { "config": { "a": secret(125) } } }),
+    ] {
+        let answer = world
+            .ask(&world.rest, Method::PUT, service, &[("if-match", "*")], Some(&body))
+            .await;
+        assert_eq!(answer.status, 422, "{}", answer.text);
+    }
+    let patch = json!({ "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "a": secret(126) } }, "canary": { "node_selector": "a" } });
+    let answer = world
+        .ask(
+            &world.rest,
+            Method::POST,
+            "/api/v1/rollouts",
+            &[],
+            Some(&json!({ "name": "r", "spec": patch })),
+        )
+        .await;
+    assert_eq!(answer.status, 422, "{}", answer.text);
+    let good = json!({ "spec": spec(130) });
+    for (rest, headers, status) in [
+        (&world.rest, [("if-match", "\"1\"")], 412),
+        (&world.rest, [("x-request-id", "none")], 428),
+        (&world.viewer, [("if-match", "*")], 403),
+        (&world.rest.with_token("garbage"), [("if-match", "*")], 401),
+    ] {
+        let answer = world.ask(rest, Method::PUT, service, &headers, Some(&good)).await;
+        assert_eq!(answer.status, status, "{}", answer.text);
+    }
+    let text = text(140);
+    let cut = format!("{{\"spec\":{{\"config\":{{\"a\":{{\"$secret\":\"{text}\"");
+    let twice = format!("{{\"spec\":{{\"config\":{{\"a\":{{\"$secret\":\"{text}\",\"$secret\":\"{text}\"}}}}}}}}");
+    let far = format!("{{\"spec\":{{\"config\":{{\"a\":{{\"$secret\":\"{text}\"}},\"n\":9007199254740993}}}}}}");
+    let bare = format!("{{\"spec\": {text}}}");
+    for body in [cut, twice, far, bare] {
+        assert_eq!(world.send(Method::PUT, service, "application/json", body).await, 400);
+    }
+    assert_eq!(
+        world.send(Method::PUT, service, "text/plain", good.to_string()).await,
+        415
+    );
+    for yaml in [
+        format!("kind: Service\nname: x\nspec: {{ config: {{ a: {{ $secret: {text} }} }}"),
+        format!("kind: Service\nname: x\nspec: {{ config: {{ a: {{ $secret: &anchor {text} }} }} }}\n"),
+        format!("kind: Service\nname: x\nspec:\n  config:\n    a: {{ $secret: {text} }}\n   b: 1\n"),
+        format!("kind: Service\nname: x\nspec: {{ config: {{ a: !tag {text} }} }}\n"),
+        format!("a: {text}\na: {text}\n"),
+        format!("kind: Service\n  a: [{text}"),
+    ] {
+        assert_eq!(
+            world
+                .send(Method::POST, "/api/v1/apply", "application/yaml", yaml)
+                .await,
+            400
+        );
+    }
+    let too_long = json!({ "spec": { "config": { "a": { "$secret": format!("{text}{}", "x".repeat(300 * 1024)) } } } });
+    let answer = world
+        .ask(&world.rest, Method::PUT, service, &[("if-match", "*")], Some(&too_long))
+        .await;
+    assert!([413, 422].contains(&answer.status), "{}", answer.text);
+    let answer = world
+        .ask(
+            &world.viewer,
+            Method::GET,
+            "/api/v1/services/slam?reveal=true",
+            &[],
+            None,
+        )
+        .await;
+    assert_eq!(answer.status, 403, "{}", answer.text);
+}
+
+/// Whatever shows documents, or says what was done to them.
+async fn read(world: &World, begin: u64) {
+    let head = world.read("/api/v1/nodes").await.revision.unwrap();
+    for name in [
+        "layers/edge",
+        "nodes/robot",
+        "services/slam",
+        "services/map",
+        "services/plan",
+        "services/slam/instances/0",
+    ] {
+        let shown = world.read(&format!("/api/v1/{name}")).await;
+        assert!(
+            shown.text.contains("redacted") && (name == "services/map" || shown.text.contains(PLAIN)),
+            "{}",
+            shown.text
+        );
+        let history = world.read(&format!("/api/v1/{name}/history?view=full")).await;
+        assert!(history.text.contains("redacted"), "{}", history.text);
+        world.read(&format!("/api/v1/{name}/history")).await;
+        for entry in history.body["items"].as_array().unwrap() {
+            let (revision, op) = (entry["revision"].as_u64().unwrap(), &entry["op"]);
+            if op != "delete" {
+                world.read(&format!("/api/v1/{name}?revision={revision}")).await;
+                world
+                    .read(&format!("/api/v1/{name}/diff?from={begin}&to={revision}"))
+                    .await;
+            }
+            let diff = world
+                .read(&format!("/api/v1/{name}/diff?from={revision}&to={head}"))
+                .await;
+            assert!(diff.body["changes"].is_array());
+        }
+    }
+    for path in [
+        "layers",
+        "nodes",
+        "services",
+        "services/-/instances",
+        "effective?service=slam&instance=0&explain=true",
+        "effective?service=slam&node=robot&explain=true",
+        "effective?service=slam&layer=edge&explain=true",
+        "effective?node=robot&explain=true",
+        "effective?layer=edge&explain=true",
+        "topology",
+        "workers",
+        "digest?layer=edge",
+        "tokens",
+    ] {
+        world.read(&format!("/api/v1/{path}")).await;
+    }
+    let explain = world
+        .read("/api/v1/effective?service=slam&instance=0&explain=true")
+        .await;
+    assert!(
+        explain.body["explain"]["/db/password"]["overridden"]
+            .as_array()
+            .unwrap()
+            .len()
+            > 2,
+        "{}",
+        explain.text
+    );
+    let audit = world.rest.pages(world.main.at().rest, "/api/v1/audit").await;
+    let audit = Value::Array(audit).to_string();
+    clean("the audit", &audit);
+    assert!(audit.contains("/spec/config/db/password") && audit.contains("rollback"));
+    for path in ["/openapi.json", "/docs/errors/schema_mismatch", "/readyz", "/version"] {
+        world.read(path).await;
+    }
+}
+
+async fn read_by_grpc(world: &World, begin: u64) {
+    let client = &world.grpc;
+    let mut grpc = client.grpc().await.unwrap();
+    let get = v1::GetRequest {
+        r#ref: reference("slam"),
+        read: None,
+    };
+    let list = v1::ListRequest {
+        kind: v1::Kind::Service.into(),
+        ..v1::ListRequest::default()
+    };
+    let history = v1::ListHistoryRequest {
+        r#ref: reference("slam"),
+        page: None,
+        full: true,
+    };
+    let diff = v1::DiffRequest {
+        r#ref: reference("slam"),
+        from_revision: begin + 1,
+        to_revision: 0,
+    };
+    let effective = v1::GetEffectiveRequest {
+        place: Some(v1::Place {
+            service: "slam".to_owned(),
+            instance: "0".to_owned(),
+            ..v1::Place::default()
+        }),
+        explain: true,
+        read: None,
+    };
+    let answers = [
+        format!("{:?}", grpc.get(client.signed(get)).await.unwrap()),
+        format!("{:?}", grpc.list(client.signed(list)).await.unwrap()),
+        format!("{:?}", grpc.list_history(client.signed(history)).await.unwrap()),
+        format!("{:?}", grpc.get_effective(client.signed(effective)).await.unwrap()),
+    ];
+    for answer in answers {
+        assert!(answer.contains("redacted"), "{answer}");
+        clean("an answer of gRPC", &answer);
+    }
+    clean("Diff", &format!("{:?}", grpc.diff(client.signed(diff)).await.unwrap()));
+    clean(
+        "ListAudit",
+        &format!(
+            "{:?}",
+            grpc.list_audit(client.signed(v1::ListAuditRequest::default()))
+                .await
+                .unwrap()
+        ),
+    );
+    clean(
+        "GetTopology",
+        &format!(
+            "{:?}",
+            grpc.get_topology(client.signed(v1::GetTopologyRequest {}))
+                .await
+                .unwrap()
+        ),
+    );
+}
+
+async fn watched(world: &World) {
+    let at = world.main.at();
+    let head = world.read("/api/v1/nodes").await.revision.unwrap();
+    let mut events = Events::open(&world.rest, at.rest, "since=0", None)
+        .await
+        .unwrap_or_else(|refused| panic!("{refused:?}"));
+    let told = within("the watch", Duration::from_secs(30), async {
+        let mut told = String::new();
+        loop {
+            let event = events.next().await.unwrap();
+            told.push_str(&event.data.to_string());
+            if event.id == Some(head) {
+                return told;
+            }
+        }
+    })
+    .await;
+    assert!(told.contains("redacted") && told.contains(PLAIN));
+    clean("the watch", &told);
+    let request = v1::WatchRequest {
+        since: Some(0),
+        ..v1::WatchRequest::default()
+    };
+    let mut messages = world
+        .grpc
+        .grpc()
+        .await
+        .unwrap()
+        .watch(world.grpc.signed(request))
+        .await
+        .unwrap()
+        .into_inner();
+    let told = within("the watch", Duration::from_secs(30), async {
+        let mut told = String::new();
+        while !told.contains(&format!("Bookmark({head})")) {
+            told.push_str(&format!("{:?}", messages.message().await.unwrap().unwrap()));
+        }
+        told
+    })
+    .await;
+    assert!(told.contains("redacted"));
+    clean("Watch", &told);
+}
+
+/// It was there all the time.
+async fn revealed(world: &World) {
+    let at = world.main.at().rest;
+    let slam = world.rest.get(at, "/api/v1/services/slam?reveal=true").await.unwrap();
+    assert_eq!(
+        slam.body.pointer("/spec/config/db/password/$secret/text"),
+        Some(&json!(text(10))),
+        "{}",
+        slam.status
+    );
+    let instance = world
+        .rest
+        .get(at, "/api/v1/effective?service=slam&instance=0&reveal=true")
+        .await
+        .unwrap();
+    assert_eq!(
+        instance.body.pointer("/config/list/0/key/$secret/text"),
+        Some(&json!(text(29))),
+        "{}",
+        instance.status
+    );
+    let client = &world.grpc;
+    let get = v1::GetRequest {
+        r#ref: reference("plan"),
+        read: Some(v1::ReadOptions {
+            reveal: true,
+            ..v1::ReadOptions::default()
+        }),
+    };
+    let plan = client
+        .grpc()
+        .await
+        .unwrap()
+        .get(client.signed(get))
+        .await
+        .unwrap()
+        .into_inner();
+    assert!(
+        plan.spec_json.contains(&text(52)),
+        "the text is given to who may have it"
+    );
+    let audit = world.read("/api/v1/audit?action=reveal").await;
+    assert!(audit.body["items"].as_array().unwrap().len() > 2, "{}", audit.text);
+}
