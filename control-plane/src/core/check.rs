@@ -367,7 +367,8 @@ mod tests {
         assert_eq!(faults(1000, 9000, json!("x")).len(), 1);
         let choice = json!({ "anyOf": vec![json!({ "items": { "type": "integer" } }); 100] });
         let service = json!({ "schema": { "properties": { "list": choice } }, "config": { "list": vec!["x"; 1000] } });
-        let state = State::new(1, [document("Service/s", service)]);
+        let layer = document("Layer/edge", json!({ "kind": "edge" }));
+        let state = State::new(1, [layer, document("Service/s", service)]);
         let refused = schemas.check_effective(&state, &keys, &whole);
         assert!(
             refused.len() == 1 && refused[0].detail.contains("too large together"),
