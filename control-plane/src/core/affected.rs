@@ -17,6 +17,11 @@ pub(crate) const MAX_CANDIDATES: usize = 200_000;
 /// The same for an answer that is kept with the commit: nobody can write while it is worked out.
 pub(crate) const MAX_KEPT_CANDIDATES: usize = 1000;
 
+/// Bytes of configurations that are merged and compared for each place that may be told, at most in the mean.
+const BYTES_PER_PLACE: usize = 64 * 1024;
+/// The same for all of them.
+const MAX_BYTES: usize = 1024 * 1024 * 1024;
+
 /// Documents that are looked at for each place that may be found, at most.
 const LOOKS_PER_PLACE: usize = 25;
 /// The same for few places together.
@@ -239,14 +244,21 @@ pub(crate) fn touched(
 }
 
 /// Places whose effective configuration is another one, in order, as far as they are seen. Of each state at most `limit`
-/// are looked at.
+/// are looked at, and no more bytes of configurations than so many places usually have.
 pub(crate) fn changed(before: &State, after: &State, keys: &[Key], view: &View, limit: usize) -> Vec<At> {
     let all = |_: &ServiceName| true;
     let mut places = candidates(before, keys, &all, limit).found;
     places.extend(candidates(after, keys, &all, limit).found);
+    let mut left = limit.saturating_mul(BYTES_PER_PLACE).min(MAX_BYTES);
     places
         .into_iter()
         .filter(|at| view.sees_place(before, at) || view.sees_place(after, at))
+        .take_while(|at| {
+            let bytes = |state: &State| Sources::at(state, at).size_bound();
+            let enough = left.checked_sub(bytes(before) + bytes(after));
+            left = enough.unwrap_or(0);
+            enough.is_some()
+        })
         .filter(|at| {
             let hash = |state: &State| exists(state, at).then(|| Sources::at(state, at).hash());
             hash(before) != hash(after)

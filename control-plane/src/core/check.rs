@@ -10,7 +10,7 @@ use jsonschema::{ValidationError, Validator};
 use serde_json::Value;
 
 use super::affected::{MAX_CANDIDATES, touched};
-use super::cost::{self, MAX_WORK, MAX_WORK_OF_ALL_FAULTS, MAX_WORK_OF_COMMIT};
+use super::cost::{self, MAX_WORK, MAX_WORK_OF_ALL_FAULTS, MAX_WORK_OF_COMMIT, MAX_WORK_OF_FAULTS};
 use super::effective::{At, Sources};
 use super::schema::{Compiled, Schemas, with_placeholders};
 use super::state::State;
@@ -139,19 +139,23 @@ impl Check<'_> {
             return Ok(());
         };
         let (mut config, secrets) = with_placeholders(sources.merged());
+        self.take(cost::values(&config).saturating_mul(STEPS_OF_MERGE))?;
         if let Value::Object(members) = &mut config {
             members.retain(|name, _| !NODE_FILE_SECTIONS.contains(&name.as_str()));
         }
         let values = cost::values(&config);
         let work = values.saturating_mul(compiled.steps());
         if work > MAX_WORK {
-            self.take(values.saturating_mul(STEPS_OF_MERGE))?;
             found.push(too_costly(at, values, compiled.steps()));
             return Ok(());
         }
-        self.take(work.saturating_add(values.saturating_mul(STEPS_OF_MERGE)))?;
+        self.take(work)?;
         let validator = compiled.validator(at.instance.is_some());
         if validator.is_valid(&config) {
+            return Ok(());
+        }
+        if secrets.is_empty() && work > MAX_WORK_OF_FAULTS {
+            found.push(some_fault(at));
             return Ok(());
         }
         // Once more, to tell what is wrong.
@@ -198,6 +202,19 @@ impl Check<'_> {
 
 fn steps_of_bytes(bytes: usize) -> u64 {
     u64::try_from(bytes / BYTES_PER_STEP).unwrap_or(u64::MAX)
+}
+
+/// A fault of which it would take too much to say where it is: a choice of subschemas tells what is wrong with each.
+fn some_fault(at: &At) -> FieldFault {
+    FieldFault {
+        pointer: "/spec/config".to_owned(),
+        code: Code::SchemaMismatch,
+        detail: format!(
+            "effective configuration of {}: it does not match the schema; the two are too large together to say where",
+            described(at)
+        ),
+        document: None,
+    }
 }
 
 /// The first fault, if it may be told.
@@ -346,8 +363,17 @@ mod tests {
         assert_eq!(faults(1000, 9000, json!(1)), []);
         let refused = faults(1000, 11_000, json!(1));
         assert!(refused[0].detail.contains("too costly"), "{refused:?}");
-        // Many faults are not all collected.
+        // Many faults are not all collected, nor one that tells of many.
         assert_eq!(faults(1000, 9000, json!("x")).len(), 1);
+        let choice = json!({ "anyOf": vec![json!({ "items": { "type": "integer" } }); 100] });
+        let service = json!({ "schema": { "properties": { "list": choice } }, "config": { "list": vec!["x"; 1000] } });
+        let layer = document("Layer/edge", json!({ "kind": "edge" }));
+        let state = State::new(1, [layer, document("Service/s", service)]);
+        let refused = schemas.check_effective(&state, &keys, &whole);
+        assert!(
+            refused.len() == 1 && refused[0].detail.contains("too large together"),
+            "{refused:?}"
+        );
         assert_eq!(faults(10, 9, json!("x")).len(), MAX_FAULTS);
         assert_eq!(faults(1, 9, json!("x")).len(), 9);
     }

@@ -40,6 +40,9 @@ const MAX_BATCH_BYTES: usize = 4 * 1024 * 1024;
 const QUICK_BYTES: usize = 64 * 1024;
 /// How long one batch is tried.
 const DEADLINE: Duration = Duration::from_secs(10);
+/// How long a batch is worked out before it is written with what there is: while it is, other processes may be first, and
+/// all of it is worked out again.
+const SHARE: Duration = Duration::from_millis(100);
 /// Pause before a batch is tried again after another process was first, at most.
 const JITTER: Duration = Duration::from_millis(4);
 /// How long an idempotency record is kept.
@@ -213,8 +216,8 @@ impl Committer {
         }
     }
 
-    async fn commit(&mut self, batch: Vec<Queued>) {
-        let deadline = Instant::now() + DEADLINE;
+    async fn commit(&mut self, mut batch: Vec<Queued>) {
+        let mut deadline = Instant::now() + DEADLINE;
         loop {
             if self.doubtful {
                 if let Err(error) = follow(&*self.store, &self.log, None).await {
@@ -223,7 +226,16 @@ impl Committer {
                 self.doubtful = false;
             }
             match self.try_batch(&batch).await {
-                Ok(tried) => return answer(batch, tried),
+                Ok(tried) => {
+                    let rest = batch.split_off(tried.len());
+                    answer(batch, tried);
+                    if rest.is_empty() {
+                        return;
+                    }
+                    batch = rest;
+                    deadline = Instant::now() + DEADLINE;
+                    continue;
+                }
                 Err(Again::Refuse(problem)) => return refuse(batch, &problem),
                 Err(Again::Follow) => {
                     if let Err(error) = follow(&*self.store, &self.log, None).await {
@@ -243,6 +255,7 @@ impl Committer {
         }
     }
 
+    /// What became of the first ones: of all, unless that takes long.
     async fn try_batch(&mut self, batch: &[Queued]) -> Result<Vec<Tried>, Again> {
         let time = now();
         let mut work = Vec::with_capacity(batch.len());
@@ -352,13 +365,17 @@ impl Work {
     }
 }
 
-/// Works out each request on the state after the ones before.
+/// Works out each request on the state after the ones before, until that has taken [`SHARE`].
 fn work_out(evaluator: &Evaluator, start: &State, work: Vec<Work>, time: Timestamp) -> (Vec<CommitRecord>, Vec<Tried>) {
     let id = uuid::Uuid::now_v7().to_string();
     let mut state = start.clone();
     let mut records: Vec<CommitRecord> = Vec::new();
     let mut tried = Vec::with_capacity(work.len());
+    let begun = Instant::now();
     for one in work {
+        if !tried.is_empty() && begun.elapsed() >= SHARE {
+            break;
+        }
         if let Some(found) = one.before {
             tried.push(found);
             continue;

@@ -27,7 +27,9 @@ const BYTES_PER_VALUE: usize = 100;
 pub(super) const MAX_WORK: u64 = 10_000_000;
 /// The same for all effective configurations that one commit concerns: nobody can write meanwhile.
 pub(super) const MAX_WORK_OF_COMMIT: u64 = 100_000_000;
-/// The same up to which every fault is looked for; beyond it the first one alone, for each takes memory.
+/// The same up to which it is told where the faults are: each takes memory, and one of them may tell of many.
+pub(super) const MAX_WORK_OF_FAULTS: u64 = 50_000;
+/// The same beside secrets, of which some faults do not count; beyond it the first one alone is looked for.
 pub(super) const MAX_WORK_OF_ALL_FAULTS: u64 = 1_000_000;
 /// Patterns in one schema: each is compiled, which takes up to a megabyte and its time.
 const MAX_PATTERNS: usize = 200;

@@ -1,7 +1,7 @@
 //! From a request and a state to changes, or to a refusal. Pure but for new uids and nonces: the same code runs for a
 //! dry run, for the first try and again after another process was first.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use blaze_domain::config::diff::{document_diff, paths};
@@ -216,7 +216,8 @@ impl Evaluator {
         order: Vec<Key>,
         mut faults: Faults,
     ) -> Result<Evaluated, Problem> {
-        let index_of = |key: &Key| order.iter().position(|other| other == key).unwrap_or(0);
+        let places: HashMap<&Key, usize> = order.iter().zip(0..).collect();
+        let index_of = |key: &Key| places.get(key).copied().unwrap_or(0);
         let mut changes = Vec::with_capacity(outcomes.len());
         let mut actions: BTreeMap<Key, ApplyAction> = BTreeMap::new();
         for (key, (outcome, op)) in outcomes {
@@ -404,6 +405,9 @@ impl Evaluator {
         }
         faults.finish_invalid()?;
         for change in changes.iter().filter(|change| change.op == Op::Delete) {
+            if !faults.has_room_for_conflicts() {
+                break;
+            }
             let key = &change.document.key;
             let referrers = refs::referrers(after, key, COUNTED);
             if !referrers.is_empty() {
@@ -907,8 +911,12 @@ impl Faults {
         self.invalid.push(fault);
     }
 
+    fn has_room_for_conflicts(&self) -> bool {
+        self.conflicts.len() < MAX_FAULTS
+    }
+
     fn conflict(&mut self, index: usize, problem: Problem) {
-        if self.conflicts.len() < MAX_FAULTS {
+        if self.has_room_for_conflicts() {
             self.conflicts.push((index, problem));
         }
     }

@@ -10,12 +10,19 @@ use super::evaluate::invalid;
 use super::placement::{placement, rollout_target};
 use super::state::State;
 
+/// Nodes that one roll-out is tried on, at most: each has its line in the status.
+const MAX_CANARIES: usize = 1000;
+
 /// The status of a roll-out that begins in a state of which it is part.
 pub(super) fn begin(after: &State, rollout: &Document) -> Result<Value, Box<Problem>> {
     let nodes = nodes(after, rollout);
     if nodes.is_empty() {
         let detail = "matches no node on which the target counts; at least one must try the change";
         return Err(refusal("/spec/canary/node_selector", detail));
+    }
+    if nodes.len() > MAX_CANARIES {
+        let detail = format!("matches more than {MAX_CANARIES} nodes; choose fewer to try the change on");
+        return Err(refusal("/spec/canary/node_selector", &detail));
     }
     let target = rollout_target(rollout).and_then(|key| after.get(&key));
     if let Some(target) = target {
@@ -59,6 +66,8 @@ fn nodes(after: &State, rollout: &Document) -> Vec<Value> {
     after
         .of_kind(Kind::Node, None)
         .filter(|(_, held)| selector.matches(&held.document.labels) && counts(&held.document))
+        // One more, to tell that they are too many.
+        .take(MAX_CANARIES + 1)
         .map(|(key, _)| json!({ "node": key.name().as_str(), "phase": "pending", "revision": null, "reason": "" }))
         .collect()
 }

@@ -12,8 +12,9 @@ use imbl::{OrdMap, OrdSet};
 use super::placement::{Placement, is_active, placement, rollout_target};
 use crate::store::{Change, Commit, Op};
 
-/// Documents larger than this make an effective configuration that is too large possible (four documents are merged).
-const BIG_BYTES: usize = blaze_domain::config::MAX_EFFECTIVE_BYTES / 4;
+/// Documents larger than this make an effective configuration that is too large possible (four documents are merged, each
+/// perhaps with the change of a roll-out).
+const BIG_BYTES: usize = blaze_domain::config::MAX_EFFECTIVE_BYTES / 8;
 
 /// A document as it is kept in memory.
 #[derive(Debug, PartialEq)]

@@ -285,8 +285,8 @@ pub trait CommitLog: Send + Sync + 'static {
     /// [`CommitError`].
     async fn commit(&self, records: &[CommitRecord]) -> Result<(), CommitError>;
 
-    /// Returns when another process may have committed; at the latest after 100 ms where the store cannot tell. Never
-    /// returns where nobody else writes.
+    /// Returns when another process may have committed; at the latest after 100 ms where the store cannot tell, and now and
+    /// then all the same. Never returns where nobody else can write.
     async fn foreign_commit(&self);
 }
 

@@ -233,3 +233,19 @@ async fn a_roll_out_that_began_tells_its_revision() {
         .unwrap_err();
     assert_eq!((back.code, back.revision), (Code::RolloutState, Some(started)));
 }
+
+#[tokio::test]
+async fn a_roll_out_is_not_tried_on_more_nodes_than_its_status_can_tell_of() {
+    let w = canary_world().await;
+    for half in 0..2 {
+        let keys: Vec<String> = (0..500).map(|number| format!("Node/n{half}-{number}")).collect();
+        let nodes = keys.iter().map(|key| (key.as_str(), json!({ "layer": "edge" })));
+        w.apply(nodes.collect()).await.unwrap();
+    }
+    let mut spec = on("Service", "s", &json!({ "config": { "n": 2 } }));
+    // All but those with a label that nobody has.
+    spec["canary"]["node_selector"] = json!("!none");
+    let refused = start(&w, &w.admin, "r", spec).await.unwrap_err();
+    assert_eq!(refused.code, Code::ValidationFailed);
+    assert!(refused.errors[0].detail.contains("more than 1000 nodes"), "{refused:?}");
+}

@@ -5,7 +5,7 @@
 //!                                                                                  still the one that was read (`turn`)
 //! others in the table: every read asks the database
 //! nobody else:         reads are answered from memory for 800 ms from before the exchange
-//! nobody has read for a while:                     the exchange is every 10 s, and the next read asks the database
+//! nobody has read for a while:                     an exchange every 10 s, a look every 500 ms; the next read asks the database
 //! just come, or back after being left out: 1.1 s without reads and writes, for somebody may still read from memory
 //! ```
 //!
@@ -25,7 +25,7 @@ use std::time::Duration;
 use mongodb::bson::{Document, doc};
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout};
 use tokio_util::sync::CancellationToken;
 
 use super::client::{QUICK, Tables, limited};
@@ -40,6 +40,8 @@ const BEAT: Duration = Duration::from_millis(250);
 /// The same after [`IDLE_BEATS`] of them without reads: each one is a write to the disks of the database.
 const IDLE_BEAT: Duration = Duration::from_secs(10);
 const IDLE_BEATS: u32 = 40;
+/// Between two looks at the table meanwhile: whoever comes is seen before it writes.
+const LOOK: Duration = Duration::from_millis(500);
 /// How long a process that is alone may answer from memory, from before the exchange on.
 const LEASE: Duration = Duration::from_millis(800);
 /// How long one that has come waits for the leases of others to end.
@@ -190,13 +192,9 @@ impl Reads {
         }
     }
 
-    /// Waits for the time of the next exchange.
-    async fn next(&self) {
-        if self.idle.fetch_add(1, Ordering::Relaxed) < IDLE_BEATS {
-            return tokio::time::sleep(BEAT).await;
-        }
-        // Either will do.
-        let _ = timeout(IDLE_BEAT, self.began.notified()).await;
+    /// Whether there was none for long. To be asked once for each exchange.
+    fn are_idle(&self) -> bool {
+        self.idle.fetch_add(1, Ordering::Relaxed) >= IDLE_BEATS
     }
 }
 
@@ -232,6 +230,11 @@ impl Members {
     pub(super) fn alone(&self) -> Option<u64> {
         self.reads.note();
         self.standing.borrow().alone(since_boot())
+    }
+
+    /// Whether no other process was there at the last exchange, however long ago that is: half a second where all is well.
+    pub(super) fn is_alone(&self) -> bool {
+        self.standing.borrow().alone.is_some()
     }
 
     /// Waits until this process may read and write. Which time in the table it is, for [`Members::is_still`].
@@ -296,10 +299,25 @@ impl Beating {
         loop {
             tokio::select! {
                 () = leave.cancelled() => return self,
-                () = self.reads.next() => {}
+                () = self.next_time() => {}
             }
             if let Err(error) = self.beat().await {
                 tracing::debug!(%error, "no exchange with the other processes");
+            }
+        }
+    }
+
+    /// Waits for the time of the next exchange: when nobody reads, until somebody does, or another process comes.
+    async fn next_time(&self) {
+        if !self.reads.are_idle() {
+            return tokio::time::sleep(BEAT).await;
+        }
+        let until = Instant::now() + IDLE_BEAT;
+        while Instant::now() < until {
+            let has_begun = timeout(LOOK, self.reads.began.notified()).await.is_ok();
+            let is_mine = |table: Table| self.last.as_ref().is_some_and(|last| last.turn == table.turn);
+            if has_begun || !self.read().await.is_ok_and(is_mine) {
+                return;
             }
         }
     }
@@ -440,6 +458,7 @@ mod tests {
         assert!(LEASE * 4 / 3 <= WAIT);
         assert!(VALID * 2 <= SILENT);
         assert!(BEAT * 3 <= LEASE);
+        assert!(LOOK * 2 < WAIT);
     }
 
     #[test]
