@@ -12,7 +12,7 @@ use blaze_runtime::{logs, say};
 use clap::{Parser, Subcommand};
 
 /// A commit makes and drops thousands of small texts and map nodes on other threads than it began on: with the allocator
-/// of glibc that took two fifths of its time.
+/// of glibc that took more than a third of its time.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 

@@ -290,14 +290,15 @@ fn described(at: &At) -> String {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use blaze_domain::config::{Labels, Timestamp};
     use serde_json::json;
 
     use super::*;
     use crate::core::view::view;
 
-    fn document(key: &str, spec: Value) -> Document {
+    /// A document with nothing but its spec.
+    pub(in crate::core) fn document(key: &str, spec: Value) -> Document {
         Document {
             key: key.parse().unwrap(),
             uid: key.to_owned(),

@@ -296,31 +296,15 @@ fn replaced(keyring: &Keyring, document: &Document, value: &Value, form: impl Fn
 #[cfg(test)]
 mod tests {
     use std::cell::Cell;
-    use std::sync::Arc;
 
-    use blaze_domain::config::{Labels, Timestamp};
     use serde_json::json;
 
     use super::*;
+    use crate::core::check::tests::document;
 
     thread_local! {
         /// Secrets that were decrypted.
         pub(super) static OPENED: Cell<usize> = const { Cell::new(0) };
-    }
-
-    fn document(spec: Value) -> Document {
-        Document {
-            key: "Service/s".parse().unwrap(),
-            uid: "u".to_owned(),
-            revision: 1,
-            create_time: Timestamp::default(),
-            update_time: Timestamp::default(),
-            updated_by: String::new(),
-            labels: Labels::new(),
-            annotations: Labels::new(),
-            spec: Arc::new(spec),
-            status: None,
-        }
     }
 
     fn stored(keyring: &Keyring, current: Option<&Document>, spec: &Value) -> Result<Value, Vec<FieldFault>> {
@@ -342,7 +326,10 @@ mod tests {
         let keyring = Keyring::with_keys(&[("e1", [7; 32])]).unwrap();
         let twins: Vec<Value> = (0..3000).map(|_| json!({ "pw": { "$secret": "A" } })).collect();
         let mut spec = stored(&keyring, None, &json!({ "config": { "list": twins } })).unwrap();
-        let current = document(spec.clone());
+        let current = Document {
+            uid: "u".to_owned(),
+            ..document("Service/s", spec.clone())
+        };
         spec = secret::redact(&spec).into_owned();
         spec["config"]["list"].as_array_mut().unwrap().pop();
         OPENED.with(|opened| opened.set(0));
