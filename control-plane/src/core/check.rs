@@ -1,5 +1,6 @@
 //! Whether effective configurations keep to their size and match the schemas of their services.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use blaze_domain::ServiceName;
@@ -10,8 +11,9 @@ use jsonschema::{ValidationError, Validator};
 use serde_json::Value;
 
 use super::affected::{MAX_CANDIDATES, touched};
-use super::cost::{self, MAX_WORK, MAX_WORK_OF_ALL_FAULTS, MAX_WORK_OF_COMMIT, MAX_WORK_OF_FAULTS};
+use super::cost::{MAX_WORK, MAX_WORK_OF_ALL_FAULTS, MAX_WORK_OF_COMMIT, MAX_WORK_OF_FAULTS, Size};
 use super::effective::{At, Sources};
+use super::pattern::{self, Exhausted};
 use super::schema::{Compiled, Schemas, with_placeholders};
 use super::state::State;
 use super::view::View;
@@ -28,14 +30,24 @@ const BYTES_PER_STEP: usize = 64;
 impl Schemas {
     /// Checks every effective configuration that changed documents can concern: its size, and its service's schema. Of
     /// what is outside the view no more is told than that it would not do. What would take too long is refused: nothing is
-    /// left unchecked.
-    pub(crate) fn check_effective(&self, state: &State, keys: &[Key], view: &View) -> Vec<FieldFault> {
-        self.check_within(state, keys, view, MAX_CANDIDATES, MAX_WORK_OF_COMMIT)
+    /// left unchecked, but for what was too costly before the change.
+    pub(crate) fn check_effective(&self, before: &State, after: &State, keys: &[Key], view: &View) -> Vec<FieldFault> {
+        self.check_within([before, after], keys, view, MAX_CANDIDATES, MAX_WORK_OF_COMMIT)
     }
 
-    fn check_within(&self, state: &State, keys: &[Key], view: &View, places: usize, work: u64) -> Vec<FieldFault> {
+    fn check_within(
+        &self,
+        [before, state]: [&State; 2],
+        keys: &[Key],
+        view: &View,
+        places: usize,
+        work: u64,
+    ) -> Vec<FieldFault> {
         // Most writes concern no schema at all; to find the places that they touch would cost more than the write.
         let matters = |key: &&Key| {
+            if is_other_in_name_only(before, state, key) {
+                return false;
+            }
             state.has_big()
                 || match (key.kind(), key.service_name()) {
                     (Kind::Service, _) => state.has_schema(&ServiceName::from(key.name())),
@@ -53,6 +65,7 @@ impl Schemas {
         };
         let mut check = Check {
             schemas: self,
+            before,
             state,
             view,
             left: work,
@@ -74,8 +87,14 @@ impl Schemas {
     }
 }
 
-/// There is more to check than one commit may take.
-struct Exhausted;
+/// Whether a document is as it was in all that configurations are made of: its labels place nothing, but a roll-out
+/// finds its nodes by them.
+fn is_other_in_name_only(before: &State, after: &State, key: &Key) -> bool {
+    let (Some(was), Some(is)) = (before.get(key), after.get(key)) else {
+        return false;
+    };
+    key.kind() != Kind::Node && was.document.spec == is.document.spec && was.document.status == is.document.status
+}
 
 /// A service as it was met, with its schema compiled.
 type Known = (Arc<Document>, Option<Arc<Compiled>>);
@@ -83,6 +102,7 @@ type Known = (Arc<Document>, Option<Arc<Compiled>>);
 /// A check of many places, one after the other.
 struct Check<'c> {
     schemas: &'c Schemas,
+    before: &'c State,
     state: &'c State,
     view: &'c View,
     /// Steps that it may still take.
@@ -138,20 +158,22 @@ impl Check<'_> {
         let Some(compiled) = self.compiled(service, schema)? else {
             return Ok(());
         };
-        let (mut config, secrets) = with_placeholders(sources.merged());
-        self.take(cost::values(&config).saturating_mul(STEPS_OF_MERGE))?;
-        if let Value::Object(members) = &mut config {
-            members.retain(|name, _| !NODE_FILE_SECTIONS.contains(&name.as_str()));
-        }
-        let values = cost::values(&config);
-        let work = values.saturating_mul(compiled.steps());
-        if work > MAX_WORK {
-            found.push(too_costly(at, values, compiled.steps()));
-            return Ok(());
-        }
-        self.take(work)?;
+        let (config, secrets) = self.checked(sources)?;
+        let size = Size::of(&config);
+        let work = compiled.cost().work(&size);
         let validator = compiled.validator(at.instance.is_some());
-        if validator.is_valid(&config) {
+        let Some(is_valid) = self.verdict(validator, &config, work)? else {
+            if self.was_too_costly(at) {
+                tracing::warn!(
+                    place = described(at),
+                    "the configuration is too costly to check, as it was before; it is not checked"
+                );
+            } else {
+                found.push(too_costly(at, &compiled.cost().why(&size)));
+            }
+            return Ok(());
+        };
+        if is_valid {
             return Ok(());
         }
         if secrets.is_empty() && work > MAX_WORK_OF_FAULTS {
@@ -160,7 +182,7 @@ impl Check<'_> {
         }
         // Once more, to tell what is wrong.
         self.take(work)?;
-        // Whether the text of a secret has a length or matches a pattern is not told.
+        // What a secret is, beyond that it is a text, is not told.
         let is_told = |error: &ValidationError<'_>| {
             !secrets.contains(error.instance_path().as_str())
                 || matches!(
@@ -168,17 +190,77 @@ impl Check<'_> {
                     ValidationErrorKind::Type { .. } | ValidationErrorKind::FalseSchema
                 )
         };
-        if work > MAX_WORK_OF_ALL_FAULTS {
-            found.push(first_fault(validator, &config, at, is_told).unwrap_or_else(|| {
-                // What is wrong beside the secret is not known, so it cannot be let through.
-                too_costly(at, values, compiled.steps())
-            }));
-            return Ok(());
-        }
-        let errors = validator.iter_errors(&config).filter(is_told);
         let left = MAX_FAULTS.saturating_sub(self.faults.len());
-        found.extend(errors.take(left).map(|error| mismatch(&error, at)));
+        let told = || match work > MAX_WORK_OF_ALL_FAULTS {
+            true => vec![first_fault(validator, &config, at, is_told).unwrap_or_else(|| {
+                // What is wrong beside the secret is not known, so it cannot be let through.
+                too_costly(at, &compiled.cost().why(&size))
+            })],
+            false => {
+                let errors = validator.iter_errors(&config).filter(is_told);
+                errors.take(left).map(|error| mismatch(&error, at)).collect()
+            }
+        };
+        match pattern::counted(MAX_WORK.min(self.left), told) {
+            Ok((faults, taken)) => {
+                self.take(taken)?;
+                found.extend(faults);
+            }
+            Err(Exhausted) => {
+                self.take(MAX_WORK.min(self.left))?;
+                found.push(some_fault(at));
+            }
+        }
         Ok(())
+    }
+
+    /// The configuration that the schema is about, and where its secrets are.
+    fn checked(&mut self, sources: &Sources) -> Result<(Value, HashSet<String>), Exhausted> {
+        let (mut config, secrets) = with_placeholders(sources.merged());
+        self.take(Size::of(&config).values.saturating_mul(STEPS_OF_MERGE))?;
+        if let Value::Object(members) = &mut config {
+            members.retain(|name, _| !NODE_FILE_SECTIONS.contains(&name.as_str()));
+        }
+        Ok((config, secrets))
+    }
+
+    /// Whether a configuration is valid; `None`: it is too costly to know.
+    fn verdict(&mut self, validator: &Validator, config: &Value, work: u64) -> Result<Option<bool>, Exhausted> {
+        if work > MAX_WORK {
+            return Ok(None);
+        }
+        self.take(work)?;
+        match pattern::counted(MAX_WORK.min(self.left), || validator.is_valid(config)) {
+            Ok((is_valid, taken)) => {
+                self.take(taken)?;
+                Ok(Some(is_valid))
+            }
+            // Of what one configuration may take, or of what was left for all.
+            Err(Exhausted) if self.left < MAX_WORK => Err(Exhausted),
+            Err(Exhausted) => {
+                self.take(MAX_WORK)?;
+                Ok(None)
+            }
+        }
+    }
+
+    /// Whether the configuration of a place was too costly to check before the change already: stored when more was
+    /// allowed, it must not stand in the way of other changes.
+    fn was_too_costly(&mut self, at: &At) -> bool {
+        let sources = Sources::at(self.before, at);
+        let Some(service) = &sources.service else { return false };
+        let Some(schema) = service.spec_member("schema").filter(|schema| !schema.is_null()) else {
+            return false;
+        };
+        let Ok(compiled) = self.schemas.compiled(schema) else {
+            return false;
+        };
+        let Ok((config, _)) = self.checked(&sources) else {
+            return false;
+        };
+        let work = compiled.cost().work(&Size::of(&config));
+        let validator = compiled.validator(at.instance.is_some());
+        matches!(self.verdict(validator, &config, work), Ok(None))
     }
 
     /// The schema of a service, compiled, if it can be.
@@ -189,12 +271,15 @@ impl Check<'_> {
             return Ok(compiled.clone());
         }
         self.take(STEPS_OF_SCHEMA)?;
-        let compiled = self.schemas.compiled(schema);
-        if compiled.is_err() {
-            // It was sound when it was written; a newer program may see it otherwise, and must not block every write.
-            tracing::warn!(service = %service.key, "the stored schema cannot be compiled; it is not checked");
-        }
-        let compiled = compiled.ok();
+        let compiled = match self.schemas.compiled(schema) {
+            // Always, for whether it is known already depends on what else was done.
+            Ok(compiled) => self.take(compiled.cost().compiling).map(|()| Some(compiled))?,
+            Err(reason) => {
+                // It was sound when it was written; a newer program may see it otherwise, and must not block every write.
+                tracing::warn!(service = %service.key, reason, "the stored schema cannot be compiled; it is not checked");
+                None
+            }
+        };
         self.known.push((Arc::clone(service), compiled.clone()));
         Ok(compiled)
     }
@@ -238,20 +323,20 @@ fn mismatch(error: &ValidationError<'_>, at: &At) -> FieldFault {
     }
 }
 
-fn too_costly(at: &At, values: u64, steps: u64) -> FieldFault {
+fn too_costly(at: &At, why: &str) -> FieldFault {
     FieldFault {
         pointer: "/spec/config".to_owned(),
         code: Code::ValidationFailed,
         detail: format!(
-            "effective configuration of {}: too costly to check: {values} values, for each of which the schema takes up to \
-             {steps} steps, together more than {MAX_WORK}; make the configuration smaller or the schema simpler",
+            "effective configuration of {}: too costly to check: {why}, and matching its texts with patterns, are together \
+             more than {MAX_WORK} steps; make the configuration smaller or the schema simpler",
             described(at)
         ),
         document: None,
     }
 }
 
-fn too_many() -> FieldFault {
+pub(super) fn too_many() -> FieldFault {
     FieldFault {
         pointer: String::new(),
         code: Code::ValidationFailed,
@@ -313,13 +398,16 @@ pub(super) mod tests {
         }
     }
 
+    fn schema() -> Value {
+        json!({ "properties": { "n": { "type": "integer" } } })
+    }
+
     /// A service with a schema and another one without, each with so many instances.
     fn state(instances: usize) -> State {
-        let schema = json!({ "properties": { "n": { "type": "integer" } } });
         let mut all = vec![
             document("Layer/edge", json!({ "kind": "edge" })),
             document("Service/plain", json!({})),
-            document("Service/strict", json!({ "schema": schema })),
+            document("Service/strict", json!({ "schema": schema() })),
         ];
         for number in 0..instances {
             for service in ["plain", "strict"] {
@@ -337,29 +425,42 @@ pub(super) mod tests {
         let (schemas, state) = (Schemas::default(), state(20));
         let whole = view(&crate::auth::dev::claims());
         let keys = ["Layer/edge".parse().unwrap()];
-        let faults = |places, work| schemas.check_within(&state, &keys, &whole, places, work);
+        let before = State::new(0, []);
+        let faults = |places, work| schemas.check_within([&before, &state], &keys, &whole, places, work);
         // The instances and the service without instance.
         assert_eq!(faults(21, MAX_WORK_OF_COMMIT), []);
         let refused = faults(20, MAX_WORK_OF_COMMIT);
         assert_eq!(refused.len(), 1);
         assert!(refused[0].detail.contains("in parts"), "{refused:?}");
         // One schema for all of them, and less than that.
-        assert_eq!(faults(100, STEPS_OF_SCHEMA + 1000), []);
-        assert_eq!(faults(100, STEPS_OF_SCHEMA - 1).len(), 1);
-        let refused = faults(100, STEPS_OF_SCHEMA + 20);
+        let schema = STEPS_OF_SCHEMA + schemas.check(&schema()).unwrap();
+        assert_eq!(faults(100, schema + 1000), []);
+        assert_eq!(faults(100, schema - 1).len(), 1);
+        let refused = faults(100, schema + 20);
         assert!(refused[0].detail.contains("in parts"), "{refused:?}");
+    }
+
+    /// What is wrong with a service that is written, alone in its layer.
+    fn faults_of(spec: Value) -> Vec<FieldFault> {
+        faults_after(&State::new(0, []), spec)
+    }
+
+    fn faults_after(before: &State, spec: Value) -> Vec<FieldFault> {
+        let keys = ["Service/s".parse().unwrap()];
+        let whole = view(&crate::auth::dev::claims());
+        Schemas::default().check_effective(before, &with_service(spec), &keys, &whole)
+    }
+
+    fn with_service(spec: Value) -> State {
+        let layer = document("Layer/edge", json!({ "kind": "edge" }));
+        State::new(1, [layer, document("Service/s", spec)])
     }
 
     #[test]
     fn what_takes_too_many_steps_for_its_values_is_refused() {
-        let (schemas, whole) = (Schemas::default(), view(&crate::auth::dev::claims()));
-        let keys = ["Service/s".parse().unwrap()];
         let faults = |steps: usize, items: usize, item: Value| {
             let schema = json!({ "properties": { "list": { "items": { "allOf": vec![json!({ "type": "integer" }); steps] } } } });
-            let config = json!({ "list": vec![item; items] });
-            let service = document("Service/s", json!({ "schema": schema, "config": config }));
-            let state = State::new(1, [document("Layer/edge", json!({ "kind": "edge" })), service]);
-            schemas.check_effective(&state, &keys, &whole)
+            faults_of(json!({ "schema": schema, "config": { "list": vec![item; items] } }))
         };
         assert_eq!(faults(1000, 9000, json!(1)), []);
         let refused = faults(1000, 11_000, json!(1));
@@ -367,15 +468,99 @@ pub(super) mod tests {
         // Many faults are not all collected, nor one that tells of many.
         assert_eq!(faults(1000, 9000, json!("x")).len(), 1);
         let choice = json!({ "anyOf": vec![json!({ "items": { "type": "integer" } }); 100] });
-        let service = json!({ "schema": { "properties": { "list": choice } }, "config": { "list": vec!["x"; 1000] } });
-        let layer = document("Layer/edge", json!({ "kind": "edge" }));
-        let state = State::new(1, [layer, document("Service/s", service)]);
-        let refused = schemas.check_effective(&state, &keys, &whole);
+        let refused =
+            faults_of(json!({ "schema": { "properties": { "list": choice } }, "config": { "list": vec!["x"; 1000] } }));
         assert!(
             refused.len() == 1 && refused[0].detail.contains("too large together"),
             "{refused:?}"
         );
         assert_eq!(faults(10, 9, json!("x")).len(), MAX_FAULTS);
         assert_eq!(faults(1, 9, json!("x")).len(), 9);
+    }
+
+    #[test]
+    fn texts_that_take_long_to_match_are_refused() {
+        let hostile = "(a|b)*a(a|b){900}c$";
+        let faults = |schema: Value, bytes: usize| {
+            faults_of(json!({ "schema": schema, "config": { "text": "ab".repeat(bytes / 2) } }))
+        };
+        let of_text = json!({ "properties": { "text": { "pattern": hostile } } });
+        let refused = faults(of_text.clone(), 200_000);
+        assert!(
+            refused.len() == 1 && refused[0].detail.contains("too costly"),
+            "{refused:?}"
+        );
+        let refused = faults(of_text, 2_000);
+        assert!(refused[0].detail.contains("does not match"), "{refused:?}");
+        // A large text that no costly pattern is about.
+        let elsewhere = json!({ "properties": { "other": { "pattern": hostile }, "text": { "pattern": "^[ab]+$" } } });
+        assert_eq!(faults(elsewhere, 200_000), []);
+        let names: serde_json::Map<String, Value> = (0..2000)
+            .map(|number| (format!("{number}{}", "ab".repeat(50)), json!(1)))
+            .collect();
+        let of_names = json!({ "patternProperties": { hostile: true } });
+        let refused = faults_of(json!({ "schema": of_names, "config": names }));
+        assert!(
+            refused.len() == 1 && refused[0].detail.contains("states"),
+            "{refused:?}"
+        );
+    }
+
+    #[test]
+    fn what_was_too_costly_before_stands_in_nobodys_way() {
+        let steps = |count: usize| json!({ "items": { "allOf": vec![json!({ "type": "integer" }); count] } });
+        let service = |schema: Value, items: usize, rate: u64| json!({ "schema": { "properties": { "list": schema } }, "config": { "list": vec![1; items], "rate": rate } });
+        let before = with_service(service(steps(1000), 11_000, 1));
+        assert_eq!(faults_after(&before, service(steps(1000), 11_000, 2)), []);
+        let text = |rate: u64| {
+            let schema = json!({ "properties": { "text": { "pattern": "(a|b)*a(a|b){900}c$" } } });
+            json!({ "schema": schema, "config": { "text": "ab".repeat(100_000), "rate": rate } })
+        };
+        assert_eq!(faults_after(&with_service(text(1)), text(2)), []);
+        let cheap = with_service(service(steps(1000), 1000, 1));
+        assert_eq!(faults_after(&cheap, service(steps(1000), 11_000, 2)).len(), 1);
+    }
+
+    #[test]
+    fn a_secret_fits_a_costly_schema() {
+        let items = json!({ "items": { "allOf": vec![json!({ "type": "integer" }); 1000] } });
+        let secret = json!({ "type": "string", "minLength": 100, "pattern": "^key-" });
+        let schema = json!({ "properties": { "list": items, "key": secret } });
+        let config = |item: Value| json!({ "list": vec![item; 2000], "key": { "$secret": "x" } });
+        assert_eq!(faults_of(json!({ "schema": schema, "config": config(json!(1)) })), []);
+        let refused = faults_of(json!({ "schema": schema, "config": config(json!("x")) }));
+        assert!(
+            refused.len() == 1 && refused[0].pointer == "/spec/config/list/0",
+            "{refused:?}"
+        );
+    }
+
+    #[test]
+    fn a_change_of_names_alone_is_not_checked_but_of_a_node() {
+        let whole = view(&crate::auth::dev::claims());
+        let labelled = |key: &str, spec: Value| Document {
+            labels: Labels::from([("site".to_owned(), "two".to_owned())]),
+            ..document(key, spec)
+        };
+        let strict = document(
+            "Service/s",
+            json!({ "schema": { "properties": { "n": false } }, "config": { "n": 1 } }),
+        );
+        let layer = json!({ "kind": "edge" });
+        let node = json!({ "layer": "edge", "type": "static", "config": { "s": 1 } });
+        let before = State::new(
+            1,
+            [
+                strict.clone(),
+                document("Layer/edge", layer.clone()),
+                document("Node/n", node.clone()),
+            ],
+        );
+        let after = State::new(2, [strict, labelled("Layer/edge", layer), labelled("Node/n", node)]);
+        let faults = |key: &str| {
+            let keys = [key.parse().unwrap()];
+            Schemas::default().check_effective(&before, &after, &keys, &whole).len()
+        };
+        assert_eq!((faults("Layer/edge"), faults("Node/n")), (0, 1));
     }
 }

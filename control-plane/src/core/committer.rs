@@ -11,6 +11,7 @@
 //! proof; it asks the store for its newest revision before it answers.
 
 use std::collections::HashSet;
+use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -282,13 +283,11 @@ impl Committer {
             // Beside the threads that serve, so that they go on meanwhile.
             let (evaluator, start) = (Arc::clone(&self.evaluator), start.clone());
             let worked = tokio::task::spawn_blocking(move || work_out(&evaluator, &start, work, time)).await;
-            worked.map_err(|error| {
-                tracing::error!(%error, "a change could not be worked out");
-                let detail = "the change could not be worked out; see the log of the service";
-                Again::Refuse(Problem::new(Code::Internal, detail))
-            })?
+            worked.map_err(|error| not_worked_out(&error))?
         } else {
-            work_out(&self.evaluator, &start, work, time)
+            // A fault of ours in one change must not end the committer. What it works on is dropped.
+            let worked = AssertUnwindSafe(|| work_out(&self.evaluator, &start, work, time));
+            std::panic::catch_unwind(worked).map_err(|_| not_worked_out(&"it panicked"))?
         };
         if records.is_empty() {
             self.check_newest(&start).await?;
@@ -408,6 +407,12 @@ fn work_out(evaluator: &Evaluator, start: &State, work: Vec<Work>, time: Timesta
         }
     }
     (records, tried)
+}
+
+fn not_worked_out(error: &dyn std::fmt::Display) -> Again {
+    tracing::error!(%error, "a change could not be worked out");
+    let detail = "the change could not be worked out; see the log of the service";
+    Again::Refuse(Problem::new(Code::Internal, detail))
 }
 
 enum Again {

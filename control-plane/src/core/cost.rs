@@ -5,18 +5,23 @@
 //!                                         ├─▶ steps × values ─▶ of one place, of all places of a commit: at most so many
 //! configuration ─▶ values in it ──────────┘
 //! ```
+//!
+//! What a text takes that is matched against a pattern is counted while it is done, in [`super::pattern`].
 
 use std::collections::HashMap;
 
 use blaze_domain::config::MAX_DEPTH;
 use serde_json::{Map, Value};
 
+use super::pattern::{self, Pattern, steps_of_states};
 use super::schema::{ONE, find_anchors, own_dialect, resolve};
 
 /// Subschemas that may be looked at on the way to one leaf of a configuration. References that meet again multiply it.
 const MAX_STEPS: u64 = 10_000;
 /// How many of them may lie within each other: each takes a part of the stack.
 const MAX_NESTING: usize = 512;
+/// How many of them may lie within each other for one value: choices within choices are looked at again and again.
+const MAX_IN_PLACE: usize = 64;
 /// Subschemas that `uniqueItems` counts as: it looks at all that a list holds.
 const UNIQUE_STEPS: u64 = 50;
 /// Names, or values to choose from, of one keyword that take as long as one subschema.
@@ -31,8 +36,8 @@ pub(super) const MAX_WORK_OF_COMMIT: u64 = 100_000_000;
 pub(super) const MAX_WORK_OF_FAULTS: u64 = 50_000;
 /// The same beside secrets, of which some faults do not count; beyond it the first one alone is looked for.
 pub(super) const MAX_WORK_OF_ALL_FAULTS: u64 = 1_000_000;
-/// Patterns in one schema: each is compiled, which takes up to a megabyte and its time.
-const MAX_PATTERNS: usize = 200;
+/// Steps in the time that it takes to compile a byte of a schema, or of its patterns: 150 ns were measured.
+const STEPS_PER_BYTE: u64 = 3;
 /// Keywords with names, or with values to choose from, that are gone through one after the other.
 const NAMES: &[&str] = &[
     "dependencies",
@@ -44,21 +49,30 @@ const NAMES: &[&str] = &[
 ];
 
 /// What checking one leaf of a configuration comes to, at most.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 struct Effort {
     steps: u64,
     nesting: usize,
+    /// Of `nesting`, what is for the same value.
+    in_place: usize,
+    /// States of the patterns that each byte of a name is matched against.
+    states: u64,
 }
 
 impl Effort {
-    const NONE: Self = Self { steps: 0, nesting: 0 };
-    const ONE: Self = Self { steps: 1, nesting: 1 };
+    const ONE: Self = Self {
+        steps: 1,
+        nesting: 1,
+        in_place: 1,
+        states: 0,
+    };
 
     /// Both are looked at.
     fn and(self, other: Self) -> Self {
         Self {
             steps: self.steps.saturating_add(other.steps),
-            nesting: self.nesting.max(other.nesting),
+            states: self.states.saturating_add(other.states),
+            ..self.or(other)
         }
     }
 
@@ -67,63 +81,114 @@ impl Effort {
         Self {
             steps: self.steps.max(other.steps),
             nesting: self.nesting.max(other.nesting),
+            in_place: self.in_place.max(other.in_place),
+            states: self.states.max(other.states),
         }
     }
 }
 
-/// How many patterns a schema has, or what looks like one.
-fn patterns(schema: &Value) -> usize {
-    match schema {
-        Value::Object(members) => members
-            .iter()
-            .map(|(name, value)| match (name.as_str(), value) {
-                ("pattern", Value::String(_)) => 1,
-                ("patternProperties", Value::Object(named)) => named.len() + patterns(value),
-                _ => patterns(value),
-            })
-            .sum(),
-        Value::Array(list) => list.iter().map(patterns).sum(),
-        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => 0,
+/// What a schema takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Cost {
+    /// Steps for each value of a configuration, at most.
+    steps: u64,
+    /// States of patterns for each byte of a name in it, at most.
+    states: u64,
+    /// Steps to compile it.
+    pub(super) compiling: u64,
+    /// Patterns in it.
+    pub(super) patterns: usize,
+}
+
+impl Cost {
+    /// Steps that a check of so much takes, at most.
+    pub(super) fn work(&self, size: &Size) -> u64 {
+        let names = steps_of_states(size.names.saturating_mul(self.states));
+        size.values.saturating_mul(self.steps).saturating_add(names)
+    }
+
+    /// What makes a check of so much costly.
+    pub(super) fn why(&self, size: &Size) -> String {
+        let Size { values, names } = size;
+        let mut out = format!(
+            "{values} values, for each of which the schema takes up to {} steps",
+            self.steps
+        );
+        if self.states > 0 {
+            out.push_str(&format!(
+                ", and names of {names} bytes, each matched by patterns of up to {} states",
+                self.states
+            ));
+        }
+        out
     }
 }
 
-/// The steps that a schema takes for each value of a configuration, at most. Refuses one that could take for ever, or the
-/// whole stack, although it is small.
-pub(super) fn steps(schema: &Value) -> Result<u64, String> {
-    let patterns = patterns(schema);
-    if patterns > MAX_PATTERNS {
-        return Err(format!("it has {patterns} patterns; {MAX_PATTERNS} are allowed"));
+/// How large a configuration is to who checks it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Size {
+    /// Values; a long text counts as several.
+    pub(super) values: u64,
+    /// Bytes of the names of members.
+    names: u64,
+}
+
+impl Size {
+    pub(super) fn of(config: &Value) -> Self {
+        let mut size = Self::default();
+        size.add(config);
+        size
     }
+
+    fn add(&mut self, value: &Value) {
+        let text = |text: &str| u64::try_from(text.len() / BYTES_PER_VALUE).unwrap_or(u64::MAX);
+        self.values += 1;
+        match value {
+            Value::Null | Value::Bool(_) | Value::Number(_) => {}
+            Value::String(found) => self.values += text(found),
+            Value::Array(items) => items.iter().for_each(|item| self.add(item)),
+            Value::Object(members) => {
+                for (name, member) in members {
+                    self.values += text(name);
+                    self.names += u64::try_from(name.len()).unwrap_or(u64::MAX);
+                    self.add(member);
+                }
+            }
+        }
+    }
+}
+
+/// What a schema takes. Refuses one that could take for ever, or the whole stack, although it is small.
+pub(super) fn of_schema(schema: &Value, text: &str) -> Result<Cost, String> {
+    let patterns = pattern::sizes(schema)?;
     let mut anchors = HashMap::new();
     find_anchors(schema, true, &mut anchors)?;
     let mut estimate = Estimate {
         root: schema,
         anchors,
+        patterns: &patterns,
         known: HashMap::new(),
     };
-    estimate.effort(schema, MAX_DEPTH, 1).map(|effort| effort.steps)
+    let effort = estimate.effort(schema, MAX_DEPTH, 1)?;
+    let compiled: usize = patterns.values().map(|pattern| pattern.bytes).sum();
+    let bytes = u64::try_from(text.len() + compiled).unwrap_or(u64::MAX);
+    Ok(Cost {
+        steps: effort.steps,
+        states: effort.states,
+        compiling: bytes.saturating_mul(STEPS_PER_BYTE),
+        patterns: patterns.len(),
+    })
 }
 
-/// Values of a configuration; a long text counts as several.
-pub(super) fn values(config: &Value) -> u64 {
-    let text = |text: &str| u64::try_from(text.len() / BYTES_PER_VALUE).unwrap_or(u64::MAX);
-    let within = match config {
-        Value::Null | Value::Bool(_) | Value::Number(_) => 0,
-        Value::String(found) => text(found),
-        Value::Array(items) => items.iter().map(values).sum(),
-        Value::Object(members) => members.iter().map(|(name, value)| text(name) + values(value)).sum(),
-    };
-    1 + within
-}
-
-struct Estimate<'s> {
+struct Estimate<'s, 'e> {
     root: &'s Value,
     anchors: HashMap<&'s str, &'s Value>,
+    patterns: &'e HashMap<&'s str, Pattern>,
     /// By subschema, and how many levels of the configuration may still come; nothing while it is being worked out.
     known: HashMap<(*const Value, usize), Option<Effort>>,
 }
 
-impl<'s> Estimate<'s> {
+impl<'s> Estimate<'s, '_> {
     fn effort(&mut self, schema: &'s Value, levels: usize, nesting: usize) -> Result<Effort, String> {
         let members = match schema {
             Value::Object(members) => members,
@@ -145,8 +210,11 @@ impl<'s> Estimate<'s> {
         self.known.insert(id, None);
         let mut here = self.here(members, levels, nesting)?;
         let below = match levels {
-            0 => Effort::NONE,
-            _ => self.below(members, levels - 1, nesting)?,
+            0 => Effort::default(),
+            _ => Effort {
+                in_place: 0,
+                ..self.below(members, levels - 1, nesting)?
+            },
         };
         if members.contains_key("unevaluatedProperties") || members.contains_key("unevaluatedItems") {
             // To know what is left over, everything is looked at once more.
@@ -156,8 +224,10 @@ impl<'s> Estimate<'s> {
         let effort = Effort {
             steps: within.steps.saturating_add(own_steps(members)),
             nesting: within.nesting + 1,
+            in_place: within.in_place + 1,
+            states: within.states,
         };
-        if effort.steps > MAX_STEPS || effort.nesting > MAX_NESTING {
+        if effort.steps > MAX_STEPS || effort.nesting > MAX_NESTING || effort.in_place > MAX_IN_PLACE {
             return Err(too_much());
         }
         self.known.insert(id, Some(effort));
@@ -166,7 +236,7 @@ impl<'s> Estimate<'s> {
 
     /// What is looked at for the same value.
     fn here(&mut self, members: &'s Map<String, Value>, levels: usize, nesting: usize) -> Result<Effort, String> {
-        let mut here = Effort::NONE;
+        let mut here = Effort::default();
         for (name, value) in members {
             let more = match (name.as_str(), value) {
                 ("$ref" | "$dynamicRef", Value::String(reference)) => self.referred(reference, levels, nesting)?,
@@ -178,7 +248,7 @@ impl<'s> Estimate<'s> {
                     let schemas = named.values().filter(|value| !value.is_array());
                     self.all(schemas, levels, nesting)?
                 }
-                _ => Effort::NONE,
+                _ => Effort::default(),
             };
             here = here.and(more);
         }
@@ -187,18 +257,26 @@ impl<'s> Estimate<'s> {
 
     /// What is looked at for the members and items of the value, of which so many levels may still come.
     fn below(&mut self, members: &'s Map<String, Value>, levels: usize, nesting: usize) -> Result<Effort, String> {
-        let mut below = Effort::NONE;
+        let mut below = Effort::default();
         for (name, value) in members {
             let more = match (name.as_str(), value) {
                 // A member has one name, and an item one place.
                 ("properties", Value::Object(named)) => self.any(named.values(), levels, nesting)?,
                 ("prefixItems", Value::Array(list)) => self.any(list.iter(), levels, nesting)?,
-                ("patternProperties", Value::Object(named)) => self.all(named.values(), levels, nesting)?,
-                ("not" | "if" | "then" | "else", _) => Effort::NONE,
+                ("patternProperties", Value::Object(named)) => {
+                    let sizes = named.keys().filter_map(|name| self.patterns.get(name.as_str()));
+                    let states = sizes.map(|pattern| pattern.states).sum();
+                    let within = self.all(named.values(), levels, nesting)?;
+                    within.and(Effort {
+                        states,
+                        ..Effort::default()
+                    })
+                }
+                ("not" | "if" | "then" | "else", _) => Effort::default(),
                 (name, value) if ONE.contains(&name) || name == "additionalItems" => {
                     self.effort(value, levels, nesting + 1)?
                 }
-                _ => Effort::NONE,
+                _ => Effort::default(),
             };
             below = below.and(more);
         }
@@ -211,7 +289,7 @@ impl<'s> Estimate<'s> {
         levels: usize,
         nesting: usize,
     ) -> Result<Effort, String> {
-        schemas.try_fold(Effort::NONE, |sum, one| {
+        schemas.try_fold(Effort::default(), |sum, one| {
             Ok(sum.and(self.effort(one, levels, nesting + 1)?))
         })
     }
@@ -222,7 +300,7 @@ impl<'s> Estimate<'s> {
         levels: usize,
         nesting: usize,
     ) -> Result<Effort, String> {
-        schemas.try_fold(Effort::NONE, |most, one| {
+        schemas.try_fold(Effort::default(), |most, one| {
             Ok(most.or(self.effort(one, levels, nesting + 1)?))
         })
     }
@@ -261,7 +339,7 @@ fn own_steps(members: &Map<String, Value>) -> u64 {
 fn too_much() -> String {
     format!(
         "its references meet again and again: more than {MAX_STEPS} subschemas for one value, or {MAX_NESTING} within \
-         each other"
+         each other, or {MAX_IN_PLACE} for the same value"
     )
 }
 
@@ -271,10 +349,15 @@ mod tests {
 
     use super::*;
 
+    fn steps(schema: &Value) -> Result<u64, String> {
+        of_schema(schema, "").map(|cost| cost.steps)
+    }
+
     #[test]
     fn a_configuration_counts_by_its_values_and_long_texts() {
-        assert_eq!(values(&json!({ "a": 1, "b": [true, null, { "c": "text" }] })), 7);
-        assert_eq!(values(&json!("x".repeat(1000))), 11);
+        let size = Size::of(&json!({ "a": 1, "b": [true, null, { "name": "text" }] }));
+        assert_eq!(size, Size { values: 7, names: 6 });
+        assert_eq!(Size::of(&json!("x".repeat(1000))).values, 11);
     }
 
     #[test]
@@ -282,6 +365,30 @@ mod tests {
         let names: Vec<String> = (0..200).map(|number| format!("n{number}")).collect();
         assert_eq!(steps(&json!({ "enum": names })), Ok(21));
         assert_eq!(steps(&json!({ "type": "object", "required": ["a"] })), Ok(1));
+    }
+
+    #[test]
+    fn names_that_are_matched_count_by_their_bytes() {
+        let of = |schema: Value| of_schema(&schema, "").unwrap();
+        let one = of(json!({ "patternProperties": { "^[a-z]{1,40}$": true } }));
+        let two = of(json!({ "patternProperties": { "^[a-z]{1,40}$": true, "^[0-9]{1,40}$": true } }));
+        assert!(one.states >= 40, "{one:?}");
+        assert!(two.states >= 80, "{two:?}");
+        let size = |names| Size { values: 1, names };
+        assert_eq!(one.work(&size(0)), one.steps);
+        assert!(one.work(&size(100_000)) > 400_000);
+        assert_eq!(of(json!({ "pattern": "^[a-z]{1,40}$" })).states, 0);
+    }
+
+    #[test]
+    fn choices_lie_within_each_other_so_deep_only() {
+        let nested =
+            |depth: usize| (0..depth).fold(json!({ "type": "object" }), |inner, _| json!({ "anyOf": [inner] }));
+        assert!(steps(&nested(MAX_IN_PLACE - 1)).is_ok());
+        let error = steps(&nested(MAX_IN_PLACE)).unwrap_err();
+        assert!(error.contains("for the same value"), "{error}");
+        // Each level of a configuration may have as many.
+        assert!(steps(&json!({ "properties": { "a": nested(MAX_IN_PLACE - 2) }, "anyOf": [nested(10)] })).is_ok());
     }
 
     #[test]

@@ -24,8 +24,9 @@ const FEW: usize = 8;
 type Mark = (String, u64);
 
 /// What is known of a list with edited items.
-pub(super) struct Edited<'c> {
-    current: &'c [Value],
+pub(super) struct Edited {
+    /// Marks of the secrets of each item.
+    marks: Vec<Vec<Mark>>,
     /// Items that went away or were edited.
     left: HashSet<usize>,
     /// Items by the marks of their secrets.
@@ -38,12 +39,12 @@ pub(super) struct Edited<'c> {
     is_complete: bool,
 }
 
-impl<'c> Edited<'c> {
+impl Edited {
     /// Of a list as it is now with indices of items that are not written as they were, and of what is written instead.
-    pub(super) fn new(current: &'c [Value], left: HashSet<usize>, changed: &[&Value], is_in_place: bool) -> Self {
+    pub(super) fn new(current: &[Value], left: HashSet<usize>, changed: &[&Value], is_in_place: bool) -> Self {
         let keeping = changed.iter().filter(|item| !kept(item).is_empty()).count();
         let mut out = Self {
-            current,
+            marks: Vec::new(),
             marked: HashMap::new(),
             members: HashMap::new(),
             is_in_place,
@@ -55,13 +56,15 @@ impl<'c> Edited<'c> {
         }
         let mut secret_left = 0;
         for (index, item) in current.iter().enumerate() {
-            let mut marks = stored(item);
-            marks.dedup();
+            let marks = stored(item);
             let is_left = out.left.contains(&index);
             secret_left += usize::from(is_left && !marks.is_empty());
-            for mark in marks {
+            let mut distinct = marks.clone();
+            distinct.dedup();
+            for mark in distinct {
                 out.marked.entry(mark).or_default().push(index);
             }
+            out.marks.push(marks);
             if is_left {
                 for member in members(item) {
                     out.members.entry(member).or_default().push(index);
@@ -84,11 +87,7 @@ impl<'c> Edited<'c> {
             .iter()
             .map(|mark| self.marked.get(mark).map_or(&[][..], Vec::as_slice));
         let rarest = rarest.min_by_key(|found| found.len()).unwrap_or_default();
-        let is_match = |place: usize| {
-            self.current
-                .get(place)
-                .is_some_and(|item| covers(&stored(item), &wanted))
-        };
+        let is_match = |place: usize| self.marks.get(place).is_some_and(|marks| covers(marks, &wanted));
         if rarest.len() <= FEW {
             let all: Vec<usize> = rarest.iter().copied().filter(|place| is_match(*place)).collect();
             let left: Vec<usize> = all.iter().copied().filter(|place| self.left.contains(place)).collect();

@@ -16,6 +16,7 @@ mod effective;
 mod evaluate;
 mod log;
 mod page;
+mod pattern;
 mod placement;
 mod refs;
 mod report;

@@ -1,8 +1,10 @@
 //! The use cases, as REST and gRPC call them. Every right is checked here, whoever asks.
 
+mod history;
 mod read;
 mod tasks;
 mod token;
+mod topology;
 mod write;
 
 use std::net::IpAddr;
@@ -32,7 +34,7 @@ use crate::auth::{Authenticator, Claims, Revocations, Right, dev};
 use crate::secrets::Keyring;
 use crate::store::{AuditEntry, Store, StoreError};
 
-pub use read::DiffReport;
+pub use history::DiffReport;
 
 /// Refusals that wait to be written to the audit, at most.
 const DENIED_QUEUE: usize = 1024;

@@ -2,10 +2,9 @@
 
 use std::sync::Arc;
 
-use blaze_domain::config::diff::{Delta, document_diff};
-use blaze_domain::config::{Code, Document, Key, Kind, Problem, canonical};
-use blaze_domain::{DocumentName, LayerName, NodeName, ServiceName};
-use serde_json::{Value, json};
+use blaze_domain::config::{Code, Document, Key, Kind, Problem};
+use blaze_domain::{DocumentName, LayerName};
+use serde_json::Value;
 
 use super::super::committer::unavailable;
 use super::super::effective::{At, Sources};
@@ -13,35 +12,20 @@ use super::super::page::Position;
 use super::super::placement::{Placement, placement};
 use super::super::report;
 use super::super::secrets;
-use super::super::state::{Held, State, redacted};
-use super::super::types::{Answer, Caller, Effective, HistoryEntry, ListQuery, Page, Place, ReadOptions, WatchQuery};
-use super::super::view::{View, may_reveal, view};
+use super::super::state::{State, redacted};
+use super::super::types::{Answer, Caller, Effective, ListQuery, Page, Place, ReadOptions, WatchQuery};
+use super::super::view::{may_reveal, view};
 use super::super::watch::{Filter, WatchStream, is_in_layer, trimmed};
 use super::{ConfigService, WAIT_FOR_REVISION, not_found, selector};
 use crate::auth::Right;
-use crate::store::{Op, Version};
 
 /// Entries of a page unless it is said.
 const PAGE: u32 = 100;
 /// The same, at most.
 const MAX_PAGE: u32 = 1000;
 /// A page ends with the document that makes it this large, in bytes of JSON: then it fits into a message of gRPC.
-const PAGE_BYTES: usize = 8 * 1024 * 1024;
-/// Versions that are taken from the store at once: each may be a whole document.
-const VERSIONS_AT_ONCE: usize = 32;
-
-/// What changed between two revisions of a document.
-#[derive(Debug, Clone, PartialEq)]
-pub struct DiffReport {
-    /// From this revision.
-    pub from: u64,
-    /// To this one.
-    pub to: u64,
-    /// Secrets redacted.
-    pub changes: Vec<Delta>,
-}
-
-fn answer<T>(state: &State, value: T) -> Answer<T> {
+pub(super) const PAGE_BYTES: usize = 8 * 1024 * 1024;
+pub(super) fn answer<T>(state: &State, value: T) -> Answer<T> {
     Answer {
         revision: state.revision(),
         replayed: false,
@@ -49,7 +33,7 @@ fn answer<T>(state: &State, value: T) -> Answer<T> {
     }
 }
 
-fn page_size(limit: Option<u32>) -> Result<usize, Problem> {
+pub(super) fn page_size(limit: Option<u32>) -> Result<usize, Problem> {
     match limit.unwrap_or(PAGE) {
         limit @ 1..=MAX_PAGE => Ok(limit as usize),
         other => Err(Problem::new(
@@ -117,7 +101,7 @@ impl ConfigService {
 
     /// Refuses a revision below the floor, as the store has it now: another process may have trimmed, or this one is
     /// about it. What was read of the past before is whole if this succeeds.
-    async fn check_floor(&self, now: &State, revision: u64) -> Result<(), Problem> {
+    pub(super) async fn check_floor(&self, now: &State, revision: u64) -> Result<(), Problem> {
         let batch = self.inner.store.commits_after(revision, 1).await;
         let floor = batch.map_err(|error| unavailable(&error))?.floor;
         self.inner.log.raise_floor(floor);
@@ -175,50 +159,6 @@ impl ConfigService {
             false => Arc::clone(&held.shown),
         };
         Ok(answer(&state, document))
-    }
-
-    /// The same, refused where what it held then is outside of the token's view.
-    pub(super) async fn seen_version(
-        &self,
-        caller: &Caller,
-        state: &State,
-        key: &Key,
-        revision: u64,
-    ) -> Result<Version, Problem> {
-        let version = self.version_at(state, key, revision).await?;
-        let view = view(&caller.claims);
-        match view.sees_document(state, &version.change.document) {
-            true => Ok(version),
-            false => Err(view.outside(&format!("{key} at revision {revision}"))),
-        }
-    }
-
-    /// The version of a document that held at a revision.
-    pub(super) async fn version_at(&self, state: &State, key: &Key, revision: u64) -> Result<Version, Problem> {
-        if revision > state.revision() {
-            let detail = format!("the store is at revision {}", state.revision());
-            return Err(Problem::new(Code::RevisionUnknown, detail).at(state.revision()));
-        }
-        let found = self
-            .inner
-            .store
-            .versions(key, Some(revision.saturating_add(1)), 1)
-            .await;
-        let found = found.map_err(|error| unavailable(&error))?.into_iter().next();
-        match found {
-            Some(version) if version.change.op != Op::Delete => Ok(version),
-            Some(_) => Err(Problem::new(
-                Code::NotFound,
-                format!("{key} did not exist at revision {revision}"),
-            )),
-            None => {
-                self.check_floor(state, revision).await?;
-                Err(Problem::new(
-                    Code::NotFound,
-                    format!("{key} did not exist at revision {revision}"),
-                ))
-            }
-        }
     }
 
     /// Documents by name, bytewise; all pages show the state of the first one.
@@ -414,132 +354,6 @@ impl ConfigService {
         Ok(at)
     }
 
-    /// What was done to a document, newest first, also after its deletion.
-    ///
-    /// # Errors
-    /// [`Problem`].
-    pub async fn history(
-        &self,
-        caller: &Caller,
-        key: &Key,
-        limit: Option<u32>,
-        page_token: &str,
-        full: bool,
-        read: &ReadOptions,
-    ) -> Result<Answer<Page<HistoryEntry>>, Problem> {
-        self.authorize(&caller.claims, Right::Read)?;
-        let limit = page_size(limit)?;
-        let bound = format!("history {key} {full} {:?}", caller.claims.layer);
-        let position = match page_token {
-            "" => None,
-            token => Some(self.inner.pages.position(&bound, token)?),
-        };
-        let state = self.read_state(read).await?;
-        view(&caller.claims).check_key(&state, key)?;
-        let below = position.as_ref().and_then(|position| position.after.parse().ok());
-        let shown_at = position.map_or(state.revision(), |position| position.revision);
-        let below = below.unwrap_or(shown_at.saturating_add(1));
-        let own = view(&caller.claims);
-        let is_seen = |document: &Document| own.sees_document(&state, document);
-        let (versions, more) = self.versions_below(key, below, limit, full, is_seen).await?;
-        if versions.is_empty() && page_token.is_empty() && state.get(key).is_none() {
-            return Err(not_found(key, &state));
-        }
-        let next = versions.last().filter(|_| more).map(|version| Position {
-            revision: shown_at,
-            after: version.revision.to_string(),
-        });
-        let items = versions.into_iter().map(|version| HistoryEntry {
-            revision: version.revision,
-            op: version.change.op,
-            time: version.time,
-            subject: version.subject,
-            request_id: version.request_id,
-            paths: version.change.paths,
-            document: (full && version.change.op != Op::Delete).then(|| redacted(&version.change.document)),
-        });
-        let page = Page {
-            items: items.collect(),
-            next_page_token: next
-                .map(|position| self.inner.pages.token(&bound, &position))
-                .unwrap_or_default(),
-        };
-        Ok(answer(&state, page))
-    }
-
-    /// Versions of a document before a revision, newest first, and whether there are more: up to `limit`, and with the
-    /// documents (`full`) a page's bytes of them. Without `full` a version comes without what its document holds. What is
-    /// not seen is passed over, as if it had not been.
-    async fn versions_below(
-        &self,
-        key: &Key,
-        mut below: u64,
-        limit: usize,
-        full: bool,
-        is_seen: impl Fn(&Document) -> bool,
-    ) -> Result<(Vec<Version>, bool), Problem> {
-        let mut found: Vec<Version> = Vec::new();
-        let mut bytes = 0;
-        loop {
-            let some = self.inner.store.versions(key, Some(below), VERSIONS_AT_ONCE).await;
-            let some = some.map_err(|error| unavailable(&error))?;
-            let all = some.len() < VERSIONS_AT_ONCE;
-            for mut version in some {
-                if !is_seen(&version.change.document) {
-                    below = version.revision;
-                    continue;
-                }
-                if found.len() == limit || bytes >= PAGE_BYTES {
-                    return Ok((found, true));
-                }
-                below = version.revision;
-                match full {
-                    true => bytes += Held::new(Arc::clone(&version.change.document)).bytes,
-                    false => Arc::make_mut(&mut version.change.document).spec = Arc::default(),
-                }
-                found.push(version);
-            }
-            if all {
-                return Ok((found, false));
-            }
-        }
-    }
-
-    /// What changed in a document between two revisions; it counts as empty where it did not exist.
-    ///
-    /// # Errors
-    /// [`Problem`].
-    pub async fn diff(
-        &self,
-        caller: &Caller,
-        key: &Key,
-        from: u64,
-        to: Option<u64>,
-        read: &ReadOptions,
-    ) -> Result<Answer<DiffReport>, Problem> {
-        self.authorize(&caller.claims, Right::Read)?;
-        let state = self.read_state(read).await?;
-        view(&caller.claims).check_key(&state, key)?;
-        let to = to.unwrap_or_else(|| state.revision());
-        let side = async |revision: u64| match self.seen_version(caller, &state, key, revision).await {
-            Ok(version) => Ok(Some(redacted(&version.change.document))),
-            Err(problem) if problem.code == Code::NotFound => Ok(None),
-            Err(problem) => Err(problem),
-        };
-        let (old, new) = (side(from).await?, side(to).await?);
-        if old.is_none() && new.is_none() {
-            return Err(match state.get(key) {
-                Some(_) => Problem::new(
-                    Code::NotFound,
-                    format!("{key} existed neither at revision {from} nor at {to}"),
-                ),
-                None => not_found(key, &state),
-            });
-        }
-        let changes = document_diff(old.as_deref(), new.as_deref());
-        Ok(answer(&state, DiffReport { from, to, changes }))
-    }
-
     /// Changes from a revision on.
     ///
     /// # Errors
@@ -582,61 +396,6 @@ impl ConfigService {
         let stream = self.inner.watches.open(caller, filter, since, query.timeout_s);
         Ok(answer(&state, stream))
     }
-
-    /// Layers, nodes and services, with what is known of them.
-    ///
-    /// # Errors
-    /// [`Problem`].
-    pub async fn topology(&self, caller: &Caller, read: &ReadOptions) -> Result<Answer<Value>, Problem> {
-        self.authorize(&caller.claims, Right::Read)?;
-        let state = self.read_state(read).await?;
-        let view = view(&caller.claims);
-        let layers = state
-            .of_kind(Kind::Layer, None)
-            .filter(|(_, held)| view.sees_document(&state, &held.document))
-            .map(|(key, held)| {
-                let layer = LayerName::from(key.name());
-                let nodes = state.in_layer(&layer).filter(|key| key.kind() == Kind::Node);
-                json!({
-                    "name": layer.as_str(),
-                    "kind": held.document.spec_member("kind"),
-                    "nodes": nodes.map(|key| node_json(&state, &view, key)).collect::<Vec<_>>(),
-                })
-            });
-        let layers: Vec<Value> = layers.collect();
-        let value = json!({ "revision": state.revision(), "layers": layers, "links": [] });
-        Ok(answer(&state, value))
-    }
-
-    /// Workers that are known.
-    ///
-    /// # Errors
-    /// [`Problem`].
-    pub async fn workers(&self, caller: &Caller, read: &ReadOptions) -> Result<Answer<Value>, Problem> {
-        self.authorize(&caller.claims, Right::Read)?;
-        let state = self.read_state(read).await?;
-        let value = json!({ "items": [], "revision": state.revision(), "next_page_token": "" });
-        Ok(answer(&state, value))
-    }
-
-    /// What a layer's worker should hold.
-    ///
-    /// # Errors
-    /// [`Problem`].
-    pub async fn digest(
-        &self,
-        caller: &Caller,
-        layer: &LayerName,
-        read: &ReadOptions,
-    ) -> Result<Answer<Value>, Problem> {
-        self.authorize(&caller.claims, Right::Read)?;
-        let state = self.read_state(read).await?;
-        view(&caller.claims).check_layer(layer)?;
-        let key = Key::layer(layer);
-        state.get(&key).ok_or_else(|| not_found(&key, &state))?;
-        let value = json!({ "revision": state.revision(), "digest": digest(&state, layer) });
-        Ok(answer(&state, value))
-    }
 }
 
 /// To a token that is bound to a layer, an instance with a document elsewhere is what one without a document is, for the one
@@ -654,40 +413,6 @@ fn without_foreign_instance(caller: &Caller, mut state: State, asked: &Place) ->
         }
     }
     Ok(state)
-}
-
-/// Digest of a layer's view.
-pub(crate) fn digest(state: &State, layer: &LayerName) -> String {
-    let seen = state
-        .all()
-        .filter(|(_, held)| placement(state, &held.document).visible.contains(layer));
-    canonical::digest(seen.map(|(key, held)| {
-        let service = key.service_name().map(ServiceName::as_str);
-        (key.kind(), service, key.name().as_str(), held.document.revision)
-    }))
-}
-
-fn node_json(state: &State, view: &View, key: &Key) -> Value {
-    let node = NodeName::from(key.name());
-    let kind = state
-        .get(key)
-        .and_then(|held| held.document.spec_member("type").cloned());
-    let seen = |key: &&Key| {
-        let held = state.get(key);
-        held.is_some_and(|held| view.sees_document(state, &held.document))
-    };
-    let services = state.on_node(&node).filter(seen).map(|key| {
-        json!({
-            "service": key.service_name().map(ServiceName::as_str), "instance": key.name().as_str(),
-            "state": null, "config_revision": null,
-        })
-    });
-    json!({
-        "name": node.as_str(),
-        "type": kind.unwrap_or_else(|| "static".into()),
-        "worker": { "connected": null, "revision": null, "in_sync": null, "last_seen": null },
-        "services": services.collect::<Vec<_>>(),
-    })
 }
 
 /// Everything that the next page's request must repeat.

@@ -249,3 +249,82 @@ async fn a_roll_out_is_not_tried_on_more_nodes_than_its_status_can_tell_of() {
     assert_eq!(refused.code, Code::ValidationFailed);
     assert!(refused.errors[0].detail.contains("more than 1000 nodes"), "{refused:?}");
 }
+
+#[tokio::test]
+async fn a_roll_out_counts_on_its_canaries_until_it_is_promoted() {
+    let w = world().await;
+    w.robot().await;
+    let mut second = input("Node/robot-2", json!({ "layer": "edge" }));
+    second.labels.insert("canary".to_owned(), "true".to_owned());
+    w.service.create(&w.admin, second, None).await.unwrap();
+    let spec = json!({
+        "target": { "kind": "Service", "name": "slam" },
+        "patch": { "config": { "camera": { "rate_hz": 5 } } },
+        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+    });
+    let started = w
+        .service
+        .create(&w.admin, input("Rollout/slower", spec.clone()), None)
+        .await
+        .unwrap()
+        .value;
+    assert_eq!(started.document.status.as_ref().unwrap()["phase"], "canary");
+    let on = |node: &str| Place {
+        service: Some("slam".parse().unwrap()),
+        node: Some(node.parse().unwrap()),
+        ..Place::default()
+    };
+    assert_eq!(w.effective(on("robot-2")).await.config["camera"]["rate_hz"], 5);
+    assert_eq!(w.effective(on("robot-2")).await.rollout.as_deref(), Some("slower"));
+    assert_eq!(w.effective(on("robot-1")).await.config["camera"]["rate_hz"], 30);
+    assert_eq!(
+        code(w.service.create(&w.admin, input("Rollout/other", spec), None).await),
+        Code::RolloutActive
+    );
+    let name = "slower".parse().unwrap();
+    w.service.promote_rollout(&w.admin, &name, None).await.unwrap();
+    assert_eq!(w.effective(on("robot-1")).await.config["camera"]["rate_hz"], 5);
+    assert_eq!(
+        code(w.service.abort_rollout(&w.admin, &name, "late", None).await),
+        Code::RolloutState
+    );
+}
+
+#[tokio::test]
+async fn a_change_is_tried_only_where_its_target_counts() {
+    let w = world().await;
+    w.robot().await;
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    for (name, layer) in [("robot-2", "edge"), ("server", "fog")] {
+        let mut node = input(&format!("Node/{name}"), json!({ "layer": layer }));
+        node.labels.insert("canary".to_owned(), "true".to_owned());
+        w.service.create(&w.admin, node, None).await.unwrap();
+    }
+    w.put("Service/inner", json!({ "layers": ["fog"] })).await;
+    let spec = |kind: &str, name: &str| {
+        json!({
+            "target": { "kind": kind, "name": name }, "patch": { "config": { "a": 5 } },
+            "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 },
+        })
+    };
+    for (kind, name, expected) in [
+        ("Service", "slam", &["robot-2", "server"][..]),
+        ("Service", "inner", &["server"]),
+        ("Layer", "edge", &["robot-2"]),
+        ("Node", "server", &["server"]),
+    ] {
+        let rollout = input(&format!("Rollout/to-{name}"), spec(kind, name));
+        let started = w.service.create(&w.admin, rollout, None).await.unwrap().value;
+        let canaries = started.document.status.as_ref().unwrap()["canaries"]
+            .as_array()
+            .unwrap()
+            .clone();
+        let names: Vec<&str> = canaries.iter().map(|canary| canary["node"].as_str().unwrap()).collect();
+        assert_eq!(names, expected, "{kind} {name}");
+    }
+    let nowhere = input("Rollout/nowhere", spec("Node", "robot-1"));
+    assert_eq!(
+        code(w.service.create(&w.admin, nowhere, None).await),
+        Code::ValidationFailed
+    );
+}

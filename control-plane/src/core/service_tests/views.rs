@@ -173,3 +173,102 @@ async fn an_instance_elsewhere_is_as_one_that_nobody_uses() {
         assert_eq!(of(name, None).await.unwrap_err().code, Code::PermissionDenied, "{name}");
     }
 }
+
+#[tokio::test]
+async fn a_bound_token_sees_and_changes_its_own_layer_alone() {
+    let w = world().await;
+    w.robot().await;
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    w.put("Service/cloud-only", json!({ "layers": ["fog"] })).await;
+    let bound = caller(&["operator"], Some("edge"));
+    let read = ReadOptions::default();
+    for (name, seen) in [
+        ("Layer/edge", true),
+        ("Node/robot-1", true),
+        ("Service/slam", true),
+        ("Instance/slam/0", true),
+        ("Layer/fog", false),
+        ("Service/cloud-only", false),
+        ("Node/absent", false),
+    ] {
+        let result = w.service.get(&bound, &key(name), &read).await;
+        match seen {
+            true => assert!(result.is_ok(), "{name}"),
+            false => assert_eq!(code(result), Code::PermissionDenied, "{name}"),
+        }
+    }
+    let patch = async |name: &str, spec: Value| {
+        let patch = json!({ "spec": spec });
+        w.service.patch(&bound, &key(name), patch, Precondition::Any).await
+    };
+    assert_eq!(
+        code(patch("Service/slam", json!({ "description": "x" })).await),
+        Code::PermissionDenied
+    );
+    assert_eq!(
+        code(patch("Node/robot-1", json!({ "layer": "fog" })).await),
+        Code::PermissionDenied
+    );
+    assert!(patch("Node/robot-1", json!({ "type": "mobile" })).await.is_ok());
+    w.put("Node/server", json!({ "layer": "fog" })).await;
+    // Of many documents, those outside are refused before anything is told of them.
+    let apply = async |name: &str, spec: Value, revision: Option<u64>, delete: bool| {
+        let items = vec![ApplyItem {
+            input: input(name, spec),
+            revision,
+            delete,
+        }];
+        let request = ApplyRequest {
+            items,
+            ..ApplyRequest::default()
+        };
+        w.service.apply(&bound, request, None).await
+    };
+    let fog = || json!({ "layer": "fog" });
+    for outside in [
+        apply("Node/server", fog(), None, false).await,
+        apply("Node/server", fog(), Some(1), false).await,
+        apply("Node/absent", fog(), Some(1), false).await,
+        apply("Node/absent", json!({}), None, true).await,
+        apply("Service/slam", json!({}), None, false).await,
+    ] {
+        assert_eq!(code(outside), Code::PermissionDenied);
+    }
+    // What is placed nowhere counts everywhere: a roll-out on it is none of one layer's.
+    w.put("Instance/slam/anywhere", json!({})).await;
+    let rollout = json!({
+        "target": { "kind": "Instance", "service": "slam", "name": "anywhere" }, "patch": { "config": { "a": 5 } },
+        "canary": { "node_selector": "!absent" },
+    });
+    let started = w.service.create(&bound, input("Rollout/r", rollout), None).await;
+    assert_eq!(code(started), Code::PermissionDenied);
+    // Who may make tokens could make one that is bound to nothing.
+    let admin = caller(&["admin"], Some("edge"));
+    let token = TokenRequest {
+        subject: "x".to_owned(),
+        roles: vec!["admin".to_owned()],
+        layer: None,
+        expires_in_s: 60,
+    };
+    assert_eq!(
+        code(w.service.create_token(&admin, token).await),
+        Code::PermissionDenied
+    );
+    assert_eq!(code(w.service.revoke_token(&admin, "x").await), Code::PermissionDenied);
+    assert_eq!(code(w.service.tokens(&admin, &read).await), Code::PermissionDenied);
+    assert_eq!(
+        code(w.service.audit(&admin, AuditQuery::default(), "", &read).await),
+        Code::PermissionDenied
+    );
+    assert_eq!(code(w.service.trim(&admin, 1, None).await), Code::PermissionDenied);
+    assert!(
+        w.service
+            .authorize(&caller(&["viewer"], None).claims, Right::Write)
+            .is_err()
+    );
+    assert!(
+        w.service
+            .authorize(&caller(&["admin", "wizard"], None).claims, Right::Read)
+            .is_err()
+    );
+}

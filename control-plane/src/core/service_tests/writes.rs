@@ -279,3 +279,27 @@ async fn dry_runs_do_not_stop_what_is_served_beside_them() {
     assert!(!refused.is_empty());
     assert!(refused.iter().all(|problem| problem.code == Code::Overloaded));
 }
+
+#[tokio::test]
+async fn many_writers_with_preconditions_lose_nothing() {
+    let w = world().await;
+    w.put("Service/counter", json!({ "config": { "n": 0 } })).await;
+    let one = async |_: usize| {
+        let mut done = 0;
+        while done < 25 {
+            let now = w.get("Service/counter").await.unwrap();
+            let n = now.spec["config"]["n"].as_u64().unwrap();
+            let next = json!({ "config": { "n": n + 1 } });
+            match w
+                .try_put("Service/counter", next, Precondition::Revisions(vec![now.revision]))
+                .await
+            {
+                Ok(_) => done += 1,
+                Err(problem) => assert_eq!(problem.code, Code::PreconditionFailed),
+            }
+        }
+    };
+    futures::future::join_all((0..8).map(one)).await;
+    assert_eq!(w.get("Service/counter").await.unwrap().spec["config"]["n"], 200);
+    assert_eq!(w.service.revision(), 201);
+}

@@ -71,13 +71,7 @@ impl MongoStore {
     ) -> Result<Vec<(Key, Option<Config>)>, StoreError> {
         // The first change after the revision says which version was there before it.
         let (after, until) = (signed(revision), signed(until));
-        let mut first: BTreeMap<String, (i64, Option<i64>)> = BTreeMap::new();
-        for (key, changed, previous) in self.changes_between(after, until).await? {
-            let place = first.entry(key).or_insert((changed, previous));
-            if changed < place.0 {
-                *place = (changed, previous);
-            }
-        }
+        let first = self.first_changes(after, until).await?;
         let wanted: BTreeMap<&str, i64> = first
             .iter()
             .filter_map(|(key, (_, previous))| Some((key.as_str(), (*previous)?)))
@@ -101,32 +95,49 @@ impl MongoStore {
         Ok(documents)
     }
 
-    /// Key, revision and version before, of all changes in a range.
-    async fn changes_between(&self, after: i64, until: i64) -> Result<Vec<(String, i64, Option<i64>)>, StoreError> {
+    /// By key, the first change in a range: its revision and the version before it.
+    async fn first_changes(&self, after: i64, until: i64) -> Result<BTreeMap<String, (i64, Option<i64>)>, StoreError> {
+        let mut first: BTreeMap<String, (i64, Option<i64>)> = BTreeMap::new();
+        // There may be many more changes than documents, so they are not collected before.
+        let mut note = |key: &str, changed: i64, previous: Option<i64>| {
+            if changed <= after || changed > until {
+                return;
+            }
+            match first.get_mut(key) {
+                Some(known) if known.0 <= changed => {}
+                Some(known) => *known = (changed, previous),
+                None => {
+                    first.insert(key.to_owned(), (changed, previous));
+                }
+            }
+        };
         let range = doc! { "_id": { "$gt": after - RECORD_COMMITS, "$lte": until }, "last": { "$gt": after } };
         let fields = doc! { "docs.key": 1, "docs.revision": 1, "docs.previous": 1 };
         let logged = self.tables.events.find(range).projection(fields);
-        let logged = collect(logged, |found| {
-            let docs = rows::members(found, "docs");
-            docs.map(|change| {
+        collect(logged, |found| {
+            for change in rows::members(found, "docs") {
                 let change = change?;
                 let previous = rows::integer(change, "previous").ok();
-                Ok((rows::text(change, "key")?, rows::integer(change, "revision")?, previous))
-            })
-            .collect::<Result<Vec<_>, StoreError>>()
-        });
-        let mut changes: Vec<_> = logged.await?.into_iter().flatten().collect();
+                note(
+                    &rows::text(change, "key")?,
+                    rows::integer(change, "revision")?,
+                    previous,
+                );
+            }
+            Ok(())
+        })
+        .await?;
         let range = doc! { "revision": { "$gt": after, "$lte": until } };
         let fields = doc! { "_id": 1, "previous": 1 };
         let kept = self.tables.versions.find(range).projection(fields);
-        let kept = collect(kept, |found| {
+        collect(kept, |found| {
             let id = rows::text(found, "_id")?;
             let (key, revision) = rows::split_version_id(&id)?;
-            Ok((key.to_owned(), revision, rows::integer(found, "previous").ok()))
-        });
-        changes.extend(kept.await?);
-        changes.retain(|(_, revision, _)| *revision > after && *revision <= until);
-        Ok(changes)
+            note(key, revision, rows::integer(found, "previous").ok());
+            Ok(())
+        })
+        .await?;
+        Ok(first)
     }
 
     /// Texts of one version of each document: from the log, or what trimming has kept of it.

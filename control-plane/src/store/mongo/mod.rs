@@ -194,7 +194,7 @@ impl MongoStore {
 /// Reads all that a query finds.
 async fn collect<T>(
     find: impl IntoFuture<Output = mongodb::error::Result<Cursor<Document>>>,
-    read: impl Fn(&Document) -> Result<T, StoreError>,
+    read: impl FnMut(&Document) -> Result<T, StoreError>,
 ) -> Result<Vec<T>, StoreError> {
     collect_within(USUAL, find, read).await
 }
@@ -203,7 +203,7 @@ async fn collect<T>(
 async fn collect_within<T>(
     limit: Duration,
     find: impl IntoFuture<Output = mongodb::error::Result<Cursor<Document>>>,
-    read: impl Fn(&Document) -> Result<T, StoreError>,
+    mut read: impl FnMut(&Document) -> Result<T, StoreError>,
 ) -> Result<Vec<T>, StoreError> {
     limited_steps(limit, async {
         let mut cursor = find.into_future().await.map_err(store_error)?;

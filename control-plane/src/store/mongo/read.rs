@@ -152,7 +152,8 @@ impl MongoStore {
     }
 
     async fn find_records(&self, filter: Document, part: Part) -> Result<(Vec<Record>, bool), StoreError> {
-        let limit = i64::try_from(part.records).unwrap_or(i64::MAX);
+        // One more tells whether there are more, and whether the last one came too late.
+        let limit = i64::try_from(part.records.saturating_add(1)).unwrap_or(i64::MAX);
         let mut find = self.tables.events.find(filter).sort(doc! { "_id": 1 }).limit(limit);
         if !part.whole {
             find = find.projection(doc! { "audit": 0, "answers": 0 });
@@ -160,18 +161,23 @@ impl MongoStore {
         limited_steps(USUAL, async {
             let mut cursor = find.await.map_err(store_error)?;
             let mut records: Vec<Record> = Vec::new();
-            let mut bytes = 0;
+            let (mut bytes, mut count) = (0, 0);
             while let Some(found) = cursor.try_next().await.map_err(store_error)? {
                 let record = rows::read_record(&found)?;
                 bytes += record.bytes();
-                if bytes > READ_BYTES && !records.is_empty() {
-                    return Ok((records, false));
-                }
+                count += 1;
+                let is_full = records.len() >= part.records || bytes > READ_BYTES;
                 records.push(record);
+                if is_full && records.len() > 1 {
+                    drop_late(&mut records);
+                    if records.len() > 1 {
+                        records.pop();
+                        return Ok((records, false));
+                    }
+                }
             }
-            let all = records.len() < part.records;
             drop_late(&mut records);
-            Ok((records, all))
+            Ok((records, count <= part.records))
         })
         .await
     }

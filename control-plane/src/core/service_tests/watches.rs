@@ -1,0 +1,123 @@
+//! Watches: what they tell, from where on, and how they end.
+
+use super::*;
+
+/// Revision and changes of the next commit; bookmarks are passed over.
+async fn next(stream: &mut crate::core::WatchStream) -> (u64, Vec<(&'static str, String)>) {
+    let wait = async {
+        loop {
+            match stream.next().await {
+                Some(WatchItem::Commit(commit)) => {
+                    let changes = commit
+                        .changes
+                        .iter()
+                        .map(|(op, document)| (op.as_str(), document.key.to_string()));
+                    return (commit.revision, changes.collect());
+                }
+                Some(WatchItem::Bookmark(_)) => {}
+                other => panic!("the stream ended: {other:?}"),
+            }
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(10), wait)
+        .await
+        .expect("a commit within 10 s")
+}
+
+#[tokio::test]
+async fn a_watch_tells_every_commit_from_a_revision_on() {
+    let w = world().await;
+    w.robot().await;
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    let query = WatchQuery {
+        since: Some(0),
+        ..WatchQuery::default()
+    };
+    let mut stream = w.service.watch(&w.admin, &query).await.unwrap().value;
+    let (revision, changes) = next(&mut stream).await;
+    assert_eq!((revision, changes.len()), (1, 4));
+    assert_eq!(next(&mut stream).await, (2, vec![("create", "Layer/fog".to_owned())]));
+    w.service
+        .delete(&w.admin, &key("Layer/fog"), Precondition::Any, false)
+        .await
+        .unwrap();
+    assert_eq!(next(&mut stream).await, (3, vec![("delete", "Layer/fog".to_owned())]));
+}
+
+#[tokio::test]
+async fn what_leaves_a_filter_is_told_also_when_it_moves_with_its_node() {
+    let w = world().await;
+    w.robot().await;
+    w.put("Layer/fog", json!({ "kind": "fog" })).await;
+    let query = |layer: &str| WatchQuery {
+        layer: Some(layer.parse().unwrap()),
+        since: Some(2),
+        ..WatchQuery::default()
+    };
+    let mut edge = w.service.watch(&w.admin, &query("edge")).await.unwrap().value;
+    let mut fog = w.service.watch(&w.admin, &query("fog")).await.unwrap().value;
+    w.patch("Node/robot-1", json!({ "spec": { "layer": "fog" } }))
+        .await
+        .unwrap();
+    let both = |op: &'static str| vec![(op, "Node/robot-1".to_owned()), (op, "Instance/slam/0".to_owned())];
+    assert_eq!(next(&mut edge).await, (3, both("leave")));
+    assert_eq!(next(&mut fog).await, (3, both("update")));
+}
+
+#[tokio::test]
+async fn a_watch_of_what_is_trimmed_is_refused_with_where_to_begin() {
+    let w = world().await;
+    for number in 0..6 {
+        w.put(&format!("Layer/l{number}"), json!({ "kind": "fog" })).await;
+    }
+    assert_eq!(w.service.trim(&w.admin, 4, None).await.unwrap().value, 3);
+    let query = |since| WatchQuery {
+        since: Some(since),
+        ..WatchQuery::default()
+    };
+    let refused = w.service.watch(&w.admin, &query(2)).await.err().unwrap();
+    assert_eq!(
+        (refused.code, refused.oldest_revision, refused.revision),
+        (Code::RevisionTrimmed, Some(3), Some(6))
+    );
+    let mut stream = w.service.watch(&w.admin, &query(3)).await.unwrap().value;
+    assert_eq!(next(&mut stream).await.0, 4);
+}
+
+#[tokio::test]
+async fn a_watch_ends_in_time_although_there_is_more_to_tell() {
+    let w = world().await;
+    for number in 0..5 {
+        w.put(&format!("Layer/l{number}"), json!({ "kind": "fog" })).await;
+    }
+    let query = WatchQuery {
+        since: Some(0),
+        timeout_s: Some(1),
+        ..WatchQuery::default()
+    };
+    let mut stream = w.service.watch(&w.admin, &query).await.unwrap().value;
+    assert_eq!(next(&mut stream).await.0, 1);
+    tokio::time::pause();
+    tokio::time::advance(Duration::from_secs(2)).await;
+    assert!(matches!(stream.next().await, Some(WatchItem::Bookmark(1))));
+    assert!(matches!(stream.next().await, Some(WatchItem::End(None))));
+    assert!(stream.next().await.is_none());
+}
+
+#[tokio::test]
+async fn a_watch_begins_at_the_revision_that_is_waited_for() {
+    let w = world().await;
+    let read = ReadOptions {
+        cached: true,
+        min_revision: Some(2),
+        ..ReadOptions::default()
+    };
+    let query = WatchQuery::default();
+    let writes = async {
+        for name in ["Layer/a", "Layer/b"] {
+            w.put(name, json!({ "kind": "fog" })).await;
+        }
+    };
+    let (watch, ()) = tokio::join!(w.service.watch_with(&w.admin, &query, &read), writes);
+    assert_eq!(watch.unwrap().revision, 2);
+}
