@@ -36,8 +36,9 @@ pub use many::{
     readers_never_see_a_hole_while_history_is_trimmed,
 };
 pub use trimming::{
-    a_writer_that_slept_through_a_trim_is_refused, every_revision_from_the_floor_on_can_be_told,
-    the_floor_rises_and_commits_go, versions_that_hold_or_are_young_stay, what_outlives_a_commit_stays,
+    a_long_history_is_trimmed, a_writer_that_slept_through_a_trim_is_refused,
+    every_revision_from_the_floor_on_can_be_told, the_floor_rises_and_commits_go, versions_that_hold_or_are_young_stay,
+    what_outlives_a_commit_stays,
 };
 pub use upkeep::{a_backup_is_restored_elsewhere, a_closed_store_is_unavailable, documents_are_rewritten_in_place};
 
@@ -116,6 +117,7 @@ rules!(
     the_floor_rises_and_commits_go,
     versions_that_hold_or_are_young_stay,
     what_outlives_a_commit_stays,
+    a_long_history_is_trimmed,
     every_revision_from_the_floor_on_can_be_told,
     a_writer_that_slept_through_a_trim_is_refused,
     a_store_that_is_reopened_is_the_same,

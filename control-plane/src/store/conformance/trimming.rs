@@ -99,6 +99,42 @@ pub async fn versions_that_hold_or_are_young_stay(fixture: &dyn Fixture) -> Outc
     Ok(())
 }
 
+/// However long a history is, what is to spare of it goes, and nothing else.
+///
+/// # Errors
+/// How the store breaks the rule.
+pub async fn a_long_history_is_trimmed(fixture: &dyn Fixture) -> Outcome {
+    // More than a store goes through at once.
+    const GROUPS: u64 = 210;
+    const GROUP: usize = 100;
+    let newest = GROUPS * GROUP as u64;
+    let mut model = Model::new(fixture, "long").await?;
+    model.write(&[&["b"]]).await?;
+    for _ in 0..GROUPS {
+        model.write(&[&["a"][..]; GROUP]).await?;
+    }
+    let newest = newest + 1;
+    let revisions = async |name: &str| -> Outcome<Vec<u64>> {
+        let found = told("versions", model.store.versions(&samples::key(name), None, 1000).await)?;
+        Ok(found.iter().map(|version| version.revision).collect())
+    };
+    for (floor, keep, oldest) in [
+        (10, 1000, newest - 999),
+        (newest - 300, 3, newest - 300),
+        (newest, 1, newest),
+    ] {
+        same("the floor", &told("trim", model.store.trim(floor, keep).await)?, &floor)?;
+        let expected: Vec<u64> = (oldest..=newest).rev().collect();
+        same(
+            &format!("versions of a, trim({floor}, {keep})"),
+            &revisions("a").await?,
+            &expected,
+        )?;
+        same("versions of b", &revisions("b").await?, &vec![1])?;
+    }
+    model.check_now().await
+}
+
 /// Audit entries and answers to repeat are there once each, however often their commits are trimmed away; a key that is
 /// taken stays taken.
 ///

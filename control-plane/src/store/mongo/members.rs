@@ -97,6 +97,13 @@ impl Standing {
         }
     }
 
+    /// Whether one that is in the table at an exchange has been there since its last one. After long it may have been left
+    /// out and be in it again, by an exchange of which it heard nothing.
+    fn has_stayed(&self, asked: Option<Duration>) -> bool {
+        let age = asked.zip(self.beat).and_then(|(asked, beat)| asked.checked_sub(beat));
+        age.is_some_and(|age| age <= VALID)
+    }
+
     /// The revision above which nobody else has written anything, while that is certain.
     fn alone(&self, now: Option<Duration>) -> Option<u64> {
         let age = now?.checked_sub(self.beat?)?;
@@ -341,9 +348,7 @@ impl Beating {
                 continue;
             }
             let before = *self.standing.borrow();
-            // It may have been left out since, and be in the table again by an exchange of which it heard nothing.
-            let age = asked.zip(before.beat).and_then(|(asked, beat)| asked.checked_sub(beat));
-            let stayed = table.beats.contains_key(&self.me) && age.is_some_and(|age| age <= VALID);
+            let stayed = table.beats.contains_key(&self.me) && before.has_stayed(asked);
             let has_others = next.has_others_than(&self.me);
             let mut standing = Standing { beat: asked, ..before };
             if !stayed {
@@ -450,6 +455,24 @@ mod tests {
             ..standing
         };
         assert_eq!(others.alone(Some(at(10_020))), None);
+    }
+
+    #[test]
+    fn one_that_heard_nothing_for_long_comes_anew() {
+        let standing = Standing {
+            beat: Some(at(10_000)),
+            ..Standing::default()
+        };
+        for (asked, stayed) in [
+            (Some(10_000), true),
+            (Some(70_000), true),
+            (Some(70_001), false),
+            (Some(9_999), false),
+            (None, false),
+        ] {
+            assert_eq!(standing.has_stayed(asked.map(at)), stayed, "{asked:?}");
+        }
+        assert!(!Standing::default().has_stayed(Some(at(1))));
     }
 
     #[test]
