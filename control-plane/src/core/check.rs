@@ -3,15 +3,15 @@
 use std::collections::HashSet;
 use std::sync::Arc;
 
-use blaze_domain::ServiceName;
 use blaze_domain::config::spec::NODE_FILE_SECTIONS;
 use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_EFFECTIVE_BYTES};
+use blaze_domain::{LayerName, NodeName, ServiceName};
 use jsonschema::error::ValidationErrorKind;
 use jsonschema::{ValidationError, Validator};
 use serde_json::Value;
 
 use super::affected::{MAX_CANDIDATES, touched};
-use super::cost::{MAX_WORK, MAX_WORK_OF_ALL_FAULTS, MAX_WORK_OF_COMMIT, MAX_WORK_OF_FAULTS, Size};
+use super::cost::{MAX_WORK, MAX_WORK_OF_COMMIT, MAX_WORK_OF_FAULTS, Size};
 use super::effective::{At, Sources};
 use super::pattern::{self, Exhausted};
 use super::schema::{Compiled, Schemas, with_placeholders};
@@ -163,7 +163,7 @@ impl Check<'_> {
         let work = compiled.cost().work(&size);
         let validator = compiled.validator(at.instance.is_some());
         let Some(is_valid) = self.verdict(validator, &config, work)? else {
-            if self.was_too_costly(at) {
+            if self.was_too_costly(at)? {
                 tracing::warn!(
                     place = described(at),
                     "the configuration is too costly to check, as it was before; it is not checked"
@@ -176,7 +176,7 @@ impl Check<'_> {
         if is_valid {
             return Ok(());
         }
-        if secrets.is_empty() && work > MAX_WORK_OF_FAULTS {
+        if work > MAX_WORK_OF_FAULTS {
             found.push(some_fault(at));
             return Ok(());
         }
@@ -191,15 +191,9 @@ impl Check<'_> {
                 )
         };
         let left = MAX_FAULTS.saturating_sub(self.faults.len());
-        let told = || match work > MAX_WORK_OF_ALL_FAULTS {
-            true => vec![first_fault(validator, &config, at, is_told).unwrap_or_else(|| {
-                // What is wrong beside the secret is not known, so it cannot be let through.
-                too_costly(at, &compiled.cost().why(&size))
-            })],
-            false => {
-                let errors = validator.iter_errors(&config).filter(is_told);
-                errors.take(left).map(|error| mismatch(&error, at)).collect()
-            }
+        let told = || -> Vec<FieldFault> {
+            let errors = validator.iter_errors(&config).filter(is_told);
+            errors.take(left).map(|error| mismatch(&error, at)).collect()
         };
         match pattern::counted(MAX_WORK.min(self.left), told) {
             Ok((faults, taken)) => {
@@ -207,7 +201,7 @@ impl Check<'_> {
                 found.extend(faults);
             }
             Err(Exhausted) => {
-                self.take(MAX_WORK.min(self.left))?;
+                self.take(MAX_WORK)?;
                 found.push(some_fault(at));
             }
         }
@@ -246,21 +240,24 @@ impl Check<'_> {
 
     /// Whether the configuration of a place was too costly to check before the change already: stored when more was
     /// allowed, it must not stand in the way of other changes.
-    fn was_too_costly(&mut self, at: &At) -> bool {
+    fn was_too_costly(&mut self, at: &At) -> Result<bool, Exhausted> {
+        if !is_place(self.before, at) {
+            return Ok(false);
+        }
         let sources = Sources::at(self.before, at);
-        let Some(service) = &sources.service else { return false };
+        let Some(service) = &sources.service else {
+            return Ok(false);
+        };
         let Some(schema) = service.spec_member("schema").filter(|schema| !schema.is_null()) else {
-            return false;
+            return Ok(false);
         };
-        let Ok(compiled) = self.schemas.compiled(schema) else {
-            return false;
+        let Some(compiled) = self.compiled(service, schema)? else {
+            return Ok(false);
         };
-        let Ok((config, _)) = self.checked(&sources) else {
-            return false;
-        };
+        let (config, _) = self.checked(&sources)?;
         let work = compiled.cost().work(&Size::of(&config));
         let validator = compiled.validator(at.instance.is_some());
-        matches!(self.verdict(validator, &config, work), Ok(None))
+        Ok(self.verdict(validator, &config, work)?.is_none())
     }
 
     /// The schema of a service, compiled, if it can be.
@@ -285,6 +282,25 @@ impl Check<'_> {
     }
 }
 
+/// Whether a place is one whose configuration is checked: the instance is placed there, or the service may be seen there.
+fn is_place(state: &State, at: &At) -> bool {
+    let Some(service) = &at.service else { return false };
+    if let Some(instance) = &at.instance {
+        let held = state.get(&Key::instance(service.clone(), instance.clone()));
+        return held.is_some_and(|held| Sources::placed(state, service, &held.document) == *at);
+    }
+    let is_seen = |layer: &LayerName| {
+        let service = state.get(&Key::service(service));
+        service.is_some_and(|held| held.document.is_for_layer(layer.as_str()))
+            && state.get(&Key::layer(layer)).is_some()
+    };
+    let is_there = |node: &NodeName| {
+        let held = state.get(&Key::node(node));
+        held.is_some_and(|held| held.document.spec_layer() == at.layer.as_ref().map(LayerName::as_str))
+    };
+    at.layer.as_ref().is_some_and(is_seen) && at.node.as_ref().is_none_or(is_there)
+}
+
 fn steps_of_bytes(bytes: usize) -> u64 {
     u64::try_from(bytes / BYTES_PER_STEP).unwrap_or(u64::MAX)
 }
@@ -295,22 +311,12 @@ fn some_fault(at: &At) -> FieldFault {
         pointer: "/spec/config".to_owned(),
         code: Code::SchemaMismatch,
         detail: format!(
-            "effective configuration of {}: it does not match the schema; the two are too large together to say where",
+            "effective configuration of {}: it does not match the schema; the two are too large together to say where (of a \
+             secret, `const` and `enum` do not hold)",
             described(at)
         ),
         document: None,
     }
-}
-
-/// The first fault, if it may be told.
-fn first_fault(
-    validator: &Validator,
-    config: &Value,
-    at: &At,
-    is_told: impl Fn(&ValidationError<'_>) -> bool,
-) -> Option<FieldFault> {
-    let error = validator.validate(config).err()?;
-    is_told(&error).then(|| mismatch(&error, at))
 }
 
 fn mismatch(error: &ValidationError<'_>, at: &At) -> FieldFault {
@@ -519,6 +525,13 @@ pub(super) mod tests {
         assert_eq!(faults_after(&with_service(text(1)), text(2)), []);
         let cheap = with_service(service(steps(1000), 1000, 1));
         assert_eq!(faults_after(&cheap, service(steps(1000), 11_000, 2)).len(), 1);
+        // Where it could not be seen before it was not checked either.
+        let mut unseen = service(steps(1000), 11_000, 1);
+        unseen["layers"] = json!([]);
+        assert_eq!(
+            faults_after(&with_service(unseen), service(steps(1000), 11_000, 2)).len(),
+            1
+        );
     }
 
     #[test]
@@ -530,7 +543,7 @@ pub(super) mod tests {
         assert_eq!(faults_of(json!({ "schema": schema, "config": config(json!(1)) })), []);
         let refused = faults_of(json!({ "schema": schema, "config": config(json!("x")) }));
         assert!(
-            refused.len() == 1 && refused[0].pointer == "/spec/config/list/0",
+            refused.len() == 1 && refused[0].detail.contains("too large together"),
             "{refused:?}"
         );
     }

@@ -34,10 +34,10 @@ pub(super) const MAX_WORK: u64 = 10_000_000;
 pub(super) const MAX_WORK_OF_COMMIT: u64 = 100_000_000;
 /// The same up to which it is told where the faults are: each takes memory, and one of them may tell of many.
 pub(super) const MAX_WORK_OF_FAULTS: u64 = 50_000;
-/// The same beside secrets, of which some faults do not count; beyond it the first one alone is looked for.
-pub(super) const MAX_WORK_OF_ALL_FAULTS: u64 = 1_000_000;
 /// Steps in the time that it takes to compile a byte of a schema, or of its patterns: 150 ns were measured.
 const STEPS_PER_BYTE: u64 = 3;
+/// Steps that a schema that is refused counts as: those of the most costly one.
+pub(super) const STEPS_OF_REFUSED: u64 = 4_000_000;
 /// Keywords with names, or with values to choose from, that are gone through one after the other.
 const NAMES: &[&str] = &[
     "dependencies",
@@ -55,8 +55,10 @@ struct Effort {
     nesting: usize,
     /// Of `nesting`, what is for the same value.
     in_place: usize,
-    /// States of the patterns that each byte of a name is matched against.
+    /// States of the patterns that each byte of the names of the value's own members is matched against.
     states: u64,
+    /// The same of the names on whatever level within them, at most.
+    deeper: u64,
 }
 
 impl Effort {
@@ -65,6 +67,7 @@ impl Effort {
         nesting: 1,
         in_place: 1,
         states: 0,
+        deeper: 0,
     };
 
     /// Both are looked at.
@@ -72,6 +75,7 @@ impl Effort {
         Self {
             steps: self.steps.saturating_add(other.steps),
             states: self.states.saturating_add(other.states),
+            deeper: self.deeper.saturating_add(other.deeper),
             ..self.or(other)
         }
     }
@@ -83,6 +87,7 @@ impl Effort {
             nesting: self.nesting.max(other.nesting),
             in_place: self.in_place.max(other.in_place),
             states: self.states.max(other.states),
+            deeper: self.deeper.max(other.deeper),
         }
     }
 }
@@ -129,7 +134,7 @@ impl Cost {
 pub(super) struct Size {
     /// Values; a long text counts as several.
     pub(super) values: u64,
-    /// Bytes of the names of members.
+    /// Bytes of the names of members, each with its end.
     names: u64,
 }
 
@@ -150,7 +155,7 @@ impl Size {
             Value::Object(members) => {
                 for (name, member) in members {
                     self.values += text(name);
-                    self.names += u64::try_from(name.len()).unwrap_or(u64::MAX);
+                    self.names += u64::try_from(name.len()).unwrap_or(u64::MAX).saturating_add(1);
                     self.add(member);
                 }
             }
@@ -174,7 +179,7 @@ pub(super) fn of_schema(schema: &Value, text: &str) -> Result<Cost, String> {
     let bytes = u64::try_from(text.len() + compiled).unwrap_or(u64::MAX);
     Ok(Cost {
         steps: effort.steps,
-        states: effort.states,
+        states: effort.states.max(effort.deeper),
         compiling: bytes.saturating_mul(STEPS_PER_BYTE),
         patterns: patterns.len(),
     })
@@ -221,11 +226,14 @@ impl<'s> Estimate<'s, '_> {
             here = here.and(here);
         }
         let within = here.and(below);
+        let states = here.states.saturating_add(self.states_of_names(members));
         let effort = Effort {
             steps: within.steps.saturating_add(own_steps(members)),
             nesting: within.nesting + 1,
             in_place: within.in_place + 1,
-            states: within.states,
+            states,
+            // Names of one level alone: each is a member of one object.
+            deeper: here.deeper.saturating_add(below.states.max(below.deeper)),
         };
         if effort.steps > MAX_STEPS || effort.nesting > MAX_NESTING || effort.in_place > MAX_IN_PLACE {
             return Err(too_much());
@@ -263,15 +271,7 @@ impl<'s> Estimate<'s, '_> {
                 // A member has one name, and an item one place.
                 ("properties", Value::Object(named)) => self.any(named.values(), levels, nesting)?,
                 ("prefixItems", Value::Array(list)) => self.any(list.iter(), levels, nesting)?,
-                ("patternProperties", Value::Object(named)) => {
-                    let sizes = named.keys().filter_map(|name| self.patterns.get(name.as_str()));
-                    let states = sizes.map(|pattern| pattern.states).sum();
-                    let within = self.all(named.values(), levels, nesting)?;
-                    within.and(Effort {
-                        states,
-                        ..Effort::default()
-                    })
-                }
+                ("patternProperties", Value::Object(named)) => self.all(named.values(), levels, nesting)?,
                 ("not" | "if" | "then" | "else", _) => Effort::default(),
                 (name, value) if ONE.contains(&name) || name == "additionalItems" => {
                     self.effort(value, levels, nesting + 1)?
@@ -281,6 +281,14 @@ impl<'s> Estimate<'s, '_> {
             below = below.and(more);
         }
         Ok(below)
+    }
+
+    /// States of the patterns that names of the value's members are matched against by this subschema itself.
+    fn states_of_names(&self, members: &Map<String, Value>) -> u64 {
+        let named = members.get("patternProperties").and_then(Value::as_object);
+        let names = named.into_iter().flat_map(Map::keys);
+        let sizes = names.filter_map(|name| self.patterns.get(name.as_str()));
+        sizes.map(|pattern| pattern.states).sum()
     }
 
     fn all(
@@ -356,7 +364,7 @@ mod tests {
     #[test]
     fn a_configuration_counts_by_its_values_and_long_texts() {
         let size = Size::of(&json!({ "a": 1, "b": [true, null, { "name": "text" }] }));
-        assert_eq!(size, Size { values: 7, names: 6 });
+        assert_eq!(size, Size { values: 7, names: 9 });
         assert_eq!(Size::of(&json!("x".repeat(1000))).values, 11);
     }
 
@@ -378,6 +386,12 @@ mod tests {
         assert_eq!(one.work(&size(0)), one.steps);
         assert!(one.work(&size(100_000)) > 400_000);
         assert_eq!(of(json!({ "pattern": "^[a-z]{1,40}$" })).states, 0);
+        // A name is on one level.
+        let nested = of(json!({ "patternProperties": { "^[a-z]{1,40}$": { "$ref": "#" } } }));
+        assert_eq!(nested.states, one.states);
+        let apart = json!({ "patternProperties": { "^[a-z]{1,40}$": true } });
+        let both = of(json!({ "allOf": [apart, apart], "properties": { "a": apart } }));
+        assert_eq!(both.states, 2 * one.states);
     }
 
     #[test]

@@ -17,7 +17,7 @@ use self::faults::{COUNTED, Faults, in_use, twice};
 use self::outcome::{Outcome, Target, cascade_into, outcome_of, prune_into, same_spec};
 
 use super::check::too_many;
-use super::cost::MAX_WORK_OF_COMMIT;
+use super::cost::{MAX_WORK_OF_COMMIT, STEPS_OF_REFUSED};
 use super::placement::rollout_target;
 use super::refs;
 use super::rollouts::{begin, tried};
@@ -245,7 +245,14 @@ impl Evaluator {
         let mut after = state.clone();
         after.advance(revision, &changes);
         check_rights(state, &after, request, &changes)?;
-        self.begin_rollouts(&mut after, request, &mut changes, &index_of, &mut faults)?;
+        self.begin_rollouts(
+            &mut after,
+            request,
+            &mut changes,
+            &index_of,
+            &mut faults,
+            &mut compiling,
+        )?;
         self.check_result(state, &after, request, &changes, &index_of, &mut faults)?;
         let results = order.into_iter().map(|key| {
             let action = actions.get(&key).copied().unwrap_or(ApplyAction::Unchanged);
@@ -292,9 +299,8 @@ impl Evaluator {
             // One that is stored was sound when it came, and does not stand in the way of other changes.
             && stored != Some(schema)
         {
-            let steps = self.schemas.check(schema);
-            let steps = steps.map_err(|reason| vec![invalid("/spec/schema", &reason)])?;
-            *compiling = compiling.checked_sub(steps).ok_or_else(|| vec![too_many()])?;
+            self.check_schema(schema, "/spec/schema", compiling)
+                .map_err(|fault| vec![fault])?;
         }
         if let Some(before) = before
             && before.labels == target.labels
@@ -318,6 +324,23 @@ impl Evaluator {
         }))
     }
 
+    /// Whether a schema is sound. `left` is what schemas may still take.
+    fn check_schema(&self, schema: &Value, pointer: &str, left: &mut u64) -> Result<(), FieldFault> {
+        if *left == 0 {
+            return Err(too_many());
+        }
+        match self.schemas.check(schema) {
+            Ok(steps) => {
+                *left = left.checked_sub(steps).ok_or_else(too_many)?;
+                Ok(())
+            }
+            Err(reason) => {
+                *left = left.saturating_sub(STEPS_OF_REFUSED);
+                Err(invalid(pointer, &reason))
+            }
+        }
+    }
+
     /// Judges roll-outs that begin by what there is after the change, of which their targets and nodes may be part.
     fn begin_rollouts(
         &self,
@@ -326,6 +349,7 @@ impl Evaluator {
         changes: &mut [Change],
         index_of: &dyn Fn(&Key) -> usize,
         faults: &mut Faults,
+        compiling: &mut u64,
     ) -> Result<(), Problem> {
         let view = view(&request.caller.claims);
         let is_begun = |change: &&mut Change| begins(request, change);
@@ -343,7 +367,7 @@ impl Evaluator {
                 let state: &State = after;
                 let written = view.check_write((state, Some(&target)), (state, Some(&patched)));
                 written.map_err(|_| view.outside(&format!("what {} makes of its target", rollout.key)))?;
-                for fault in self.faults_of_tried(state, &rollout, &patched, faults.room()) {
+                for fault in self.faults_of_tried(state, &rollout, &patched, faults.room(), compiling) {
                     faults.add(index, fault);
                 }
             }
@@ -356,7 +380,14 @@ impl Evaluator {
     }
 
     /// What is wrong with what a roll-out makes of its target: references, and a schema that it brings.
-    fn faults_of_tried(&self, after: &State, rollout: &Document, patched: &Document, most: usize) -> Vec<FieldFault> {
+    fn faults_of_tried(
+        &self,
+        after: &State,
+        rollout: &Document,
+        patched: &Document,
+        most: usize,
+        compiling: &mut u64,
+    ) -> Vec<FieldFault> {
         let mut found = refs::missing_of(after, patched, most);
         for fault in &mut found {
             let within = fault.pointer.strip_prefix("/spec").unwrap_or_default();
@@ -365,9 +396,9 @@ impl Evaluator {
         if patched.key.kind() == Kind::Service
             && tries_schema(rollout)
             && let Some(schema) = patched.spec_member("schema")
-            && let Err(reason) = self.schemas.check(schema)
+            && let Err(fault) = self.check_schema(schema, "/spec/patch/schema", compiling)
         {
-            found.push(invalid("/spec/patch/schema", &reason));
+            found.push(fault);
         }
         found
     }

@@ -21,6 +21,8 @@ pub(super) const MAX_BYTES: usize = 128 * 1024;
 const MAX_BYTES_OF_ALL: usize = 1024 * 1024;
 /// Bytes that matching one pattern may keep for the next time.
 pub(super) const CACHE_BYTES: usize = 64 * 1024;
+/// Bytes that matching a pattern may take beside that: a place for each of its groups in each of its states.
+const MAX_GROUP_BYTES: usize = 256 * 1024;
 /// Patterns in one schema.
 const MAX_PATTERNS: usize = 200;
 /// States of patterns that a byte meets in the time of one step, at worst: 3 ns each were measured.
@@ -74,22 +76,24 @@ fn take(steps: u64) -> bool {
 /// The patterns of a schema, or what looks like one, with their sizes. Those that are none are left out: that is told where
 /// they are compiled.
 pub(super) fn sizes(schema: &Value) -> Result<HashMap<&str, Pattern>, String> {
-    let mut found = HashMap::new();
+    let mut found: HashMap<&str, WhichCaptures> = HashMap::new();
     let mut count = 0;
-    find(schema, &mut |text| {
+    find(schema, &mut |text, groups| {
         count += 1;
-        found.insert(text, None);
+        let known = found.entry(text).or_insert(groups);
+        if matches!(groups, WhichCaptures::All) {
+            *known = groups;
+        }
     });
     if count > MAX_PATTERNS {
         return Err(format!("it has {count} patterns; {MAX_PATTERNS} are allowed"));
     }
-    for (text, size) in &mut found {
-        *size = measured(text)?;
+    let mut sizes = HashMap::new();
+    for (text, groups) in found {
+        if let Some(size) = measured(text, groups)? {
+            sizes.insert(text, size);
+        }
     }
-    let sizes: HashMap<&str, Pattern> = found
-        .into_iter()
-        .filter_map(|(text, size)| Some((text, size?)))
-        .collect();
     let bytes: usize = sizes.values().map(|size| size.bytes).sum();
     match bytes > MAX_BYTES_OF_ALL {
         true => Err(format!(
@@ -99,13 +103,16 @@ pub(super) fn sizes(schema: &Value) -> Result<HashMap<&str, Pattern>, String> {
     }
 }
 
-fn find<'s>(schema: &'s Value, found: &mut impl FnMut(&'s str)) {
+/// Those of `patternProperties` are compiled with their groups: there the library gives no choice.
+fn find<'s>(schema: &'s Value, found: &mut impl FnMut(&'s str, WhichCaptures)) {
     match schema {
         Value::Object(members) => {
             for (name, value) in members {
                 match (name.as_str(), value) {
-                    ("pattern", Value::String(text)) => found(text),
-                    ("patternProperties", Value::Object(named)) => named.keys().for_each(|name| found(name)),
+                    ("pattern", Value::String(text)) => found(text, WhichCaptures::None),
+                    ("patternProperties", Value::Object(named)) => {
+                        named.keys().for_each(|name| found(name, WhichCaptures::All));
+                    }
                     _ => {}
                 }
                 find(value, found);
@@ -116,25 +123,40 @@ fn find<'s>(schema: &'s Value, found: &mut impl FnMut(&'s str)) {
     }
 }
 
-fn measured(text: &str) -> Result<Option<Pattern>, String> {
+fn measured(text: &str, groups: WhichCaptures) -> Result<Option<Pattern>, String> {
     let Ok(translated) = jsonschema_regex::to_rust_regex(text) else {
         return Ok(None);
     };
     let limited = thompson::Config::new()
         .nfa_size_limit(Some(MAX_BYTES))
-        .which_captures(WhichCaptures::None);
+        .which_captures(groups);
     match NFA::compiler().configure(limited).build(&translated) {
-        Ok(automaton) => Ok(Some(Pattern {
-            states: u64::try_from(automaton.states().len()).unwrap_or(u64::MAX),
-            bytes: automaton.memory_usage(),
-        })),
+        Ok(automaton) => {
+            let states = automaton.states().len();
+            // Two tables of them while it matches.
+            let slots = automaton.group_info().slot_len().saturating_mul(2 * size_of::<usize>());
+            if states.saturating_mul(slots) > MAX_GROUP_BYTES {
+                let start = beginning(text);
+                return Err(format!(
+                    "the pattern of names that begins with {start:?} has too many groups for its size: write (?:…) for (…)"
+                ));
+            }
+            Ok(Some(Pattern {
+                states: u64::try_from(states).unwrap_or(u64::MAX),
+                bytes: automaton.memory_usage(),
+            }))
+        }
         Err(error) if error.size_limit().is_some() => Err(too_large(text)),
         Err(_) => Ok(None),
     }
 }
 
+fn beginning(text: &str) -> String {
+    text.chars().take(50).collect()
+}
+
 fn too_large(text: &str) -> String {
-    let start: String = text.chars().take(50).collect();
+    let start = beginning(text);
     format!(
         "the pattern that begins with {start:?} takes more than {MAX_BYTES} bytes, compiled: make its counts smaller"
     )
@@ -173,6 +195,8 @@ impl Patterns {
         let translated = jsonschema_regex::to_rust_regex(text).map_err(|()| wrong(&"it is no regular expression"))?;
         let limits = Regex::config()
             .nfa_size_limit(Some(MAX_BYTES))
+            // Only whether it matches is asked; places of groups would take memory and time.
+            .which_captures(WhichCaptures::None)
             .hybrid_cache_capacity(CACHE_BYTES);
         let regex = Regex::builder().configure(limits).build(&translated);
         let regex = regex.map_err(|error| match error.size_limit() {
@@ -183,7 +207,7 @@ impl Patterns {
                 wrong(&syntax.lines().last().unwrap_or_default().trim_start_matches("error: "))
             }
         })?;
-        let states = measured(text)?.map_or(u64::MAX, |pattern| pattern.states);
+        let states = measured(text, WhichCaptures::None)?.map_or(u64::MAX, |pattern| pattern.states);
         let matcher = Matcher { regex, states };
         known.insert(text.to_owned(), matcher.clone());
         Ok(matcher)
@@ -205,7 +229,8 @@ impl<'i> Keyword<'i> for Matcher {
 
     fn is_valid(&self, instance: &'i Value) -> bool {
         looked_at(instance).is_none_or(|text| {
-            let bytes = u64::try_from(text.len()).unwrap_or(u64::MAX);
+            // The end is a place to look at too.
+            let bytes = u64::try_from(text.len()).unwrap_or(u64::MAX).saturating_add(1);
             take(steps_of_states(bytes.saturating_mul(self.states))) && self.regex.is_match(text)
         })
     }
@@ -340,6 +365,31 @@ mod tests {
         assert_eq!(check(taken - 1), Err(Exhausted));
         // The next one has its own.
         assert_eq!(check(taken), Ok((false, taken)));
+        // Nothing is for free.
+        let compiled = Schemas::default()
+            .compiled(&json!({ "pattern": "^(?:a?){100}$" }))
+            .unwrap();
+        let (is_valid, taken) = counted(1000, || compiled.validator(true).is_valid(&json!(""))).unwrap();
+        assert!(is_valid && taken >= 10, "{taken}");
+    }
+
+    #[test]
+    fn groups_take_no_more_than_is_measured() {
+        let groups = format!("^[ab]*{}c$", "()".repeat(1900));
+        let compiled = Schemas::default().compiled(&json!({ "pattern": groups })).unwrap();
+        assert!(!compiled.validator(true).is_valid(&json!("ab".repeat(1000))));
+        let error = Schemas::default()
+            .check(&json!({ "patternProperties": { groups: true } }))
+            .unwrap_err();
+        assert!(
+            error.contains("too many groups") || error.contains("takes more than"),
+            "{error}"
+        );
+        assert!(
+            Schemas::default()
+                .check(&json!({ "patternProperties": { "^(a|b)(c|d){2,9}$": true } }))
+                .is_ok()
+        );
     }
 
     #[test]
