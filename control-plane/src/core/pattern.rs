@@ -274,30 +274,16 @@ impl<'i> Keyword<'i> for Length {
     }
 }
 
+/// The keyword `minLength`, or `maxLength`.
 #[allow(
     clippy::unnecessary_wraps,
     clippy::result_large_err,
-    clippy::needless_pass_by_value,
     reason = "the form of jsonschema"
 )]
-pub(super) fn min_length<'a>(_: &'a Map<String, Value>, schema: &'a Value, _: Location) -> Made<'a> {
-    Ok(Box::new(Length {
-        limit: schema.as_f64().unwrap_or_default(),
-        is_least: true,
-    }))
-}
-
-#[allow(
-    clippy::unnecessary_wraps,
-    clippy::result_large_err,
-    clippy::needless_pass_by_value,
-    reason = "the form of jsonschema"
-)]
-pub(super) fn max_length<'a>(_: &'a Map<String, Value>, schema: &'a Value, _: Location) -> Made<'a> {
-    Ok(Box::new(Length {
-        limit: schema.as_f64().unwrap_or(f64::INFINITY),
-        is_least: false,
-    }))
+pub(super) fn length<'a>(schema: &Value, is_least: bool) -> Made<'a> {
+    // That it is a number was checked with the schema.
+    let limit = schema.as_f64().unwrap_or_default();
+    Ok(Box::new(Length { limit, is_least }))
 }
 
 #[cfg(test)]
@@ -371,6 +357,12 @@ mod tests {
             .unwrap();
         let (is_valid, taken) = counted(1000, || compiled.validator(true).is_valid(&json!(""))).unwrap();
         assert!(is_valid && taken >= 10, "{taken}");
+    }
+
+    #[test]
+    fn a_pattern_takes_linear_time() {
+        let text = Value::from("a".repeat(200_000) + "!");
+        assert!(!is_valid(&json!({ "pattern": "^(a+)+$" }), &text));
     }
 
     #[test]

@@ -126,8 +126,8 @@ fn built(schema: &Value, patterns: &Patterns) -> Result<Validator, String> {
         .with_draft(Draft::Draft202012)
         .offline()
         .with_pattern_options(of_names)
-        .with_keyword("maxLength", pattern::max_length)
-        .with_keyword("minLength", pattern::min_length)
+        .with_keyword("maxLength", |_, limit, _| pattern::length(limit, false))
+        .with_keyword("minLength", |_, limit, _| pattern::length(limit, true))
         .with_keyword("pattern", move |parent, schema, path| {
             patterns.keyword(parent, schema, path)
         })
