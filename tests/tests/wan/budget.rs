@@ -333,20 +333,32 @@ fn look(row: &Row, running: &Running, time: Duration) -> anyhow::Result<Seen> {
     })
 }
 
-/// Looks until no topic has grown meanwhile. Which picture is the largest of a topic shows late where few of them pass and LZ4 makes each
-/// another size; who of two cameras is the larger one decides who gets the rest.
+/// Looks until no topic has grown meanwhile by what would show in the rates. Which picture is the largest of a topic shows late where few of
+/// them pass and LZ4 makes each another size, and how hard it tries depends on what the processor has to spare; who of two cameras is the
+/// larger one decides who gets the rest.
 fn look_at_settled(row: &Row, running: &Running) -> anyhow::Result<(Seen, Value)> {
-    const LOOKS: usize = 5;
-    let sizes = |allocation: &Value| -> Vec<Value> {
-        let of = |topic| of_topic(allocation, topic)["size_bytes"].clone();
-        [FRONT, REAR].map(of).into()
+    const LOOKS: usize = 15;
+    const GROWN: f64 = IMAGE_RATE / 6.0;
+    let sizes = |allocation: &Value| -> anyhow::Result<[f64; 2]> {
+        let of = |topic| {
+            let size = &of_topic(allocation, topic)["size_bytes"];
+            size.as_f64().with_context(|| format!("{topic}: no size, {size}"))
+        };
+        Ok([of(FRONT)?, of(REAR)?])
     };
-    let mut before = sizes(&allocation(running)?);
+    let is_settled = |before: [f64; 2], after: [f64; 2]| {
+        let grown = before
+            .iter()
+            .zip(after)
+            .map(|(before, after)| (after / before - 1.0).abs());
+        grown.fold(0.0, f64::max) <= GROWN && before[0].total_cmp(&before[1]) == after[0].total_cmp(&after[1])
+    };
+    let mut before = sizes(&allocation(running)?)?;
     for _ in 0..LOOKS {
         let seen = look(row, running, measured())?;
         let allocation = allocation(running)?;
-        let after = sizes(&allocation);
-        if after == before {
+        let after = sizes(&allocation)?;
+        if is_settled(before, after) {
             return Ok((seen, allocation));
         }
         before = after;
