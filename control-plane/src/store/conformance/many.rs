@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use super::Fixture;
 use super::samples::{self, record};
-use super::tools::{Model, Outcome, log, same, store_name, told, within};
+use super::tools::{Dice, Model, Outcome, by_key, log, same, store_name, told, within};
 use crate::store::{CommitError, FullStore, Op};
 
 /// Whatever was there is there again, and writing goes on.
@@ -211,4 +211,75 @@ pub async fn readers_never_see_a_hole_while_history_is_trimmed(fixture: &dyn Fix
     let (at, _below) = read?;
     same("the end of the log", &at, &model.revision())?;
     model.check_now().await
+}
+
+/// Several that tidy, some of which are cut off in the middle of it, and one that trims: what is loaded is right after each
+/// commit.
+///
+/// # Errors
+/// How the store breaks the rule.
+pub async fn documents_are_right_whoever_tidies(fixture: &dyn Fixture) -> Outcome {
+    const DOCUMENTS: u64 = 400;
+    const ROUNDS: u64 = 40;
+    let name = store_name("tidied");
+    let mut model = Model::new(fixture, "unused").await?;
+    model.store = fixture.open(&name).await?;
+    let mut others = Vec::new();
+    for _ in 0..if fixture.is_shared() { 3 } else { 0 } {
+        others.push(fixture.open(&name).await?);
+    }
+    let writer = Arc::clone(&model.store);
+    let stores: Vec<_> = others.iter().chain([&writer]).collect();
+    let over = AtomicBool::new(false);
+    let tidying = futures::future::try_join_all(stores.iter().zip(1..).map(|(store, seed)| {
+        let over = &over;
+        async move {
+            let mut dice = Dice::new(seed);
+            while !over.load(Ordering::Acquire) {
+                let cut = Duration::from_millis(dice.roll(200));
+                if let Ok(done) = tokio::time::timeout(cut, store.tidy()).await {
+                    told("tidy", done)?;
+                }
+                tokio::time::sleep(Duration::from_millis(dice.roll(20))).await;
+            }
+            Ok::<_, String>(())
+        }
+    }));
+    let writing = async {
+        let mut dice = Dice::new(7);
+        for round in 0..ROUNDS {
+            let mut names: BTreeSet<String> = BTreeSet::new();
+            for _ in 0..dice.roll(DOCUMENTS) {
+                names.insert(format!("n{}", dice.roll(DOCUMENTS)));
+            }
+            let signed: Vec<String> = names
+                .into_iter()
+                .map(
+                    |name| match model.documents.contains_key(&samples::key(&name)) && dice.roll(3) == 0 {
+                        true => format!("-{name}"),
+                        false => name,
+                    },
+                )
+                .collect();
+            let mut group: Vec<&str> = signed.iter().map(String::as_str).collect();
+            group.push("always");
+            model.write(&[&group, &["always"]]).await?;
+            if round % 5 == 4 {
+                told("trim", model.store.trim(model.revision() - 5, 1).await)?;
+            }
+            let reader = others.first().unwrap_or(&model.store);
+            let snapshot = told("load", reader.load().await)?;
+            same("the loaded revision", &snapshot.revision, &model.revision())?;
+            let found = by_key(snapshot.documents);
+            same(
+                &format!("the documents of {}", snapshot.revision),
+                &found,
+                &model.documents,
+            )?;
+        }
+        over.store(true, Ordering::Release);
+        Ok::<_, String>(())
+    };
+    tokio::try_join!(writing, tidying)?;
+    told("tidy", writer.tidy().await)
 }

@@ -32,8 +32,8 @@ pub use commits::{
     commits_are_whole_whatever_their_size, commits_come_in_order_and_in_parts, what_was_written_is_read_back,
 };
 pub use many::{
-    a_foreign_commit_is_noticed, a_store_that_is_reopened_is_the_same, one_of_two_writers_has_each_revision,
-    readers_never_see_a_hole_while_history_is_trimmed,
+    a_foreign_commit_is_noticed, a_store_that_is_reopened_is_the_same, documents_are_right_whoever_tidies,
+    one_of_two_writers_has_each_revision, readers_never_see_a_hole_while_history_is_trimmed,
 };
 pub use trimming::{
     a_long_history_is_trimmed, a_writer_that_slept_through_a_trim_is_refused,
@@ -124,6 +124,7 @@ rules!(
     one_of_two_writers_has_each_revision,
     a_foreign_commit_is_noticed,
     readers_never_see_a_hole_while_history_is_trimmed,
+    documents_are_right_whoever_tidies,
     documents_are_rewritten_in_place,
     a_backup_is_restored_elsewhere,
     a_closed_store_is_unavailable,

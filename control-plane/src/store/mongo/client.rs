@@ -48,6 +48,8 @@ pub(super) struct Tables {
     pub(super) tokens: Collection<Document>,
     /// By which our transactions are known among those on the server.
     pub(super) app_name: String,
+    /// Of the replica set one member can be its primary, as far as was known when it was connected to.
+    pub(super) is_single: bool,
 }
 
 impl Tables {
@@ -71,7 +73,7 @@ impl Tables {
         options.selection_criteria = None;
         let client = Client::with_options(options).map_err(store_error)?;
         let database = client.database_with_options(name, database_options());
-        let tables = Self {
+        let mut tables = Self {
             meta: database.collection("meta"),
             migrations: database.collection("migrations"),
             events: database.collection("events"),
@@ -83,6 +85,7 @@ impl Tables {
             client,
             database,
             app_name,
+            is_single: false,
         };
         let hello = limited(USUAL, tables.admin().run_command(doc! { "hello": 1 })).await?;
         if hello.get_str("msg").is_ok_and(|what| what == "isdbgrid") {
@@ -98,6 +101,7 @@ impl Tables {
                     .to_owned(),
             ));
         }
+        tables.is_single = hello.get_array("hosts").is_ok_and(|hosts| hosts.len() == 1);
         Ok(tables)
     }
 

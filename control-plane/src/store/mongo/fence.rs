@@ -93,11 +93,6 @@ impl Fence {
         }
     }
 
-    /// The newest revision that is known here.
-    pub(super) fn newest(&self) -> Option<i64> {
-        self.newest.map(|proof| proof.revision)
-    }
-
     /// The proof that a revision is free, if it is fresh.
     pub(super) fn is_free(&self, revision: i64, now: Option<Duration>) -> Option<Proof> {
         let proof = self.newest.filter(|proof| proof.revision + 1 == revision)?;

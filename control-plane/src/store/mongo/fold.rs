@@ -1,18 +1,22 @@
 //! Bringing the documents up to date with the log, beside the writing.
 //!
 //! ```text
-//! documents of revision r, and commits above r ──▶ one transaction: documents of revision s, and s in the guard, if it was r
-//! loading = documents of r, and the commits above r
+//! commits above r, up to s ──▶ what each document that they change is at s ──▶ some at a time, each step one transaction
+//!                                                                                └ the last one: s in the guard, too
+//! loading = documents of r, some of which are newer already, and the commits above r
 //! ```
 //!
-//! Any process may do it at any time; whoever is second finds another r, and has done nothing.
+//! However often a document has changed, it is written once. Each step counts up `turn` in the guard, and finds it as the
+//! step before has left it: of two processes that are at it one is overtaken, and stops. What it has written stays, and
+//! harms nobody: whatever changed above r is taken from the log.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use futures::FutureExt as _;
 use mongodb::bson::{Document, doc};
-use tokio::time::Instant;
+use tokio::time::{Instant, sleep};
 
 use super::client::{USUAL, limited};
 use super::errors::write_error;
@@ -23,74 +27,207 @@ use super::statements::{RECORD_COMMITS, document_updates};
 use super::{MongoStore, collect};
 use crate::store::StoreError;
 use crate::store::encode::signed;
+use crate::store::rows::VersionRow;
 
-/// Records that one step takes.
-const STEP: usize = 1_000;
-/// Steps of one call that is not urgent.
-const STEPS: usize = 4;
-/// Revisions that the documents may be behind the log, for [`FOLD_PERIOD`].
-const BEHIND: i64 = 20_000;
+/// Between two times that the documents are brought up to date.
 pub(super) const FOLD_PERIOD: Duration = Duration::from_secs(30);
+/// How much longer it may take until it hurries: what is behind has to be read, and kept in memory, by whoever starts.
+const LATE: Duration = Duration::from_secs(30);
+/// Records that are read at once.
+const RECORDS: usize = 1_000;
+/// Documents, bytes of them, and bytes of the log that are read before something is written.
+const GATHERED: usize = 20_000;
+const GATHERED_BYTES: usize = 32 * 1024 * 1024;
+const READ: i64 = 256 * 1024 * 1024;
+/// Documents, and bytes of them, of one step: writers wait while the database is at it.
+const STEP: usize = 100;
+const STEP_BYTES: usize = 1024 * 1024;
+/// How many times as long as each read and each step the rest after it is.
+const REST: u32 = 3;
+/// The longest of them: others look once a second whether somebody is at it.
+const LONGEST_REST: Duration = Duration::from_millis(500);
+/// Before one that was overtaken tries again, if it cannot wait.
+const AGAIN: std::ops::Range<Duration> = Duration::from_millis(10)..Duration::from_millis(100);
 /// Revisions whose records one command removes.
 const REMOVED: i64 = 1_000;
+
+/// How much it hurries.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Pace {
+    /// Leaves most of the time to writers, up to a time.
+    CalmUntil(Instant),
+    Urgent,
+}
+
+impl Pace {
+    /// Rests after work that began at a time.
+    async fn rest(self, begun: Instant) {
+        if matches!(self, Self::CalmUntil(until) if Instant::now() < until) {
+            sleep(LONGEST_REST.min(begun.elapsed() * REST)).await;
+        }
+    }
+}
+
+/// What documents are at a revision.
+#[derive(Default)]
+struct Gathered {
+    revision: i64,
+    rows: BTreeMap<String, VersionRow>,
+    bytes: usize,
+    /// Of the log.
+    read: i64,
+}
+
+impl Gathered {
+    fn add(&mut self, row: VersionRow) {
+        self.bytes += size(&row);
+        if let Some(before) = self.rows.insert(row.key.clone(), row) {
+            self.bytes -= size(&before);
+        }
+    }
+
+    fn is_full(&self) -> bool {
+        self.rows.len() >= GATHERED || self.bytes >= GATHERED_BYTES || self.read >= READ
+    }
+
+    /// At least one, so that the revision is noted.
+    fn steps(self) -> Vec<Vec<VersionRow>> {
+        let (mut steps, mut bytes) = (vec![Vec::new()], 0);
+        for row in self.rows.into_values() {
+            let is_full = steps.last().is_some_and(|step: &Vec<_>| step.len() >= STEP) || bytes >= STEP_BYTES;
+            if is_full {
+                steps.push(Vec::new());
+                bytes = 0;
+            }
+            bytes += size(&row);
+            if let Some(step) = steps.last_mut() {
+                step.push(row);
+            }
+        }
+        steps
+    }
+}
+
+fn size(row: &VersionRow) -> usize {
+    row.document.len() + row.paths.len() + rows::OVERHEAD_BYTES
+}
 
 impl MongoStore {
     /// What can wait: bringing the documents up to date, removing what is below the floor.
     pub(super) async fn tidy_up(&self) -> Result<(), StoreError> {
-        if self.is_time_to_fold().await? {
-            for _ in 0..STEPS {
-                if !self.fold_once().await? {
-                    *self.folded.lock() = Some(Instant::now());
-                    break;
-                }
-            }
+        let due = *self.folded.lock() + self.fold_period;
+        if Instant::now() >= due && self.fold_calmly(due + LATE).await? {
+            *self.folded.lock() = Instant::now();
         }
         let floor = self.read_floor().await?;
         self.remove_records(signed(floor)).await
     }
 
-    /// Seldom, and many commits together: writers wait while the database is at it, and a document that changed often is
-    /// written once.
-    async fn is_time_to_fold(&self) -> Result<bool, StoreError> {
-        let is_old = self.folded.lock().is_none_or(|last| last.elapsed() >= self.fold_period);
-        if is_old {
-            return Ok(true);
+    /// Brings the documents up to date, with rests up to a time; `false` if another one is at it.
+    async fn fold_calmly(&self, until: Instant) -> Result<bool, StoreError> {
+        let head = signed(self.read_head().await?);
+        let guard = self.read_guard().await?;
+        // Whoever is at it has moved the turn since the last look.
+        if self
+            .turn
+            .lock()
+            .replace(guard.turn)
+            .is_some_and(|seen| seen != guard.turn)
+        {
+            return Ok(false);
         }
-        let newest = self.fence.lock().newest().unwrap_or(0);
-        Ok(newest - self.read_guard().await?.folded > BEHIND)
+        self.fold(guard, head, Pace::CalmUntil(until)).await
     }
 
     /// Brings the documents to a revision, at least.
     pub(super) async fn fold_until(&self, revision: i64) -> Result<Guard, StoreError> {
+        let mut turn = None;
         loop {
             let guard = self.read_guard().await?;
-            if guard.folded >= revision || !self.fold_once().await? {
+            if guard.folded >= revision {
+                return Ok(guard);
+            }
+            // What another one is at need not be done twice.
+            if turn.replace(guard.turn).is_none_or(|seen| seen == guard.turn)
+                && self.fold(guard, revision, Pace::Urgent).await?
+            {
                 return self.read_guard().await;
             }
+            sleep(rand::random_range(AGAIN)).await;
         }
     }
 
-    /// One step; `false` if there was nothing to do.
-    async fn fold_once(&self) -> Result<bool, StoreError> {
-        let guard = self.read_guard().await?;
-        if self.fence.lock().newest().is_some_and(|newest| newest <= guard.folded) {
-            return Ok(false);
+    /// Brings the documents from those of a guard to a revision; `false` if another one was faster, or has rewritten them.
+    async fn fold(&self, mut guard: Guard, until: i64, pace: Pace) -> Result<bool, StoreError> {
+        while guard.folded < until {
+            let Some(gathered) = self.gather(guard, until, pace).await? else {
+                return Ok(false);
+            };
+            let revision = gathered.revision;
+            if revision == guard.folded {
+                // There is nothing in the log.
+                return Ok(true);
+            }
+            let mut steps = gathered.steps().into_iter().peekable();
+            while let Some(step) = steps.next() {
+                let begun = Instant::now();
+                let next = Guard {
+                    turn: guard.turn + 1,
+                    folded: if steps.peek().is_none() { revision } else { guard.folded },
+                    ..guard
+                };
+                let change = doc! { "turn": next.turn, "folded": next.folded };
+                let mut commands = vec![advance(guard.not_folded(), change)];
+                commands.extend(document_updates(&step));
+                if !self.guarded(commands).await? {
+                    return Ok(false);
+                }
+                guard = next;
+                if pace != Pace::Urgent {
+                    *self.turn.lock() = Some(guard.turn);
+                }
+                pace.rest(begun).await;
+            }
         }
-        let part = Part {
-            after: guard.folded,
-            records: STEP,
-            whole: false,
-        };
-        let (records, _) = self.read_records(part).await?;
-        let Some(last) = records.last().map(|record| record.last) else {
-            return Ok(false);
-        };
-        let mut versions: Vec<_> = records.into_iter().flat_map(|record| record.versions).collect();
-        versions.retain(|version| version.revision > guard.folded);
-        let mut commands = vec![advance(guard, doc! { "folded": last })];
-        commands.extend(document_updates(&versions));
-        self.guarded(commands).await?;
         Ok(true)
+    }
+
+    /// Reads what the documents are that changed up to a revision, or up to one before it if there is much; `None` if
+    /// another one has been faster meanwhile.
+    async fn gather(&self, guard: Guard, until: i64, pace: Pace) -> Result<Option<Gathered>, StoreError> {
+        let mut gathered = Gathered {
+            revision: guard.folded,
+            ..Gathered::default()
+        };
+        loop {
+            let begun = Instant::now();
+            let part = Part {
+                after: gathered.revision,
+                records: RECORDS,
+                whole: false,
+            };
+            let (records, _) = self.read_records(part).await?;
+            let Some(last) = records.last().map(|record| record.last) else {
+                return Ok(Some(gathered));
+            };
+            for record in records {
+                gathered.read += record.bytes();
+                let above = gathered.revision;
+                record
+                    .versions
+                    .into_iter()
+                    .filter(|version| version.revision > above)
+                    .for_each(|version| gathered.add(version));
+            }
+            gathered.revision = last;
+            if gathered.revision >= until || gathered.is_full() {
+                return Ok(Some(gathered));
+            }
+            pace.rest(begun).await;
+            if self.read_guard().await?.turn != guard.turn {
+                return Ok(None);
+            }
+        }
     }
 
     /// Runs commands in one transaction; the first one must find the guard as it was. `false` if it did not.
@@ -173,7 +310,66 @@ impl MongoStore {
     }
 }
 
-/// A command that changes the guard, as long as it is as it was.
-pub(super) fn advance(guard: Guard, change: Document) -> Document {
-    doc! { "update": "documents", "updates": [{ "q": guard.unchanged(), "u": { "$set": change } }] }
+/// A command that changes the guard, as long as it is a certain one.
+pub(super) fn advance(guard: Document, change: Document) -> Document {
+    doc! { "update": "documents", "updates": [{ "q": guard, "u": { "$set": change } }] }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(key: &str, revision: i64, bytes: usize) -> VersionRow {
+        VersionRow {
+            key: key.to_owned(),
+            revision,
+            position: 0,
+            op: "update".to_owned(),
+            previous: None,
+            time: 0,
+            subject: String::new(),
+            request_id: String::new(),
+            paths: String::new(),
+            document: "x".repeat(bytes),
+        }
+    }
+
+    #[test]
+    fn a_document_is_written_once_however_often_it_changed() {
+        let mut gathered = Gathered::default();
+        for revision in 1..=1_000 {
+            gathered.add(row("Node/a", revision, 500));
+            gathered.add(row("Node/b", revision, 300));
+        }
+        assert_eq!(gathered.bytes, 800 + 2 * rows::OVERHEAD_BYTES);
+        let steps = gathered.steps();
+        assert_eq!(steps.len(), 1);
+        assert!(steps[0].iter().all(|row| row.revision == 1_000));
+    }
+
+    #[test]
+    fn steps_are_bounded_by_documents_and_by_bytes() {
+        let mut gathered = Gathered::default();
+        for number in 0..1_050 {
+            gathered.add(row(&format!("Node/{number}"), 1, 100));
+        }
+        let steps = gathered.steps();
+        assert_eq!(steps.len(), 11);
+        assert!(steps.iter().all(|step| step.len() <= STEP));
+        let mut gathered = Gathered::default();
+        for number in 0..12 {
+            gathered.add(row(&format!("Node/{number}"), 1, 256 * 1024));
+        }
+        assert_eq!(gathered.steps().iter().map(Vec::len).collect::<Vec<_>>(), [4, 4, 4]);
+        assert_eq!(Gathered::default().steps(), [Vec::new()], "a revision without changes");
+    }
+
+    #[test]
+    fn what_is_gathered_is_bounded() {
+        let mut gathered = Gathered::default();
+        while !gathered.is_full() {
+            gathered.add(row(&format!("Node/{}", gathered.rows.len()), 1, 256 * 1024));
+        }
+        assert!(gathered.rows.len() < 130);
+    }
 }

@@ -72,7 +72,7 @@ impl MongoStore {
     }
 
     async fn insert_floor(&self) -> Result<(), StoreError> {
-        let floor = doc! { "$setOnInsert": { FLOOR: 0_i64, "folded": 0_i64, "rewrites": 0_i64 } };
+        let floor = doc! { "$setOnInsert": { FLOOR: 0_i64, "folded": 0_i64, "turn": 0_i64, "rewrites": 0_i64 } };
         let insert = self
             .tables
             .documents

@@ -3,7 +3,8 @@
 //! ```text
 //! events      the log: one record per group of commits, _id = its first revision (the fence between writers), with their
 //!             changes, audit entries and answers to repeat
-//! documents   one record per document, _id = key: what was at revision `folded`; and `floor`, the guard of the log
+//! documents   one record per document, _id = key: what was at revision `folded`, or later; and `floor`, the guard of the
+//!             log
 //! versions    history below the floor, one record per change, _id = key@revision; and changes that a record of the log
 //!             had no room for
 //! audit, idempotency   of commits below the floor, and of what was no commit; removed by the server when they expire
@@ -69,9 +70,11 @@ pub struct MongoStore {
     doubt: AtomicU64,
     /// What is known of the newest revision.
     fence: parking_lot::Mutex<Fence>,
-    /// When the documents were last brought up to date with the log, and how often that is done at least.
-    folded: parking_lot::Mutex<Option<Instant>>,
+    /// When the documents were last brought up to date with the log, or the store was opened; and how long that is left.
+    folded: parking_lot::Mutex<Instant>,
     fold_period: Duration,
+    /// The guard's turn at the last look that was in no hurry, or after the last step of its own.
+    turn: parking_lot::Mutex<Option<i64>>,
     /// Records up to this revision were removed already, if they could be.
     removed: parking_lot::Mutex<i64>,
     /// The session of large commits; none before the first one, and while one is under way.
@@ -181,8 +184,9 @@ impl MongoStore {
             members: None,
             doubt: AtomicU64::new(0),
             fence: parking_lot::Mutex::default(),
-            folded: parking_lot::Mutex::default(),
+            folded: parking_lot::Mutex::new(Instant::now()),
             fold_period: fold::FOLD_PERIOD,
+            turn: parking_lot::Mutex::default(),
             removed: parking_lot::Mutex::default(),
             session: tokio::sync::Mutex::new(None),
             stream: tokio::sync::Mutex::new(None),

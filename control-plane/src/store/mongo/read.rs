@@ -365,7 +365,7 @@ mod tests {
     #[test]
     fn a_store_without_commits_is_at_its_floor() {
         let meta = doc! { "_id": "store", "store_id": "s" };
-        let floor = doc! { "_id": FLOOR, "floor": 9_i64, "folded": 9_i64, "rewrites": 0_i64 };
+        let floor = doc! { "_id": FLOOR, "floor": 9_i64, "folded": 9_i64, "turn": 0_i64, "rewrites": 0_i64 };
         let found = parts(Some(&meta), std::slice::from_ref(&floor)).unwrap();
         let found = found.with(Vec::new()).unwrap();
         assert_eq!((found.revision, found.floor, found.documents.len()), (9, 9, 0));
@@ -378,7 +378,7 @@ mod tests {
         let meta = doc! { "_id": "store", "store_id": "s" };
         let text = version("", 0, "").document;
         let found = [
-            doc! { "_id": FLOOR, "floor": 2_i64, "folded": 5_i64, "rewrites": 0_i64 },
+            doc! { "_id": FLOOR, "floor": 2_i64, "folded": 5_i64, "turn": 0_i64, "rewrites": 0_i64 },
             doc! { "_id": "Node/a", "revision": 5_i64, "document": &text },
             doc! { "_id": "Node/b", "revision": 5_i64, "document": &text },
         ];

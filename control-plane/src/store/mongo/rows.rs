@@ -17,8 +17,10 @@ pub(super) const FLOOR: &str = "floor";
 pub(super) struct Guard {
     /// Commits up to this revision are gone.
     pub(super) floor: i64,
-    /// The documents are those of this revision.
+    /// The documents are those of this revision, or newer where they are being brought up to date.
     pub(super) folded: i64,
+    /// How many steps that has taken.
+    pub(super) turn: i64,
     /// How often the log was rewritten: what was read of it before is out of date.
     pub(super) rewrites: i64,
 }
@@ -28,13 +30,19 @@ impl Guard {
         Ok(Self {
             floor: integer(found, FLOOR)?,
             folded: integer(found, "folded")?,
+            turn: integer(found, "turn")?,
             rewrites: integer(found, "rewrites")?,
         })
     }
 
-    /// The record as long as it is this one.
-    pub(super) fn unchanged(self) -> Document {
-        doc! { "_id": FLOOR, FLOOR: self.floor, "folded": self.folded, "rewrites": self.rewrites }
+    /// The record as long as nobody else has brought documents up to date.
+    pub(super) fn not_folded(self) -> Document {
+        doc! { "_id": FLOOR, "folded": self.folded, "turn": self.turn, "rewrites": self.rewrites }
+    }
+
+    /// The record as long as the floor is this one, and may be raised to another.
+    pub(super) fn not_raised(self, floor: i64) -> Document {
+        doc! { "_id": FLOOR, FLOOR: self.floor, "folded": { "$gte": floor }, "rewrites": self.rewrites }
     }
 }
 

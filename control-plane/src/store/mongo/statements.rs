@@ -8,7 +8,7 @@
 use mongodb::bson::{Document, doc};
 
 use super::rows::{self, OVERHEAD_BYTES};
-use crate::store::encode::{EncodedCommit, last_versions};
+use crate::store::encode::EncodedCommit;
 use crate::store::rows::VersionRow;
 
 /// Bytes of one record, about; one BSON document has at most 16 MiB.
@@ -16,9 +16,6 @@ const RECORD_BYTES: usize = 12 * 1024 * 1024;
 /// Commits of one record, at most.
 pub(super) const RECORD_COMMITS: i64 = 1_000;
 const MOST_COMMITS: usize = 1_000;
-/// Bytes and documents of one command that updates.
-const COMMAND_BYTES: usize = 6 * 1024 * 1024;
-const COMMAND_DOCUMENTS: usize = 10_000;
 
 /// What is written.
 pub(super) struct Statements {
@@ -78,28 +75,22 @@ fn beside(commit: &EncodedCommit) -> usize {
     audit.sum::<usize>() + answer + 2 * OVERHEAD_BYTES
 }
 
-/// Commands that bring the current documents up to date with these changes, ascending.
-pub(super) fn document_updates(versions: &[VersionRow]) -> Vec<Document> {
-    let (mut updates, mut commands, mut bytes) = (Vec::new(), Vec::new(), 0);
-    let last = last_versions(versions);
-    for row in last.values().filter(|row| !row.is_deletion()) {
-        if bytes + row.document.len() > COMMAND_BYTES || updates.len() >= COMMAND_DOCUMENTS {
-            commands.push(update_command("documents", std::mem::take(&mut updates)));
-            bytes = 0;
-        }
-        bytes += row.document.len() + OVERHEAD_BYTES;
-        updates.push(doc! {
-            "q": { "_id": &row.key },
-            "u": { "revision": row.revision, "document": &row.document },
-            "upsert": true,
-        });
+/// Commands that make documents what they are after these changes, of which each is of another document.
+pub(super) fn document_updates(rows: &[VersionRow]) -> Vec<Document> {
+    let (gone, there): (Vec<&VersionRow>, Vec<&VersionRow>) = rows.iter().partition(|row| row.is_deletion());
+    let mut commands = Vec::new();
+    if !there.is_empty() {
+        let update = |row: &&VersionRow| {
+            doc! {
+                "q": { "_id": &row.key },
+                "u": { "revision": row.revision, "document": &row.document },
+                "upsert": true,
+            }
+        };
+        commands.push(update_command("documents", there.iter().map(update).collect()));
     }
-    if !updates.is_empty() {
-        commands.push(update_command("documents", updates));
-    }
-    let gone = last.values().filter(|row| row.is_deletion());
-    let gone: Vec<&str> = gone.map(|row| row.key.as_str()).collect();
     if !gone.is_empty() {
+        let gone: Vec<&str> = gone.iter().map(|row| row.key.as_str()).collect();
         commands.push(doc! { "delete": "documents", "deletes": [{ "q": { "_id": { "$in": gone } }, "limit": 0 }] });
     }
     commands
@@ -116,10 +107,6 @@ mod tests {
     use crate::store::conformance::samples::{answer, change, commit, commit_of, record};
     use crate::store::encode::encode_group;
 
-    fn versions(group: &[EncodedCommit]) -> Vec<VersionRow> {
-        group.iter().flat_map(|commit| commit.versions.clone()).collect()
-    }
-
     #[test]
     fn a_group_is_one_record() {
         let group = encode_group(&[record(commit(4, &["a", "b"])), record(commit(5, &["c"]))]).unwrap();
@@ -130,24 +117,21 @@ mod tests {
     }
 
     #[test]
-    fn only_the_last_state_of_a_document_is_written() {
+    fn documents_are_replaced_and_removed() {
         let group = encode_group(&[
-            record(commit(1, &["a", "b"])),
-            record(commit_of(
-                2,
-                vec![change(Op::Update, "a", 2, Some(1)), change(Op::Delete, "b", 2, Some(1))],
-            )),
-            record(commit(3, &["b"])),
-            record(commit_of(4, vec![change(Op::Delete, "a", 4, Some(2))])),
+            record(commit(1, &["a"])),
+            record(commit_of(2, vec![change(Op::Delete, "b", 2, Some(1))])),
         ])
         .unwrap();
-        let commands = document_updates(&versions(&group));
+        let rows: Vec<VersionRow> = group.into_iter().flat_map(|commit| commit.versions).collect();
+        let commands = document_updates(&rows);
         assert_eq!(commands.len(), 2);
         assert_eq!(commands[0].get_array("updates").unwrap().len(), 1);
         assert_eq!(
             commands[1],
-            doc! { "delete": "documents", "deletes": [{ "q": { "_id": { "$in": ["Node/a"] } }, "limit": 0 }] }
+            doc! { "delete": "documents", "deletes": [{ "q": { "_id": { "$in": ["Node/b"] } }, "limit": 0 }] }
         );
+        assert!(document_updates(&[]).is_empty());
     }
 
     fn large(revision: u64, documents: u32) -> crate::store::CommitRecord {
@@ -188,8 +172,5 @@ mod tests {
         }
         assert_eq!(records[2].versions.len() + statements.versions.len(), 100);
         assert!(records[2].versions.len() > 40);
-        for command in document_updates(&versions(&group)) {
-            assert!(command.to_vec().unwrap().len() < 8 * 1024 * 1024);
-        }
     }
 }

@@ -60,7 +60,7 @@ impl MongoStore {
         };
         let (records, _) = self.read_records(part).await?;
         let floor = records.last().map_or(wanted, |record| record.last.min(wanted));
-        let mut commands = vec![advance(guard, doc! { rows::FLOOR: floor })];
+        let mut commands = vec![advance(guard.not_raised(floor), doc! { rows::FLOOR: floor })];
         commands.extend(copies(records, guard.floor, floor, keep));
         self.guarded(commands).await?;
         Ok(())

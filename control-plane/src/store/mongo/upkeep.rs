@@ -9,7 +9,7 @@ use tokio::sync::mpsc;
 
 use super::client::{LONG, USUAL, limited};
 use super::errors::write_error;
-use super::rows::{self, FLOOR, Guard};
+use super::rows::{self, FLOOR, Guard, Record};
 use super::statements::RECORD_COMMITS;
 use super::{MongoStore, collect};
 use crate::store::StoreError;
@@ -89,8 +89,13 @@ impl MongoStore {
         let above = doc! { "last": { "$gt": guard.floor }, "_id": { "$gt": guard.floor - RECORD_COMMITS } };
         let find = events.find(above).sort(doc! { "_id": 1 });
         let mut cursor = limited(USUAL, async { find.session(&mut *session).await }).await?;
-        while let Some(found) = next(&mut cursor, session).await? {
-            let record = rows::read_record(&found)?;
+        let mut ahead = read_next(&mut cursor, session).await?;
+        while let Some(record) = ahead.take() {
+            ahead = read_next(&mut cursor, session).await?;
+            if ahead.as_ref().is_some_and(|next| next.first <= record.last) {
+                // It lies under others, so it came too late: see `fence`.
+                continue;
+            }
             let lacking: Vec<i64> = record.incomplete().collect();
             for version in record.versions {
                 if version.revision > guard.folded {
@@ -355,6 +360,14 @@ async fn next(
     session: &mut ClientSession,
 ) -> Result<Option<Document>, StoreError> {
     limited(USUAL, async { cursor.next(session).await.transpose() }).await
+}
+
+async fn read_next(
+    cursor: &mut mongodb::SessionCursor<Document>,
+    session: &mut ClientSession,
+) -> Result<Option<Record>, StoreError> {
+    let found = next(cursor, session).await?;
+    found.as_ref().map(rows::read_record).transpose()
 }
 
 /// Rows on their way into an empty store, by table.
