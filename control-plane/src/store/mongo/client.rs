@@ -48,7 +48,7 @@ pub(super) struct Tables {
     pub(super) tokens: Collection<Document>,
     /// By which our transactions are known among those on the server.
     pub(super) app_name: String,
-    /// Of the replica set one member can be its primary, as far as was known when it was connected to.
+    /// Only one member of the replica set can be its primary, as far as was known when it was connected to.
     pub(super) is_single: bool,
 }
 

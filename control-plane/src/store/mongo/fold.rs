@@ -6,9 +6,9 @@
 //! loading = documents of r, some of which are newer already, and the commits above r
 //! ```
 //!
-//! However often a document has changed, it is written once. Each step counts up `turn` in the guard, and finds it as the
-//! step before has left it: of two processes that are at it one is overtaken, and stops. What it has written stays, and
-//! harms nobody: whatever changed above r is taken from the log.
+//! However often a document has changed, it is written once. Each read and each step counts up `turn` in the guard, and
+//! finds it as the one before has left it: of two processes that are at it one is overtaken, and stops. What it has written
+//! stays, and harms nobody: whatever changed above r is taken from the log.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -29,7 +29,8 @@ use crate::store::StoreError;
 use crate::store::encode::signed;
 use crate::store::rows::VersionRow;
 
-/// Between two times that the documents are brought up to date.
+/// Between two times that the documents are brought up to date, by whichever process. If another one was at it, this one
+/// looks again after as long.
 pub(super) const FOLD_PERIOD: Duration = Duration::from_secs(30);
 /// How much longer it may take until it hurries: what is behind has to be read, and kept in memory, by whoever starts.
 const LATE: Duration = Duration::from_secs(30);
@@ -44,10 +45,11 @@ const STEP: usize = 100;
 const STEP_BYTES: usize = 1024 * 1024;
 /// How many times as long as each read and each step the rest after it is.
 const REST: u32 = 3;
-/// The longest of them: others look once a second whether somebody is at it.
+/// The longest of them.
 const LONGEST_REST: Duration = Duration::from_millis(500);
-/// Before one that was overtaken tries again, if it cannot wait.
-const AGAIN: std::ops::Range<Duration> = Duration::from_millis(10)..Duration::from_millis(100);
+/// Before one that was overtaken looks again, if it cannot wait: longer than what another one that is in a hurry needs
+/// between two of its turns.
+const AGAIN: std::ops::Range<Duration> = Duration::from_millis(100)..Duration::from_millis(500);
 /// Revisions whose records one command removes.
 const REMOVED: i64 = 1_000;
 
@@ -115,31 +117,24 @@ fn size(row: &VersionRow) -> usize {
 impl MongoStore {
     /// What can wait: bringing the documents up to date, removing what is below the floor.
     pub(super) async fn tidy_up(&self) -> Result<(), StoreError> {
+        let guard = self.read_guard().await?;
+        let seen = *self.turn.lock().get_or_insert(guard.turn);
         let due = *self.folded.lock() + self.fold_period;
-        if Instant::now() >= due && self.fold_calmly(due + LATE).await? {
+        if Instant::now() >= due {
+            // If the turn has moved since, another process is at it, or was.
+            let is_ours = seen == guard.turn && {
+                let head = signed(self.read_head().await?);
+                self.fold(guard, head, Pace::CalmUntil(due + LATE)).await?
+            };
+            if !is_ours {
+                *self.turn.lock() = None;
+            }
             *self.folded.lock() = Instant::now();
         }
-        let floor = self.read_floor().await?;
-        self.remove_records(signed(floor)).await
+        self.remove_records(guard.floor).await
     }
 
-    /// Brings the documents up to date, with rests up to a time; `false` if another one is at it.
-    async fn fold_calmly(&self, until: Instant) -> Result<bool, StoreError> {
-        let head = signed(self.read_head().await?);
-        let guard = self.read_guard().await?;
-        // Whoever is at it has moved the turn since the last look.
-        if self
-            .turn
-            .lock()
-            .replace(guard.turn)
-            .is_some_and(|seen| seen != guard.turn)
-        {
-            return Ok(false);
-        }
-        self.fold(guard, head, Pace::CalmUntil(until)).await
-    }
-
-    /// Brings the documents to a revision, at least.
+    /// Brings the documents to a revision, at least. Whoever is at it without hurry is overtaken.
     pub(super) async fn fold_until(&self, revision: i64) -> Result<Guard, StoreError> {
         let mut turn = None;
         loop {
@@ -147,7 +142,7 @@ impl MongoStore {
             if guard.folded >= revision {
                 return Ok(guard);
             }
-            // What another one is at need not be done twice.
+            // Another one that has overtaken this is waited for while its turn moves.
             if turn.replace(guard.turn).is_none_or(|seen| seen == guard.turn)
                 && self.fold(guard, revision, Pace::Urgent).await?
             {
@@ -157,34 +152,26 @@ impl MongoStore {
         }
     }
 
-    /// Brings the documents from those of a guard to a revision; `false` if another one was faster, or has rewritten them.
+    /// Brings the documents from those of a guard to a revision; `false` if another one has overtaken it, or has rewritten
+    /// them.
     async fn fold(&self, mut guard: Guard, until: i64, pace: Pace) -> Result<bool, StoreError> {
         while guard.folded < until {
-            let Some(gathered) = self.gather(guard, until, pace).await? else {
+            let Some((claimed, gathered)) = self.gather(guard, until, pace).await? else {
                 return Ok(false);
             };
+            guard = claimed;
             let revision = gathered.revision;
             if revision == guard.folded {
                 // There is nothing in the log.
                 return Ok(true);
             }
             let mut steps = gathered.steps().into_iter().peekable();
-            while let Some(step) = steps.next() {
+            while let Some(rows) = steps.next() {
                 let begun = Instant::now();
-                let next = Guard {
-                    turn: guard.turn + 1,
-                    folded: if steps.peek().is_none() { revision } else { guard.folded },
-                    ..guard
-                };
-                let change = doc! { "turn": next.turn, "folded": next.folded };
-                let mut commands = vec![advance(guard.not_folded(), change)];
-                commands.extend(document_updates(&step));
-                if !self.guarded(commands).await? {
-                    return Ok(false);
-                }
-                guard = next;
-                if pace != Pace::Urgent {
-                    *self.turn.lock() = Some(guard.turn);
+                let folded = if steps.peek().is_none() { revision } else { guard.folded };
+                match self.step(guard, folded, &rows, pace).await? {
+                    Some(next) => guard = next,
+                    None => return Ok(false),
                 }
                 pace.rest(begun).await;
             }
@@ -193,14 +180,18 @@ impl MongoStore {
     }
 
     /// Reads what the documents are that changed up to a revision, or up to one before it if there is much; `None` if
-    /// another one has been faster meanwhile.
-    async fn gather(&self, guard: Guard, until: i64, pace: Pace) -> Result<Option<Gathered>, StoreError> {
+    /// another one has overtaken this. The turn is taken before each read, so that all see who is at it.
+    async fn gather(&self, mut guard: Guard, until: i64, pace: Pace) -> Result<Option<(Guard, Gathered)>, StoreError> {
         let mut gathered = Gathered {
             revision: guard.folded,
             ..Gathered::default()
         };
         loop {
             let begun = Instant::now();
+            match self.step(guard, guard.folded, &[], pace).await? {
+                Some(next) => guard = next,
+                None => return Ok(None),
+            }
             let part = Part {
                 after: gathered.revision,
                 records: RECORDS,
@@ -208,7 +199,7 @@ impl MongoStore {
             };
             let (records, _) = self.read_records(part).await?;
             let Some(last) = records.last().map(|record| record.last) else {
-                return Ok(Some(gathered));
+                return Ok(Some((guard, gathered)));
             };
             for record in records {
                 gathered.read += record.bytes();
@@ -221,13 +212,30 @@ impl MongoStore {
             }
             gathered.revision = last;
             if gathered.revision >= until || gathered.is_full() {
-                return Ok(Some(gathered));
+                return Ok(Some((guard, gathered)));
             }
             pace.rest(begun).await;
-            if self.read_guard().await?.turn != guard.turn {
-                return Ok(None);
-            }
         }
+    }
+
+    /// One transaction: the next turn, and documents. Gives the guard as it is then; `None` if it was another one before.
+    async fn step(
+        &self,
+        guard: Guard,
+        folded: i64,
+        rows: &[VersionRow],
+        pace: Pace,
+    ) -> Result<Option<Guard>, StoreError> {
+        let turn = guard.turn + 1;
+        let mut commands = vec![advance(guard.not_folded(), doc! { "turn": turn, "folded": folded })];
+        commands.extend(document_updates(rows));
+        if !self.guarded(commands).await? {
+            return Ok(None);
+        }
+        if pace != Pace::Urgent {
+            *self.turn.lock() = Some(turn);
+        }
+        Ok(Some(Guard { turn, folded, ..guard }))
     }
 
     /// Runs commands in one transaction; the first one must find the guard as it was. `false` if it did not.

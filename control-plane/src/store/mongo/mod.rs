@@ -73,7 +73,7 @@ pub struct MongoStore {
     /// When the documents were last brought up to date with the log, or the store was opened; and how long that is left.
     folded: parking_lot::Mutex<Instant>,
     fold_period: Duration,
-    /// The guard's turn at the last look that was in no hurry, or after the last step of its own.
+    /// The guard's turn when that was last looked at, or after the last step of this process that was in no hurry.
     turn: parking_lot::Mutex<Option<i64>>,
     /// Records up to this revision were removed already, if they could be.
     removed: parking_lot::Mutex<i64>,
@@ -106,7 +106,8 @@ impl MongoStore {
         Ok(store)
     }
 
-    /// Removes records below the floor at once, where others are sure not to be late: for tests.
+    /// Removes records below the floor at once, where others are sure not to be late, and brings the documents up to date at
+    /// each tidying: for tests.
     #[cfg(any(test, feature = "conformance"))]
     #[must_use]
     pub fn in_a_hurry(self) -> Self {
