@@ -34,8 +34,9 @@ use crate::store::rows::VersionRow;
 pub(super) const FOLD_PERIOD: Duration = Duration::from_secs(30);
 /// How much longer it may take until it hurries: what is behind has to be read, and kept in memory, by whoever starts.
 const LATE: Duration = Duration::from_secs(30);
-/// Records that are read at once.
+/// Records, and bytes of them, that are read at once.
 const RECORDS: usize = 1_000;
+const RECORDS_BYTES: i64 = 1024 * 1024;
 /// Documents, bytes of them, and bytes of the log that are read before something is written.
 const GATHERED: usize = 20_000;
 const GATHERED_BYTES: usize = 32 * 1024 * 1024;
@@ -195,6 +196,7 @@ impl MongoStore {
             let part = Part {
                 after: gathered.revision,
                 records: RECORDS,
+                bytes: RECORDS_BYTES,
                 whole: false,
             };
             let (records, _) = self.read_records(part).await?;

@@ -29,6 +29,8 @@ pub(super) struct Part {
     pub(super) after: i64,
     /// At most so many records.
     pub(super) records: usize,
+    /// At most so many bytes, about.
+    pub(super) bytes: i64,
     /// With audit and answers.
     pub(super) whole: bool,
 }
@@ -97,6 +99,7 @@ impl MongoStore {
         let part = Part {
             after: signed(after),
             records: limit.max(1),
+            bytes: READ_BYTES,
             whole: false,
         };
         let (records, all) = self.read_records(part).await?;
@@ -127,8 +130,7 @@ impl MongoStore {
         })
     }
 
-    /// Records with commits after a revision, ascending, as many as [`READ_BYTES`] allow but at least one; and whether
-    /// these are all. The first one may begin with older commits.
+    /// Records with commits after a revision, ascending, as many as may be but at least one; and whether these are all. The first one may begin with older commits.
     pub(super) async fn read_records(&self, part: Part) -> Result<(Vec<Record>, bool), StoreError> {
         let next = doc! { "_id": { "$gt": part.after } };
         let (mut records, all) = self.find_records(next, part).await?;
@@ -166,7 +168,7 @@ impl MongoStore {
                 let record = rows::read_record(&found)?;
                 bytes += record.bytes();
                 count += 1;
-                let is_full = records.len() >= part.records || bytes > READ_BYTES;
+                let is_full = records.len() >= part.records || bytes > part.bytes;
                 records.push(record);
                 if is_full && records.len() > 1 {
                     drop_late(&mut records);

@@ -22,7 +22,7 @@ use crate::store::encode::{signed, unsigned};
 use crate::store::retain::{Trimmed, to_spare};
 use crate::store::rows::VersionRow;
 use crate::store::upkeep::now;
-use crate::store::{AUDIT_KEPT_MS, StoreError};
+use crate::store::{AUDIT_KEPT_MS, READ_BYTES, StoreError};
 
 /// Records that one step moves, and versions that one command removes.
 const STEP: usize = 1_000;
@@ -56,6 +56,7 @@ impl MongoStore {
         let part = Part {
             after: guard.floor,
             records: STEP,
+            bytes: READ_BYTES,
             whole: true,
         };
         let (records, _) = self.read_records(part).await?;
