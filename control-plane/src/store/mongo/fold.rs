@@ -119,17 +119,24 @@ impl MongoStore {
     /// What can wait: bringing the documents up to date, removing what is below the floor.
     pub(super) async fn tidy_up(&self) -> Result<(), StoreError> {
         let guard = self.read_guard().await?;
-        let seen = *self.turn.lock().get_or_insert(guard.turn);
         let due = *self.folded.lock() + self.fold_period;
-        if Instant::now() >= due {
-            // If the turn has moved since, another process is at it, or was.
-            let is_ours = seen == guard.turn && {
-                let head = signed(self.read_head().await?);
-                self.fold(guard, head, Pace::CalmUntil(due + LATE)).await?
-            };
-            if !is_ours {
+        let is_due = Instant::now() >= due;
+        let is_quiet = {
+            let mut seen = self.turn.lock();
+            let is_quiet = *seen == Some(guard.turn);
+            if is_due || seen.is_none() {
+                *seen = Some(guard.turn);
+            }
+            is_quiet
+        };
+        // If the turn has moved since the last look, another process is at it, or was.
+        if is_due && is_quiet {
+            let head = signed(self.read_head().await?);
+            if !self.fold(guard, head, Pace::CalmUntil(due + LATE)).await? {
                 *self.turn.lock() = None;
             }
+        }
+        if is_due {
             *self.folded.lock() = Instant::now();
         }
         self.remove_records(guard.floor).await
