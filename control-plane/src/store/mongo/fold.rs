@@ -365,6 +365,33 @@ mod tests {
     }
 
     #[test]
+    fn only_the_last_state_of_a_document_is_written() {
+        let mut gathered = Gathered::default();
+        for (key, revision, op) in [
+            ("Node/a", 1, "create"),
+            ("Node/b", 1, "create"),
+            ("Node/a", 2, "update"),
+            ("Node/b", 2, "delete"),
+            ("Node/b", 3, "create"),
+            ("Node/a", 4, "delete"),
+        ] {
+            let op = op.to_owned();
+            gathered.add(VersionRow {
+                op,
+                ..row(key, revision, 10)
+            });
+        }
+        let steps = gathered.steps();
+        let commands = document_updates(&steps[0]);
+        assert_eq!((steps.len(), commands.len()), (1, 2));
+        assert_eq!(commands[0].get_array("updates").unwrap().len(), 1);
+        assert_eq!(
+            commands[1],
+            doc! { "delete": "documents", "deletes": [{ "q": { "_id": { "$in": ["Node/a"] } }, "limit": 0 }] }
+        );
+    }
+
+    #[test]
     fn steps_are_bounded_by_documents_and_by_bytes() {
         let mut gathered = Gathered::default();
         for number in 0..1_050 {
@@ -377,7 +404,11 @@ mod tests {
         for number in 0..12 {
             gathered.add(row(&format!("Node/{number}"), 1, 256 * 1024));
         }
-        assert_eq!(gathered.steps().iter().map(Vec::len).collect::<Vec<_>>(), [4, 4, 4]);
+        let steps = gathered.steps();
+        assert_eq!(steps.iter().map(Vec::len).collect::<Vec<_>>(), [4, 4, 4]);
+        for command in steps.iter().flat_map(|step| document_updates(step)) {
+            assert!(command.to_vec().unwrap().len() < 8 * 1024 * 1024);
+        }
         assert_eq!(Gathered::default().steps(), [Vec::new()], "a revision without changes");
     }
 

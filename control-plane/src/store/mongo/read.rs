@@ -130,7 +130,8 @@ impl MongoStore {
         })
     }
 
-    /// Records with commits after a revision, ascending, as many as may be but at least one; and whether these are all. The first one may begin with older commits.
+    /// Records with commits after a revision, ascending, as many as may be but at least one; and whether these are all. The
+    /// first one may begin with older commits.
     pub(super) async fn read_records(&self, part: Part) -> Result<(Vec<Record>, bool), StoreError> {
         let next = doc! { "_id": { "$gt": part.after } };
         let (mut records, all) = self.find_records(next, part).await?;
