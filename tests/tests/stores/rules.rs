@@ -5,7 +5,7 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use blaze_config::store::conformance::Fixture;
 use blaze_config::store::{Archive as _, CommitLog as _, FullStore, MongoStore};
-use blaze_tests::servers::{drop_mongo_database, shared_mongo, unique_name};
+use blaze_tests::servers::{drop_mongo_database, mongo_command, shared_mongo, unique_name};
 use parking_lot::Mutex;
 
 use super::support::record;
@@ -58,6 +58,32 @@ mod usually {
 
 mod removing_at_once {
     blaze_config::store_conformance_tests!(async { super::Databases::new(true) });
+}
+
+/// What a process remembers of its own writing is not taken for what the log has.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn documents_follow_the_log_when_it_was_set_back() {
+    let databases = Databases::new(false);
+    let mut found = Vec::new();
+    for written in [2, 3] {
+        let name = unique_name("set-back");
+        databases.made.lock().push(name.clone());
+        let store = MongoStore::open(&databases.uri, &name).await.unwrap().in_a_hurry();
+        store.tidy().await.unwrap();
+        for revision in 1..=written {
+            let record = record(revision, &format!("batch-{revision}"));
+            store.commit(&[record]).await.unwrap();
+        }
+        // As a majority does that was lost, or a snapshot of the disk.
+        let gone = serde_json::json!({ "delete": "events", "deletes": [{ "q": { "_id": 3 }, "limit": 1 }] });
+        mongo_command(&databases.uri, &name, &gone).unwrap();
+        store.tidy().await.unwrap();
+        let other = MongoStore::open(&databases.uri, &name).await.unwrap();
+        let loaded = other.load().await.unwrap();
+        found.push((loaded.revision, loaded.documents.len()));
+    }
+    assert_eq!(found[0], found[1]);
+    assert_eq!(found[0].0, 2);
 }
 
 /// What was trimmed is gone from the log too, but for its newest record; not before it is safe.

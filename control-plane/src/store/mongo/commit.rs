@@ -218,7 +218,7 @@ impl MongoStore {
     }
 
     /// Which batch has a revision, as no crash can change it any more.
-    async fn batch_at(&self, revision: i64) -> Result<Option<String>, StoreError> {
+    pub(super) async fn batch_at(&self, revision: i64) -> Result<Option<String>, StoreError> {
         // Once a majority has a later write, it has whatever was in the way of the insertion.
         let count = doc! { "$inc": { "count": 1_i64 } };
         let later = self

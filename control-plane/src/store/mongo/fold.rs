@@ -72,9 +72,9 @@ impl Pace {
 }
 
 /// What documents are at a revision.
-#[derive(Default)]
-struct Gathered {
-    revision: i64,
+#[derive(Debug, Default)]
+pub(super) struct Gathered {
+    pub(super) revision: i64,
     rows: BTreeMap<String, VersionRow>,
     bytes: usize,
     /// Of the log.
@@ -82,19 +82,30 @@ struct Gathered {
 }
 
 impl Gathered {
-    fn add(&mut self, row: VersionRow) {
+    pub(super) fn add(&mut self, row: VersionRow) {
         self.bytes += size(&row);
         if let Some(before) = self.rows.insert(row.key.clone(), row) {
             self.bytes -= size(&before);
         }
     }
 
-    fn is_full(&self) -> bool {
+    #[cfg(test)]
+    pub(super) fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// Leaves out what has not changed since a revision.
+    pub(super) fn keep_above(&mut self, revision: i64) {
+        self.rows.retain(|_, row| row.revision > revision);
+        self.bytes = self.rows.values().map(size).sum();
+    }
+
+    pub(super) fn is_full(&self) -> bool {
         self.rows.len() >= GATHERED || self.bytes >= GATHERED_BYTES || self.read >= READ
     }
 
     /// At least one, so that the revision is noted.
-    fn steps(self) -> Vec<Vec<VersionRow>> {
+    pub(super) fn steps(self) -> Vec<Vec<VersionRow>> {
         let (mut steps, mut bytes) = (vec![Vec::new()], 0);
         for row in self.rows.into_values() {
             let is_full = steps.last().is_some_and(|step: &Vec<_>| step.len() >= STEP) || bytes >= STEP_BYTES;
@@ -119,6 +130,7 @@ impl MongoStore {
     /// What can wait: bringing the documents up to date, removing what is below the floor.
     pub(super) async fn tidy_up(&self) -> Result<(), StoreError> {
         let guard = self.read_guard().await?;
+        self.recent.lock().look_at(guard);
         let due = *self.folded.lock() + self.fold_period;
         let is_due = Instant::now() >= due;
         let is_quiet = {
@@ -187,8 +199,9 @@ impl MongoStore {
         Ok(true)
     }
 
-    /// Reads what the documents are that changed up to a revision, or up to one before it if there is much; `None` if
-    /// another one has overtaken this. The turn is taken before each read, so that all see who is at it.
+    /// What the documents are that changed up to a revision, or up to one before it if there is much; `None` if another one
+    /// has overtaken this. The turn is taken before each read, so that all see who is at it. What this process has written
+    /// itself is not read.
     async fn gather(&self, mut guard: Guard, until: i64, pace: Pace) -> Result<Option<(Guard, Gathered)>, StoreError> {
         let mut gathered = Gathered {
             revision: guard.folded,
@@ -199,6 +212,11 @@ impl MongoStore {
             match self.step(guard, guard.folded, &[], pace).await? {
                 Some(next) => guard = next,
                 None => return Ok(None),
+            }
+            if gathered.revision == guard.folded
+                && let Some(recent) = self.take_recent(guard).await?
+            {
+                return Ok(Some((guard, recent)));
             }
             let part = Part {
                 after: gathered.revision,
@@ -225,6 +243,20 @@ impl MongoStore {
             }
             pace.rest(begun).await;
         }
+    }
+
+    /// What this process has written itself above the documents, if that is all that was written, and if the log still has
+    /// it: a database that was set back to an earlier time has not.
+    async fn take_recent(&self, guard: Guard) -> Result<Option<Gathered>, StoreError> {
+        let Some(last) = self.recent.lock().last() else {
+            return Ok(None);
+        };
+        let is_there = self.batch_at(last.first).await?.as_ref() == Some(&last.batch);
+        let mut recent = self.recent.lock();
+        if !is_there {
+            recent.forget();
+        }
+        Ok(recent.take_above(guard))
     }
 
     /// One transaction: the next turn, and documents. Gives the guard as it is then; `None` if it was another one before.

@@ -27,6 +27,7 @@ mod follow;
 mod members;
 mod migrate;
 mod read;
+mod recent;
 mod rows;
 mod stale;
 mod statements;
@@ -35,7 +36,7 @@ mod trim;
 mod upkeep;
 
 use std::future::IntoFuture;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -51,6 +52,7 @@ use self::errors::store_error;
 use self::fence::Fence;
 use self::follow::Stream;
 use self::members::Members;
+use self::recent::Recent;
 use super::encode::encode_group;
 use super::migrate::{Migrations, Plan};
 use super::upkeep::{Piece, Restored, Rewriter, Upkeep};
@@ -58,6 +60,9 @@ use super::{
     Archive, AuditEntry, AuditQuery, CommitBatch, CommitError, CommitLog, CommitRecord, IdempotencyRecord, Snapshot,
     StoreError, TokenRecord, TokenStore, Version,
 };
+
+/// Of a record, before one was read.
+const USUAL_RECORD_BYTES: i64 = 16 * 1024;
 
 /// A store in a database of a replica set.
 pub struct MongoStore {
@@ -75,6 +80,10 @@ pub struct MongoStore {
     fold_period: Duration,
     /// The guard's turn when that was last looked at, or after the last step of this process that was in no hurry.
     turn: parking_lot::Mutex<Option<i64>>,
+    /// How large the records were that were read last, on average.
+    record_bytes: AtomicI64,
+    /// What was written and is not in the documents.
+    recent: parking_lot::Mutex<Recent>,
     /// Records up to this revision were removed already, if they could be.
     removed: parking_lot::Mutex<i64>,
     /// The session of large commits; none before the first one, and while one is under way.
@@ -188,6 +197,8 @@ impl MongoStore {
             folded: parking_lot::Mutex::new(Instant::now()),
             fold_period: fold::FOLD_PERIOD,
             turn: parking_lot::Mutex::default(),
+            record_bytes: AtomicI64::new(USUAL_RECORD_BYTES),
+            recent: parking_lot::Mutex::default(),
             removed: parking_lot::Mutex::default(),
             session: tokio::sync::Mutex::new(None),
             stream: tokio::sync::Mutex::new(None),
@@ -247,15 +258,20 @@ impl CommitLog for MongoStore {
     async fn commit(&self, records: &[CommitRecord]) -> Result<(), CommitError> {
         let group = encode_group(records).map_err(CommitError::NotWritten)?;
         let joined = self.admitted().await.map_err(CommitError::NotWritten)?;
+        let rewrites = self.recent.lock().rewrites();
         let done = match self.write_group(&group).await {
             // Another process may have thought that it is alone, and answered reads without this.
             Ok(()) if !self.is_still_admitted(joined) => Err(CommitError::Unknown(commit::stood_still())),
             done => done,
         };
-        if let (Err(CommitError::Unknown(_)), Some(last)) = (&done, group.last()) {
-            // Until these revisions are taken, memory may lack them.
-            self.doubt
-                .fetch_max(last.event.revision.unsigned_abs(), Ordering::AcqRel);
+        match (&done, group.last()) {
+            (Ok(()), _) => self.recent.lock().keep(group, rewrites),
+            (Err(CommitError::Unknown(_)), Some(last)) => {
+                // Until these revisions are taken, memory may lack them.
+                self.doubt
+                    .fetch_max(last.event.revision.unsigned_abs(), Ordering::AcqRel);
+            }
+            (Err(_), _) => {}
         }
         done
     }

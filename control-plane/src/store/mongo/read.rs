@@ -1,6 +1,7 @@
 //! Reading the log and the documents.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use futures::TryStreamExt as _;
@@ -21,6 +22,9 @@ use crate::store::{CommitBatch, READ_BYTES, Snapshot, StoreError};
 
 /// Just after collections were made there is no snapshot of them for a moment.
 const NO_SNAPSHOT: Duration = Duration::from_secs(5);
+
+/// Records that the database sends at once, at least.
+const LEAST_BATCH: usize = 3;
 
 /// Which commits are read together.
 #[derive(Debug, Clone, Copy)]
@@ -155,9 +159,8 @@ impl MongoStore {
     }
 
     async fn find_records(&self, filter: Document, part: Part) -> Result<(Vec<Record>, bool), StoreError> {
-        // One more tells whether there are more, and whether the last one came too late.
-        let limit = i64::try_from(part.records.saturating_add(1)).unwrap_or(i64::MAX);
-        let mut find = self.tables.events.find(filter).sort(doc! { "_id": 1 }).limit(limit);
+        let mut find = self.tables.events.find(filter).sort(doc! { "_id": 1 });
+        find = find.batch_size(batch(part, self.record_bytes.load(Ordering::Relaxed)));
         if !part.whole {
             find = find.projection(doc! { "audit": 0, "answers": 0 });
         }
@@ -169,8 +172,10 @@ impl MongoStore {
                 let record = rows::read_record(&found)?;
                 bytes += record.bytes();
                 count += 1;
+                self.record_bytes.store(bytes / count, Ordering::Relaxed);
                 let is_full = records.len() >= part.records || bytes > part.bytes;
                 records.push(record);
+                // One more tells whether there are more, and whether the last one came too late.
                 if is_full && records.len() > 1 {
                     drop_late(&mut records);
                     if records.len() > 1 {
@@ -180,7 +185,7 @@ impl MongoStore {
                 }
             }
             drop_late(&mut records);
-            Ok((records, count <= part.records))
+            Ok((records, true))
         })
         .await
     }
@@ -195,6 +200,14 @@ impl MongoStore {
         fill(records, super::collect(find, rows::read_version).await?);
         Ok(())
     }
+}
+
+/// How many records the database shall send at once, if they are as large as those before: otherwise it sends a hundred and
+/// one, or 16 MiB of them, however few are wanted. If they are small after large ones, a few at once still do.
+fn batch(part: Part, record_bytes: i64) -> u32 {
+    let within = usize::try_from(part.bytes / record_bytes.max(1)).unwrap_or(usize::MAX);
+    let one_more = within.max(LEAST_BATCH).min(part.records).saturating_add(1);
+    u32::try_from(one_more).unwrap_or(u32::MAX)
 }
 
 /// The newest revision that a majority has.
@@ -349,6 +362,21 @@ impl Parts {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_database_sends_about_as_much_as_is_wanted() {
+        let part = |records, bytes| Part {
+            after: 0,
+            records,
+            bytes,
+            whole: false,
+        };
+        assert_eq!(batch(part(1_000, 1 << 20), 16 << 10), 65);
+        assert_eq!(batch(part(1_000, 1 << 20), 1), 1_001);
+        assert_eq!(batch(part(1, 8 << 20), 16 << 10), 2);
+        assert_eq!(batch(part(1_000, 1 << 20), 9 << 20), 4, "small ones may follow");
+        assert_eq!(batch(part(usize::MAX, i64::MAX), 0), u32::MAX);
+    }
 
     fn version(key: &str, revision: i64, op: &str) -> VersionRow {
         VersionRow {
