@@ -20,7 +20,7 @@ fn run(arguments: &[&str]) -> (bool, String) {
             "--rate",
             "50",
         ])
-        .args(["--seconds", "0.15", "--warm-up", "0.03"])
+        .args(["--seconds", "0.3", "--warm-up", "0.06", "--turns", "2"])
         .args(arguments)
         .output()
         .unwrap();

@@ -96,7 +96,8 @@ pub struct MongoOptions {
     pub host: Option<Host>,
     /// A server that is alone: it has neither transactions nor change streams.
     pub alone: bool,
-    /// Where its folder is made; absent = among temporary files. For measurements, where the disk matters.
+    /// Where its folder is made; absent = among temporary files. For measurements, where the disk matters; it has room then
+    /// like a server that is used, and not the least that tests can do with.
     pub folder: Option<PathBuf>,
     /// Further arguments of `mongod`.
     pub extra: Vec<String>,
@@ -149,9 +150,13 @@ impl MongoServer {
     fn spawn(&self) -> anyhow::Result<()> {
         let mut command = self.endpoint.program(Self::program()?);
         let (ip, port) = (self.endpoint.ip().to_string(), self.endpoint.port.to_string());
+        let (oplog_mib, cache_gib) = match self.options.folder {
+            Some(_) => ("1024", "2"),
+            None => ("64", "0.25"),
+        };
         command
             .args(["--dbpath", "data", "--port", &port, "--bind_ip", &ip, "--nounixsocket"])
-            .args(["--oplogSize", "64", "--wiredTigerCacheSizeGB", "0.25"])
+            .args(["--oplogSize", oplog_mib, "--wiredTigerCacheSizeGB", cache_gib])
             .args(["--setParameter", "diagnosticDataCollectionEnabled=false"]);
         if !self.options.alone {
             command.args(["--replSet", "rs0"]);

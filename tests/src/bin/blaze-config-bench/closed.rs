@@ -9,9 +9,9 @@ use tokio::time::timeout;
 
 use super::clients::{Connection, Way};
 use super::documents::{Documents, Known, check_spec, spec};
-use super::figures::{Figures, Timing, Window};
+use super::figures::{Measured, Timing, Window};
 use super::load::{APPLIED, Work};
-use super::subject::{Subject, Used};
+use super::subject::Subject;
 
 /// Of so many answers to a GET one is compared with the whole content.
 const SAMPLE: usize = 64;
@@ -30,7 +30,7 @@ pub(crate) async fn run(
     subject: &Subject,
     way: &Way,
     timing: &Timing,
-) -> anyhow::Result<(Figures, Used)> {
+) -> anyhow::Result<Measured> {
     let mut ready = Vec::with_capacity(connections);
     for _ in 0..connections {
         let mut connection = way.connect().await?;
@@ -63,7 +63,12 @@ pub(crate) async fn run(
         !latencies.is_empty(),
         "nothing was done in the window: measure for longer"
     );
-    Ok((Figures::of(latencies.len(), timing.measured, latencies), used))
+    Ok(Measured {
+        operations: latencies.len(),
+        time: timing.measured,
+        latencies,
+        used,
+    })
 }
 
 /// One request after another; the latencies of those that ended in the window, in nanoseconds.

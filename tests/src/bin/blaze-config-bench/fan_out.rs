@@ -10,8 +10,8 @@ use tokio::time::{sleep_until, timeout};
 
 use super::clients::{Connection, Way};
 use super::documents::{Documents, Known, spec};
-use super::figures::{Figures, Timing};
-use super::subject::{Subject, Used};
+use super::figures::{Measured, Timing};
+use super::subject::Subject;
 use super::watches::Watch;
 
 /// Changes that may wait for their answer; at the rates that are asked for there is hardly ever a second one.
@@ -53,7 +53,7 @@ pub(crate) async fn run(
     subject: &Subject,
     way: &Way,
     timing: &Timing,
-) -> anyhow::Result<(Figures, Used)> {
+) -> anyhow::Result<Measured> {
     let mut watches = Vec::with_capacity(watchers);
     for _ in 0..watchers {
         let mut connection = way.connect().await?;
@@ -96,7 +96,12 @@ pub(crate) async fn run(
         .await
         .context("a watcher was not told of all changes")??;
     anyhow::ensure!(latencies.len() == watchers * counted, "{} latencies", latencies.len());
-    Ok((Figures::of(counted, timing.measured, latencies), used))
+    Ok(Measured {
+        operations: counted,
+        time: timing.measured,
+        latencies,
+        used,
+    })
 }
 
 async fn write_all(

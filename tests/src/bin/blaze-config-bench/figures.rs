@@ -24,6 +24,14 @@ pub(crate) struct Window {
 }
 
 impl Timing {
+    /// One of several turns.
+    pub(crate) fn turn(&self, turns: u32) -> Self {
+        Self {
+            measured: self.measured / turns,
+            ..*self
+        }
+    }
+
     /// The window of a load that begins now.
     pub(crate) fn window(&self) -> Window {
         let begin = Instant::now() + self.warm_up;
@@ -37,6 +45,31 @@ impl Timing {
 impl Window {
     pub(crate) fn contains(&self, time: Instant) -> bool {
         (self.begin..self.end).contains(&time)
+    }
+}
+
+/// What one turn of a load, or several, gave.
+#[derive(Debug, Default)]
+pub(crate) struct Measured {
+    /// Done in the window: requests, or changes that were told to all watchers.
+    pub(crate) operations: usize,
+    pub(crate) time: Duration,
+    /// In nanoseconds.
+    pub(crate) latencies: Vec<u64>,
+    pub(crate) used: Used,
+}
+
+impl Measured {
+    /// Adds another turn.
+    pub(crate) fn add(&mut self, turn: Self) {
+        self.operations += turn.operations;
+        self.time += turn.time;
+        self.latencies.extend(turn.latencies);
+        self.used.add(turn.used);
+    }
+
+    pub(crate) fn figures(self) -> (Figures, Used) {
+        (Figures::of(self.operations, self.time, self.latencies), self.used)
     }
 }
 
@@ -118,7 +151,8 @@ impl std::fmt::Display for Bar {
 }
 
 impl Row {
-    pub(crate) fn new(round: usize, load: &Load, subject: &str, figures: &Figures, used: &Used) -> Self {
+    pub(crate) fn new(round: usize, load: &Load, subject: &str, measured: Measured) -> Self {
+        let (figures, used) = measured.figures();
         let per_operation = |time: Duration| time.as_secs_f64() * 1e6 / figures.operations.max(1) as f64;
         Self {
             round,

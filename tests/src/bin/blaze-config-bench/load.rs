@@ -1,8 +1,8 @@
 //! What is asked of each server.
 
 use super::clients::Way;
-use super::figures::{Bar, Figures, Timing};
-use super::subject::{Subject, Used};
+use super::figures::{Bar, Measured, Timing};
+use super::subject::Subject;
 use super::{closed, fan_out};
 
 /// Documents of one `apply`: etcd takes 128 puts in a transaction, at most.
@@ -62,7 +62,7 @@ impl Load {
         }
     }
 
-    pub(crate) async fn run(&self, subject: &Subject, way: &Way, timing: &Timing) -> anyhow::Result<(Figures, Used)> {
+    pub(crate) async fn run(&self, subject: &Subject, way: &Way, timing: &Timing) -> anyhow::Result<Measured> {
         match *self {
             Self::Closed { work, connections } => closed::run(work, connections, subject, way, timing).await,
             Self::FanOut { watchers, rate_hz } => fan_out::run(watchers, rate_hz, subject, way, timing).await,

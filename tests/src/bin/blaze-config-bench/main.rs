@@ -36,15 +36,16 @@ mod etcd {
     include!(concat!(env!("OUT_DIR"), "/etcdserverpb.rs"));
 }
 
+use std::os::unix::ffi::OsStrExt as _;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use clap::Parser;
 
 use clients::Way;
-use figures::{Row, Timing};
+use figures::{Measured, Row, Timing};
 use load::Load;
 use report::Report;
 use subject::{Store, Subject, Subjects};
@@ -56,9 +57,13 @@ struct Arguments {
     /// Seconds per measurement
     #[arg(long, default_value_t = 5.0)]
     seconds: f64,
-    /// Seconds of load before each measurement
-    #[arg(long, default_value_t = 1.0)]
+    /// Seconds of load before each turn of a measurement
+    #[arg(long, default_value_t = 0.5)]
     warm_up: f64,
+    /// Turns in which each measurement is made, by etcd and who is beside it alternately: what slows the machine for seconds
+    /// slows both
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=100))]
+    turns: u32,
     /// How often everything is measured; medians are judged
     #[arg(long, default_value_t = 1)]
     rounds: usize,
@@ -108,6 +113,9 @@ impl Arguments {
             .collect()
     }
 }
+
+/// For connections to be closed after a turn.
+const CLOSING: Duration = Duration::from_secs(10);
 
 /// Who is measured beside etcd.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -197,10 +205,17 @@ async fn measure(
         for load in loads {
             for contender in contenders {
                 let etcd = subjects.etcd();
-                let beside = one(round, load, "etcd", etcd, &etcd.way(false), &timing).await?;
+                let etcd = (etcd, etcd.way(false));
                 let subject = subjects.of(contender.store)?;
-                let way = subject.way(contender.rest);
-                let row = one(round, load, &contender.name(), subject, &way, &timing).await?;
+                let subject = (subject, subject.way(contender.rest));
+                let (mut beside, mut measured) = (Measured::default(), Measured::default());
+                for _ in 0..arguments.turns {
+                    let timing = timing.turn(arguments.turns);
+                    beside.add(one(load, "etcd", &etcd, &timing).await?);
+                    measured.add(one(load, &contender.name(), &subject, &timing).await?);
+                }
+                let beside = Row::new(round, load, "etcd", beside);
+                let row = Row::new(round, load, &contender.name(), measured);
                 report.add(beside, row);
             }
         }
@@ -208,15 +223,31 @@ async fn measure(
     Ok(())
 }
 
-async fn one(
-    round: usize,
-    load: &Load,
-    name: &str,
-    subject: &Subject,
-    way: &Way,
-    timing: &Timing,
-) -> anyhow::Result<Row> {
+/// One turn. What it began has ended after it: else the next one would be measured beside it.
+async fn one(load: &Load, name: &str, (subject, way): &(&Subject, Way), timing: &Timing) -> anyhow::Result<Measured> {
+    let before = open_sockets()?;
     let measured = load.run(subject, way, timing).await;
-    let (figures, used) = measured.with_context(|| format!("{} of {name}", load.name()))?;
-    Ok(Row::new(round, load, name, &figures, &used))
+    let measured = measured.with_context(|| format!("{} of {name}", load.name()))?;
+    let until = Instant::now() + CLOSING;
+    while open_sockets()? > before {
+        anyhow::ensure!(
+            Instant::now() < until,
+            "{} of {name} has left {} connections open",
+            load.name(),
+            open_sockets()?.saturating_sub(before)
+        );
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    Ok(measured)
+}
+
+/// Of this process.
+fn open_sockets() -> anyhow::Result<usize> {
+    let mut count = 0;
+    for file in std::fs::read_dir("/proc/self/fd")? {
+        // One that was closed meanwhile is none.
+        let target = std::fs::read_link(file?.path()).unwrap_or_default();
+        count += usize::from(target.as_os_str().as_bytes().starts_with(b"socket:"));
+    }
+    Ok(count)
 }

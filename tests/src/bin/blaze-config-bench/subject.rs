@@ -71,7 +71,7 @@ struct Blaze {
 pub(crate) struct Subjects(Vec<Subject>);
 
 /// What was used between two looks.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Used {
     pub(crate) server: Duration,
     pub(crate) database: Option<Duration>,
@@ -83,10 +83,28 @@ pub(crate) struct Used {
 }
 
 impl Used {
+    /// Adds what was used at another time.
+    pub(crate) fn add(&mut self, other: Self) {
+        self.server += other.server;
+        self.database = sum(self.database, other.database, |one, other| one + other);
+        self.client += other.client;
+        self.written = sum(self.written, other.written, |one, other| {
+            (one.0 + other.0, one.1 + other.1)
+        });
+        self.aborts = sum(self.aborts, other.aborts, |one, other| one + other);
+    }
+
     /// Requests in one transaction, in the mean.
     pub(crate) fn batch(&self) -> Option<f64> {
         let (revisions, transactions) = self.written?;
         (transactions > 0.0).then_some(revisions / transactions)
+    }
+}
+
+fn sum<T>(one: Option<T>, other: Option<T>, add: fn(T, T) -> T) -> Option<T> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(add(one, other)),
+        (one, other) => one.or(other),
     }
 }
 

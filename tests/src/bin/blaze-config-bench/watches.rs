@@ -1,10 +1,14 @@
 //! A stream of changes, from etcd or BlazeConfig.
 
+use std::convert::Infallible;
+
 use anyhow::Context as _;
 use blaze_proto::v1;
 use bytes::Bytes;
-use futures::StreamExt as _;
-use futures::stream::{iter, pending};
+use futures::future::ready;
+use futures::stream::iter;
+use futures::{FutureExt as _, StreamExt as _};
+use tokio::sync::oneshot;
 use tonic::Streaming;
 use tonic::transport::Channel;
 
@@ -14,7 +18,11 @@ use super::etcd::watch_client::WatchClient;
 
 /// An open watch.
 pub(crate) enum Watch {
-    Etcd(Streaming<etcd::WatchResponse>),
+    Etcd {
+        told: Streaming<etcd::WatchResponse>,
+        /// The requests go on for as long as this lives, and the watch with them.
+        _open: oneshot::Sender<Infallible>,
+    },
     Grpc(Streaming<v1::WatchResponse>),
     Rest(Events),
 }
@@ -31,12 +39,17 @@ impl Watch {
         let request = etcd::WatchRequest {
             request_union: Some(etcd::watch_request::RequestUnion::CreateRequest(create)),
         };
-        // The watch lives as long as the requests go on.
-        let requests = iter([request]).chain(pending());
+        // It ends with the requests. If they went on for ever, so would the watch and its connection, and etcd would have more
+        // watchers from one measurement to the next.
+        let (open, closed) = oneshot::channel();
+        let requests = iter([request]).chain(closed.into_stream().filter_map(|_: Result<Infallible, _>| ready(None)));
         let mut stream = client.watch(requests).await?.into_inner();
         let first = stream.message().await?.context("the watch has ended")?;
         anyhow::ensure!(first.created && !first.canceled, "no watch: {}", first.cancel_reason);
-        Ok(Self::Etcd(stream))
+        Ok(Self::Etcd {
+            told: stream,
+            _open: open,
+        })
     }
 
     pub(crate) fn of_rest(response: reqwest::Response) -> Self {
@@ -53,8 +66,8 @@ impl Watch {
     pub(crate) async fn next(&mut self) -> anyhow::Result<Vec<Known>> {
         const ENDED: &str = "the watch has ended";
         match self {
-            Self::Etcd(stream) => {
-                let response = stream.message().await?.context(ENDED)?;
+            Self::Etcd { told, .. } => {
+                let response = told.message().await?.context(ENDED)?;
                 anyhow::ensure!(!response.canceled, "{ENDED}: {}", response.cancel_reason);
                 let pairs = response.events.into_iter().map(|event| {
                     let kv = event.kv.context("an event without a key")?;
