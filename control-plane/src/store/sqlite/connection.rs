@@ -17,6 +17,9 @@ const APPLICATION_ID: i64 = 0x424C_4346;
 const BUSY: Duration = Duration::from_secs(5);
 /// The log beside the file is cut to this after it was copied into the file.
 const LOG_BYTES: i64 = 64 * 1024 * 1024;
+/// Pages of the log from which a commit copies it itself: where copying beside it does not come to an end, because there is
+/// always one more. 64 MiB.
+const LOG_PAGES: i64 = 16 * 1024;
 
 /// The path without links and relative parts, so that one file has one lock.
 ///
@@ -92,6 +95,27 @@ pub(super) fn open_reader(path: &Path) -> Result<Connection, StoreError> {
     Ok(connection)
 }
 
+/// A connection that copies the log into the file.
+///
+/// # Errors
+/// As [`open_writer`].
+pub(super) fn open_copier(path: &Path) -> Result<Connection, StoreError> {
+    let connection = open(path, OpenFlags::SQLITE_OPEN_READ_WRITE)?;
+    prepare(&connection)?;
+    Ok(connection)
+}
+
+/// Copies as much of the log into the file as nobody reads, without holding up writers. A writer begins it anew when all of
+/// it was copied.
+///
+/// # Errors
+/// [`StoreError`]; what was committed is safe in the log.
+pub(super) fn copy_log(connection: &Connection) -> Result<(), StoreError> {
+    connection
+        .query_row("PRAGMA wal_checkpoint(PASSIVE)", [], |_| Ok(()))
+        .map_err(store_error)
+}
+
 /// A store that is gone with its connection.
 ///
 /// # Errors
@@ -137,6 +161,9 @@ fn prepare(connection: &Connection) -> Result<(), StoreError> {
     set("synchronous", &"FULL")?;
     set("temp_store", &"MEMORY")?;
     set("trusted_schema", &"OFF")?;
+    connection
+        .pragma_update_and_check(None, "wal_autocheckpoint", LOG_PAGES, |_| Ok(()))
+        .map_err(store_error)?;
     connection
         .pragma_update_and_check(None, "journal_size_limit", LOG_BYTES, |_| Ok(()))
         .map_err(store_error)

@@ -3,7 +3,8 @@
 //! ```text
 //! callers ──▶ writer thread: one transaction per group (BEGIN IMMEDIATE, write-ahead log, synchronous = FULL)
 //!        ├──▶ reader thread: a connection of its own, never held up by the writer
-//!        └──▶ look-up thread: another one, for what takes no time and what others wait for, never held up by long reads
+//!        ├──▶ look-up thread: another one, for what takes no time and what others wait for, never held up by long reads
+//!        └──▶ log thread: copies the write-ahead log into the file once a second, beside the writing
 //! <path>       the database        <path>.lock   held by the process that uses it
 //! ```
 //!
@@ -49,19 +50,21 @@ const STEP: usize = 200;
 /// A store in a file, or in memory. Dropped or closed, its threads end and the file is free for another process.
 pub struct SqliteStore {
     /// None in memory, where there is only one connection.
-    readers: Option<Readers>,
+    beside: Option<Beside>,
     /// Closed last: then it empties the write-ahead log.
     writer: Worker,
     path: Option<PathBuf>,
     supervisor: Supervisor,
 }
 
-/// The threads that read.
-struct Readers {
+/// The threads beside the writer.
+struct Beside {
     /// Whatever may take long.
     long: Worker,
     /// Single rows, which commits and health wait for.
     short: Worker,
+    /// Copies the write-ahead log into the file, which a commit would else wait for.
+    log: Worker,
 }
 
 impl SqliteStore {
@@ -84,12 +87,13 @@ impl SqliteStore {
         let writer = Worker::start("sqlite-writer", connection::open_writer(&path)?, Some(lock), supervisor)?;
         writer.run(connection::bootstrap).await??;
         let reader = |name: &str| Worker::start(name, connection::open_reader(&path)?, None, supervisor);
-        let readers = Readers {
+        let beside = Beside {
             long: reader("sqlite-reader")?,
             short: reader("sqlite-look-up")?,
+            log: Worker::start("sqlite-log", connection::open_copier(&path)?, None, supervisor)?,
         };
         let store = Self {
-            readers: Some(readers),
+            beside: Some(beside),
             writer,
             path: Some(path),
             supervisor: supervisor.clone(),
@@ -106,7 +110,7 @@ impl SqliteStore {
         let writer = Worker::start("sqlite-memory", connection::open_memory()?, None, supervisor)?;
         writer.run(connection::bootstrap).await??;
         let store = Self {
-            readers: None,
+            beside: None,
             writer,
             path: None,
             supervisor: supervisor.clone(),
@@ -159,7 +163,7 @@ impl SqliteStore {
         T: Send + 'static,
         F: FnOnce(&mut Connection) -> Result<T, StoreError> + Send + 'static,
     {
-        let reader = self.readers.as_ref().map_or(&self.writer, |readers| &readers.long);
+        let reader = self.beside.as_ref().map_or(&self.writer, |beside| &beside.long);
         reader.run(job).await?
     }
 
@@ -169,7 +173,7 @@ impl SqliteStore {
         T: Send + 'static,
         F: FnOnce(&mut Connection) -> Result<T, StoreError> + Send + 'static,
     {
-        let reader = self.readers.as_ref().map_or(&self.writer, |readers| &readers.short);
+        let reader = self.beside.as_ref().map_or(&self.writer, |beside| &beside.short);
         reader.run(job).await?
     }
 
@@ -288,6 +292,13 @@ impl Archive for SqliteStore {
         super::encode::unsigned(now_trimmed.floor)
     }
 
+    async fn tidy(&self) -> Result<(), StoreError> {
+        match &self.beside {
+            Some(beside) => beside.log.run(|connection| connection::copy_log(connection)).await?,
+            None => Ok(()),
+        }
+    }
+
     async fn revision_before(&self, time: Timestamp) -> Result<u64, StoreError> {
         self.read(move |connection| archive::revision_before(connection, time))
             .await
@@ -350,8 +361,8 @@ impl Upkeep for SqliteStore {
     }
 
     async fn close(&self) {
-        if let Some(Readers { long, short }) = &self.readers {
-            tokio::join!(long.close(), short.close());
+        if let Some(Beside { long, short, log }) = &self.beside {
+            tokio::join!(long.close(), short.close(), log.close());
         }
         self.writer.close().await;
     }

@@ -32,6 +32,34 @@ impl Files {
 }
 
 #[tokio::test]
+async fn the_log_is_copied_into_the_file_by_tidying_and_begun_anew() {
+    let files = Files::new();
+    let store = files.store().await;
+    let log = files.folder.path().join("store.db-wal");
+    let alone = files.path("alone");
+    let mut sizes = Vec::new();
+    for revision in 1..=50 {
+        store.commit(&[record(commit(revision, &["a"]))]).await.unwrap();
+        store.tidy().await.unwrap();
+        // Without its log the file has it all.
+        std::fs::copy(files.path("store"), &alone).unwrap();
+        let copy = rusqlite::Connection::open(&alone).unwrap();
+        let head: i64 = copy
+            .query_row("SELECT max(revision) FROM events", [], |row| row.get(0))
+            .unwrap();
+        assert_eq!(head.unsigned_abs(), revision);
+        sizes.push(std::fs::metadata(&log).unwrap().len());
+    }
+    assert_eq!(
+        sizes[40..].iter().max(),
+        sizes[5..40].iter().max(),
+        "it does not grow: {sizes:?}"
+    );
+    store.close().await;
+    assert!(!log.exists());
+}
+
+#[tokio::test]
 async fn a_second_opening_is_refused_until_the_first_is_closed() {
     let files = Files::new();
     let first = files.store().await;
