@@ -82,7 +82,7 @@ impl Recent {
             batch: first.batch.clone(),
         });
         for mut row in group.into_iter().flat_map(|commit| commit.versions) {
-            // Documents have none, and what was serialised has room to spare.
+            // The collection has no paths of changes, and a text that was just serialised has room to spare.
             row.paths = String::new();
             row.document.shrink_to_fit();
             self.gathered.add(row);
