@@ -12,10 +12,10 @@ use serde_json::Value;
 
 use super::affected::{MAX_CANDIDATES, touched};
 use super::cost::{MAX_WORK, MAX_WORK_OF_COMMIT, MAX_WORK_OF_FAULTS, Size};
-use super::effective::{At, Sources};
+use blaze_domain::config::effective::{At, Sources};
 use super::pattern::{self, Exhausted};
 use super::schema::{Compiled, Schemas, with_placeholders};
-use super::state::State;
+use blaze_domain::config::state::State;
 use super::view::View;
 
 /// Faults that are told, at most.

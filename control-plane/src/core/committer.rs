@@ -25,9 +25,9 @@ use super::affected::{MAX_CANDIDATES, MAX_KEPT_CANDIDATES};
 use super::evaluate::{Evaluator, Request};
 use super::log::Log;
 use super::report::{AnswerKind, Done};
-use super::state::State;
+use blaze_domain::config::state::State;
 use super::view::view;
-use crate::store::{AuditEntry, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError};
+use crate::store::{AuditEntry, Change, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError};
 
 /// Requests that may wait, at most.
 pub(crate) const QUEUE: usize = 4096;
@@ -385,7 +385,7 @@ fn work_out(evaluator: &Evaluator, start: &State, work: Vec<Work>, time: Timesta
             Ok(evaluated) => {
                 let before = state.clone();
                 if !evaluated.changes.is_empty() {
-                    state.advance(revision, &evaluated.changes);
+                    state.advance(revision, evaluated.changes.iter().map(Change::step));
                 }
                 let done = Done {
                     revision: state.revision(),

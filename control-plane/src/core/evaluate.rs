@@ -18,12 +18,12 @@ use self::outcome::{Outcome, Target, cascade_into, outcome_of, prune_into, same_
 
 use super::check::too_many;
 use super::cost::{MAX_WORK_OF_COMMIT, STEPS_OF_REFUSED};
-use super::placement::rollout_target;
+use blaze_domain::config::placement::rollout_target;
 use super::refs;
 use super::rollouts::{begin, tried};
 use super::schema::Schemas;
 use super::secrets::Vault;
-use super::state::{State, tries_schema};
+use blaze_domain::config::state::{State, tries_schema};
 use super::types::{ApplyAction, Caller, DocumentInput, Precondition};
 use super::view::view;
 use crate::secrets::Keyring;
@@ -243,7 +243,7 @@ impl Evaluator {
         }
         faults.finish_invalid()?;
         let mut after = state.clone();
-        after.advance(revision, &changes);
+        after.advance(revision, changes.iter().map(Change::step));
         check_rights(state, &after, request, &changes)?;
         self.begin_rollouts(
             &mut after,

@@ -7,9 +7,9 @@ use blaze_domain::config::{Document, Key};
 use parking_lot::RwLock;
 use tokio::sync::watch;
 
-use super::state::{Effect, State};
+use blaze_domain::config::state::{Effect, State};
 use super::types::WatchCommit;
-use crate::store::Commit;
+use crate::store::{Change, Commit};
 
 /// Commits that are kept in memory, at most.
 const MAX_COMMITS: usize = 8192;
@@ -94,8 +94,8 @@ impl Log {
         if commit.revision > next {
             return false;
         }
-        let originals = inner.state.originals(&commit);
-        let effects = inner.state.apply(&commit);
+        let originals = inner.state.originals(commit.changes.iter().map(|change| &change.document.key));
+        let effects = inner.state.apply(commit.revision, commit.changes.iter().map(Change::step));
         let bytes = commit_bytes(&commit);
         inner.bytes += bytes;
         inner.commits.push_back(Arc::new(Applied {
@@ -184,7 +184,7 @@ pub(crate) fn commit_bytes(commit: &Commit) -> usize {
 }
 
 /// Bytes of a document, about: counted from its spec's text would cost more than it is worth.
-fn change_bytes(change: &crate::store::Change) -> usize {
+fn change_bytes(change: &Change) -> usize {
     fn value_bytes(value: &serde_json::Value) -> usize {
         use serde_json::Value;
         match value {

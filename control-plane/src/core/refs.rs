@@ -3,7 +3,7 @@
 use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, spec};
 use blaze_domain::{LayerName, NodeName, ServiceName};
 
-use super::state::State;
+use blaze_domain::config::state::State;
 
 /// References of a document to what does not exist, at most so many.
 pub(crate) fn missing(state: &State, key: &Key, most: usize) -> Vec<FieldFault> {

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use blaze_domain::config::{Code, Document, Kind, MAX_DOCUMENT_BYTES, Problem, merge, spec};
 use serde_json::{Value, json};
 
-use super::effective::{canaries, patched};
+use blaze_domain::config::effective::{canaries, patched};
 use super::evaluate::invalid;
-use super::placement::{placement, rollout_target};
-use super::state::State;
+use blaze_domain::config::placement::{placement, rollout_target};
+use blaze_domain::config::state::State;
 
 /// Nodes that one roll-out is tried on, at most: each has its line in the status.
 const MAX_CANARIES: usize = 1000;

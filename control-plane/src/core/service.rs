@@ -27,7 +27,7 @@ use super::log::Log;
 use super::page::Pages;
 use super::schema::Schemas;
 use super::secrets;
-use super::state::State;
+use blaze_domain::config::state::State;
 use super::view;
 use super::watch::Watches;
 use crate::auth::{Authenticator, Claims, Revocations, Right, dev};

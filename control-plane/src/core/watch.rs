@@ -23,12 +23,12 @@ use tokio_util::sync::CancellationToken;
 
 use super::committer::{now, unavailable};
 use super::log::{Applied, Log};
-use super::placement::Placement;
-use super::state::{Effect, State};
+use blaze_domain::config::placement::Placement;
+use blaze_domain::config::state::{Effect, Held, State};
 use super::types::{Caller, WatchCommit, WatchItem, WatchOp, WatchQuery};
 use super::view::{View, view};
 use crate::auth::Revocations;
-use crate::store::{Commit, Store};
+use crate::store::{Change, Commit, Store};
 
 /// Between two bookmarks of a watch with nothing to tell.
 const BOOKMARK: Duration = Duration::from_secs(15);
@@ -102,9 +102,9 @@ impl Filter {
 
     /// What an effect is to this watcher.
     fn seen(&self, effect: &Effect) -> Option<(WatchOp, Arc<Document>)> {
-        let matching = |side: &Option<(Arc<Document>, Placement)>| {
-            let (document, placement) = side.as_ref()?;
-            self.matches(document, placement).then(|| Arc::clone(document))
+        let matching = |side: &Option<(Arc<Held>, Placement)>| {
+            let (held, placement) = side.as_ref()?;
+            self.matches(&held.shown, placement).then(|| Arc::clone(&held.shown))
         };
         match (matching(&effect.before), matching(&effect.after)) {
             (None, Some(document)) if effect.before.is_none() => Some((WatchOp::Create, document)),
@@ -405,7 +405,7 @@ impl Watcher {
             return Ok(());
         };
         for commit in &batch.commits {
-            let effects = state.apply(commit);
+            let effects = state.apply(commit.revision, commit.changes.iter().map(Change::step));
             let previous = if self.everything {
                 commit.revision - 1
             } else {

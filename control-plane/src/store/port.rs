@@ -7,6 +7,7 @@
 //! ```
 
 use async_trait::async_trait;
+use blaze_domain::config::state::Step;
 use blaze_domain::config::{Document, Key, Timestamp};
 use std::sync::Arc;
 
@@ -47,6 +48,17 @@ pub struct Change {
     pub previous: Option<u64>,
     /// JSON pointers to what changed in labels, annotations and spec, sorted.
     pub paths: Vec<String>,
+}
+
+impl Change {
+    /// What it does to the documents.
+    #[must_use]
+    pub fn step(&self) -> Step {
+        match self.op {
+            Op::Delete => Step::Remove(self.document.key.clone()),
+            Op::Create | Op::Update | Op::Rollback => Step::Put(Arc::clone(&self.document)),
+        }
+    }
 }
 
 /// One commit: everything that became true with one revision.

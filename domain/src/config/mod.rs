@@ -14,13 +14,16 @@ pub mod canonical;
 mod code;
 pub mod diff;
 mod document;
+pub mod effective;
 pub mod json;
 mod key;
 pub mod merge;
+pub mod placement;
 mod problem;
 pub mod secret;
 pub mod selector;
 pub mod spec;
+pub mod state;
 mod time;
 
 pub use code::Code;

@@ -2,7 +2,7 @@
 
 use blaze_domain::config::{Code, FieldFault, Key, Problem};
 
-use super::super::state::State;
+use blaze_domain::config::state::State;
 use super::super::view::View;
 use super::Form;
 

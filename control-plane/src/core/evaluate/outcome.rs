@@ -8,10 +8,10 @@ use blaze_domain::config::{
 };
 use serde_json::{Map, Value, json};
 
-use super::super::placement::{is_active, phase, rollout_target};
+use blaze_domain::config::placement::{is_active, phase, rollout_target};
 use super::super::refs;
 use super::super::rollouts::too_large;
-use super::super::state::State;
+use blaze_domain::config::state::State;
 use super::super::types::{DocumentInput, Precondition};
 use super::super::view::view;
 use super::faults::{invalid, not_found};

@@ -7,7 +7,7 @@ use blaze_domain::config::{Code, Document, Key, Problem};
 
 use super::super::committer::unavailable;
 use super::super::page::Position;
-use super::super::state::{Held, State, redacted};
+use blaze_domain::config::state::{Held, State, redacted};
 use super::super::types::{Answer, Caller, HistoryEntry, Page, ReadOptions};
 use super::super::view::view;
 use super::read::{PAGE_BYTES, answer, page_size};

@@ -7,12 +7,12 @@ use blaze_domain::{DocumentName, LayerName};
 use serde_json::Value;
 
 use super::super::committer::unavailable;
-use super::super::effective::{At, Sources};
+use blaze_domain::config::effective::{At, Sources};
 use super::super::page::Position;
-use super::super::placement::{Placement, placement};
+use blaze_domain::config::placement::{Placement, placement};
 use super::super::report;
 use super::super::secrets;
-use super::super::state::{State, redacted};
+use blaze_domain::config::state::{State, redacted};
 use super::super::types::{Answer, Caller, Effective, ListQuery, Page, Place, ReadOptions, WatchQuery};
 use super::super::view::{may_reveal, view};
 use super::super::watch::{Filter, WatchStream, is_in_layer, trimmed};
@@ -445,7 +445,7 @@ fn found_documents<'a>(
     state: &'a State,
     kind: Option<Kind>,
     after: Option<&Key>,
-) -> Box<dyn Iterator<Item = (&'a Key, &'a Arc<super::super::state::Held>)> + Send + 'a> {
+) -> Box<dyn Iterator<Item = (&'a Key, &'a Arc<blaze_domain::config::state::Held>)> + Send + 'a> {
     match kind {
         Some(kind) => Box::new(state.of_kind(kind, after)),
         None => {

@@ -4,8 +4,8 @@ use blaze_domain::config::{Key, Kind, Problem, canonical};
 use blaze_domain::{LayerName, NodeName, ServiceName};
 use serde_json::{Value, json};
 
-use super::super::placement::placement;
-use super::super::state::State;
+use blaze_domain::config::placement::placement;
+use blaze_domain::config::state::State;
 use super::super::types::{Answer, Caller, ReadOptions};
 use super::super::view::{View, view};
 use super::read::answer;

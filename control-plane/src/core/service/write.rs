@@ -322,7 +322,7 @@ impl ConfigService {
             let _held = (room, running);
             let evaluated = evaluator.evaluate(&before, &request, revision + 1, now())?;
             let mut after = before.clone();
-            after.advance(revision + 1, &evaluated.changes);
+            after.advance(revision + 1, evaluated.changes.iter().map(Change::step));
             let done = Done {
                 revision,
                 before,

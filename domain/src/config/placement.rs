@@ -1,14 +1,14 @@
 //! Where a document counts: which layers see it, and where an instance runs.
 
-use blaze_domain::config::{Document, Key, Kind, spec};
-use blaze_domain::{LayerName, NodeName};
 use serde_json::Value;
 
 use super::state::State;
+use super::{Document, Key, Kind, spec};
+use crate::{LayerName, NodeName};
 
 /// Layers that see a document.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Visible {
+pub enum Visible {
     /// All of them.
     Everywhere,
     /// These; none: nobody but who is bound to no layer.
@@ -17,7 +17,8 @@ pub(crate) enum Visible {
 
 impl Visible {
     /// Whether a layer sees it.
-    pub(crate) fn contains(&self, layer: &LayerName) -> bool {
+    #[must_use]
+    pub fn contains(&self, layer: &LayerName) -> bool {
         match self {
             Self::Everywhere => true,
             Self::In(layers) => layers.contains(layer),
@@ -35,13 +36,13 @@ impl Visible {
 
 /// Where a document counts at one revision. It may change without the document: an instance moves with its node.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Placement {
+pub struct Placement {
     /// Layers that see it.
-    pub(crate) visible: Visible,
+    pub visible: Visible,
     /// The layer that filters go by: of an instance where it is placed, of a node its own.
-    pub(crate) layer: Option<LayerName>,
+    pub layer: Option<LayerName>,
     /// The node that filters go by.
-    pub(crate) node: Option<NodeName>,
+    pub node: Option<NodeName>,
 }
 
 fn name<T: std::str::FromStr>(text: Option<&str>) -> Option<T> {
@@ -49,7 +50,8 @@ fn name<T: std::str::FromStr>(text: Option<&str>) -> Option<T> {
 }
 
 /// Where a document counts in a state. The document itself need not be part of it.
-pub(crate) fn placement(state: &State, document: &Document) -> Placement {
+#[must_use]
+pub fn placement(state: &State, document: &Document) -> Placement {
     match document.key.kind() {
         Kind::Layer => {
             let layer = LayerName::from(document.key.name());
@@ -118,17 +120,20 @@ fn instance(state: &State, document: &Document) -> Placement {
 }
 
 /// The document that a roll-out changes.
-pub(crate) fn rollout_target(rollout: &Document) -> Option<Key> {
+#[must_use]
+pub fn rollout_target(rollout: &Document) -> Option<Key> {
     spec::rollout_target(rollout.spec_member("target")?)
 }
 
 /// Whether a roll-out is on its canaries now.
-pub(crate) fn is_active(rollout: &Document) -> bool {
+#[must_use]
+pub fn is_active(rollout: &Document) -> bool {
     phase(rollout) == "canary"
 }
 
 /// `status.phase` of a roll-out.
-pub(crate) fn phase(rollout: &Document) -> &str {
+#[must_use]
+pub fn phase(rollout: &Document) -> &str {
     let phase = rollout.status.as_ref().and_then(|status| status.get("phase"));
     phase.and_then(Value::as_str).unwrap_or("canary")
 }

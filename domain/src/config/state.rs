@@ -5,30 +5,30 @@ use std::collections::BTreeSet;
 use std::ops::Bound;
 use std::sync::Arc;
 
-use blaze_domain::config::{Document, Key, Kind, secret};
-use blaze_domain::{DocumentName, LayerName, NodeName, ServiceName};
 use imbl::{OrdMap, OrdSet};
 
 use super::placement::{Placement, is_active, placement, rollout_target};
-use crate::store::{Change, Commit, Op};
+use super::{Document, Key, Kind, MAX_EFFECTIVE_BYTES, secret};
+use crate::{DocumentName, InstanceName, LayerName, NodeName, ServiceName};
 
 /// Documents larger than this make an effective configuration that is too large possible (four documents are merged, each
 /// perhaps with the change of a roll-out).
-const BIG_BYTES: usize = blaze_domain::config::MAX_EFFECTIVE_BYTES / 8;
+const BIG_BYTES: usize = MAX_EFFECTIVE_BYTES / 8;
 
 /// A document as it is kept in memory.
 #[derive(Debug, PartialEq)]
-pub(crate) struct Held {
+pub struct Held {
     /// As in the store, secrets encrypted.
-    pub(crate) document: Arc<Document>,
+    pub document: Arc<Document>,
     /// As users see it, secrets redacted; the same one if it has none.
-    pub(crate) shown: Arc<Document>,
+    pub shown: Arc<Document>,
     /// Bytes of its spec as compact JSON.
-    pub(crate) bytes: usize,
+    pub bytes: usize,
 }
 
 impl Held {
-    pub(crate) fn new(document: Arc<Document>) -> Self {
+    #[must_use]
+    pub fn new(document: Arc<Document>) -> Self {
         let shown = redacted(&document);
         let bytes = serde_json::to_string(&*document.spec).map_or(0, |text| text.len());
         Self { document, shown, bytes }
@@ -50,13 +50,15 @@ impl Held {
 }
 
 /// Whether the change of a roll-out brings a schema.
-pub(crate) fn tries_schema(rollout: &Document) -> bool {
+#[must_use]
+pub fn tries_schema(rollout: &Document) -> bool {
     let schema = rollout.spec_member("patch").and_then(|patch| patch.get("schema"));
     schema.is_some_and(|schema| !schema.is_null())
 }
 
 /// The document as users see it.
-pub(crate) fn redacted(document: &Arc<Document>) -> Arc<Document> {
+#[must_use]
+pub fn redacted(document: &Arc<Document>) -> Arc<Document> {
     let status_has = document.status.as_ref().is_some_and(secret::contains);
     if !secret::contains(&document.spec) && !status_has {
         return Arc::clone(document);
@@ -72,7 +74,7 @@ pub(crate) fn redacted(document: &Arc<Document>) -> Arc<Document> {
 
 /// All documents at one revision.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct State {
+pub struct State {
     revision: u64,
     documents: OrdMap<Key, Arc<Held>>,
     /// Nodes of a layer, and instances placed on it directly.
@@ -89,20 +91,41 @@ pub(crate) struct State {
     schemas: usize,
 }
 
+/// What a commit does to one document.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Step {
+    /// It is this from now on.
+    Put(Arc<Document>),
+    /// It is gone.
+    Remove(Key),
+}
+
+impl Step {
+    /// Which document.
+    #[must_use]
+    pub fn key(&self) -> &Key {
+        match self {
+            Self::Put(document) => &document.key,
+            Self::Remove(key) => key,
+        }
+    }
+}
+
 /// What one commit did to one document, as far as watchers care.
 #[derive(Debug, Clone)]
-pub(crate) struct Effect {
+pub struct Effect {
     /// The document before and where it counted; `None` if it did not exist.
-    pub(crate) before: Option<(Arc<Document>, Placement)>,
+    pub before: Option<(Arc<Held>, Placement)>,
     /// The same after.
-    pub(crate) after: Option<(Arc<Document>, Placement)>,
+    pub after: Option<(Arc<Held>, Placement)>,
     /// The document itself did not change, only where it counts.
-    pub(crate) moved_only: bool,
+    pub moved_only: bool,
 }
 
 impl State {
     /// A state from documents.
-    pub(crate) fn new(revision: u64, documents: impl IntoIterator<Item = Document>) -> Self {
+    #[must_use]
+    pub fn new(revision: u64, documents: impl IntoIterator<Item = Document>) -> Self {
         let mut state = Self {
             revision,
             ..Self::default()
@@ -114,22 +137,32 @@ impl State {
     }
 
     /// The newest commit that is part of it.
-    pub(crate) fn revision(&self) -> u64 {
+    #[must_use]
+    pub fn revision(&self) -> u64 {
         self.revision
     }
 
     /// How many documents there are.
-    pub(crate) fn len(&self) -> usize {
+    #[must_use]
+    pub fn len(&self) -> usize {
         self.documents.len()
     }
 
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.documents.is_empty()
+    }
+
     /// One document.
-    pub(crate) fn get(&self, key: &Key) -> Option<&Arc<Held>> {
+    #[must_use]
+    pub fn get(&self, key: &Key) -> Option<&Arc<Held>> {
         self.documents.get(key)
     }
 
     /// Documents of a kind, in the order of their keys, those after a key.
-    pub(crate) fn of_kind<'a>(
+    #[must_use]
+    pub fn of_kind<'a>(
         &'a self,
         kind: Kind,
         after: Option<&Key>,
@@ -143,12 +176,14 @@ impl State {
     }
 
     /// All documents, in the order of their keys.
-    pub(crate) fn all(&self) -> impl Iterator<Item = (&Key, &Arc<Held>)> {
+    #[must_use]
+    pub fn all(&self) -> impl Iterator<Item = (&Key, &Arc<Held>)> {
         self.documents.iter()
     }
 
     /// Instances of a service.
-    pub(crate) fn instances<'a>(
+    #[must_use]
+    pub fn instances<'a>(
         &'a self,
         service: &ServiceName,
     ) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
@@ -160,12 +195,14 @@ impl State {
     }
 
     /// Nodes of a layer and instances placed on it directly.
-    pub(crate) fn in_layer<'a>(&'a self, layer: &LayerName) -> impl Iterator<Item = &'a Key> + use<'a> {
+    #[must_use]
+    pub fn in_layer<'a>(&'a self, layer: &LayerName) -> impl Iterator<Item = &'a Key> + use<'a> {
         indexed(&self.in_layer, layer.into())
     }
 
     /// Instances placed on a node.
-    pub(crate) fn on_node<'a>(&'a self, node: &NodeName) -> impl Iterator<Item = &'a Key> + use<'a> {
+    #[must_use]
+    pub fn on_node<'a>(&'a self, node: &NodeName) -> impl Iterator<Item = &'a Key> + use<'a> {
         indexed(&self.on_node, node.into())
     }
 
@@ -175,28 +212,32 @@ impl State {
     }
 
     /// Roll-outs of a document that are on their canaries now.
-    pub(crate) fn active_on<'a>(&'a self, target: &Key) -> impl Iterator<Item = &'a Arc<Held>> + use<'a> {
+    #[must_use]
+    pub fn active_on<'a>(&'a self, target: &Key) -> impl Iterator<Item = &'a Arc<Held>> + use<'a> {
         of_target(&self.active, target.clone()).filter_map(|key| self.documents.get(key))
     }
 
     /// Whether an effective configuration can be too large at all.
-    pub(crate) fn has_big(&self) -> bool {
+    #[must_use]
+    pub fn has_big(&self) -> bool {
         self.big > 0
     }
 
     /// Whether any service has a schema, be it on canaries alone.
-    pub(crate) fn has_schemas(&self) -> bool {
+    #[must_use]
+    pub fn has_schemas(&self) -> bool {
         self.schemas > 0
     }
 
     /// Whether this one has.
-    pub(crate) fn has_schema(&self, service: &ServiceName) -> bool {
+    #[must_use]
+    pub fn has_schema(&self, service: &ServiceName) -> bool {
         let key = Key::service(service);
         self.get(&key).is_some_and(|held| held.has_schema()) || self.active_on(&key).any(|held| held.has_schema())
     }
 
     /// Puts a document, in place of the one of the same key.
-    pub(crate) fn put(&mut self, document: Arc<Document>) {
+    pub fn put(&mut self, document: Arc<Document>) {
         let held = Arc::new(Held::new(document));
         self.remove(&held.document.key);
         for (index, entry) in index_entries(&held.document) {
@@ -214,7 +255,7 @@ impl State {
     }
 
     /// Takes a document away.
-    pub(crate) fn remove(&mut self, key: &Key) -> Option<Arc<Held>> {
+    pub fn remove(&mut self, key: &Key) -> Option<Arc<Held>> {
         let held = self.documents.remove(key)?;
         for (index, entry) in index_entries(&held.document) {
             self.index(index).remove(&entry);
@@ -235,37 +276,47 @@ impl State {
         }
     }
 
-    /// Applies changes as one revision.
-    pub(crate) fn advance(&mut self, revision: u64, changes: &[Change]) {
-        for change in changes {
-            match change.op {
-                Op::Delete => {
-                    self.remove(&change.document.key);
-                }
-                Op::Create | Op::Update | Op::Rollback => self.put(Arc::clone(&change.document)),
+    /// Takes one step; [`State::advance`] sets the revision.
+    fn step(&mut self, step: &Step) {
+        match step {
+            Step::Put(document) => self.put(Arc::clone(document)),
+            Step::Remove(key) => {
+                self.remove(key);
             }
+        }
+    }
+
+    /// Applies the steps of one commit.
+    pub fn advance(&mut self, revision: u64, steps: impl IntoIterator<Item = Step>) {
+        for step in steps {
+            self.step(&step);
         }
         self.revision = revision;
     }
 
-    /// Applies a commit and says what it did, also to documents that only moved with another.
-    pub(crate) fn apply(&mut self, commit: &Commit) -> Vec<Effect> {
+    /// Applies a commit, each step of another document, and says what it did, also to documents that only moved with
+    /// another.
+    pub fn apply(&mut self, revision: u64, steps: impl IntoIterator<Item = Step>) -> Vec<Effect> {
         let before = self.clone();
-        self.advance(commit.revision, &commit.changes);
+        let mut keys: Vec<Key> = Vec::new();
+        for step in steps {
+            self.step(&step);
+            keys.push(step.key().clone());
+        }
+        self.revision = revision;
         let seen = |state: &Self, key: &Key| {
             let held = state.get(key)?;
-            Some((Arc::clone(&held.shown), placement(state, &held.document)))
+            Some((Arc::clone(held), placement(state, &held.document)))
         };
-        let mut effects: Vec<Effect> = Vec::with_capacity(commit.changes.len());
-        for change in &commit.changes {
-            let key = &change.document.key;
+        let mut effects: Vec<Effect> = Vec::with_capacity(keys.len());
+        for key in &keys {
             effects.push(Effect {
                 before: seen(&before, key),
                 after: seen(self, key),
                 moved_only: false,
             });
         }
-        for key in moved_with(&before, self, commit) {
+        for key in moved_with(&before, self, &keys) {
             let (was, is) = (seen(&before, &key), seen(self, &key));
             let changed = match (&was, &is) {
                 (Some((_, was)), Some((_, is))) => was != is,
@@ -282,15 +333,16 @@ impl State {
         effects
     }
 
-    /// The documents that a commit is about to change, as they are now.
-    pub(crate) fn originals(&self, commit: &Commit) -> Vec<(Key, Option<Arc<Document>>)> {
-        let keys = commit.changes.iter().map(|change| &change.document.key);
-        keys.map(|key| (key.clone(), self.get(key).map(|held| Arc::clone(&held.document))))
+    /// Documents as they are now, to go back to with [`State::undo`].
+    #[must_use]
+    pub fn originals<'k>(&self, keys: impl IntoIterator<Item = &'k Key>) -> Vec<(Key, Option<Arc<Document>>)> {
+        keys.into_iter()
+            .map(|key| (key.clone(), self.get(key).map(|held| Arc::clone(&held.document))))
             .collect()
     }
 
     /// Goes back to what documents were before a commit.
-    pub(crate) fn undo(&mut self, originals: &[(Key, Option<Arc<Document>>)], revision: u64) {
+    pub fn undo(&mut self, originals: &[(Key, Option<Arc<Document>>)], revision: u64) {
         for (key, original) in originals {
             match original {
                 Some(document) => self.put(Arc::clone(document)),
@@ -303,7 +355,7 @@ impl State {
     }
 
     /// Replaces what documents were, for the state at an older revision.
-    pub(crate) fn overlay(&mut self, revision: u64, documents: Vec<(Key, Option<Document>)>) {
+    pub fn overlay(&mut self, revision: u64, documents: Vec<(Key, Option<Document>)>) {
         for (key, document) in documents {
             match document {
                 Some(document) => self.put(Arc::new(document)),
@@ -362,7 +414,7 @@ fn indexed(index: &OrdSet<(DocumentName, Key)>, name: DocumentName) -> impl Iter
 
 /// No name comes before it: `0` is the first character of the alphabet of names that may stand at the beginning.
 fn first_name() -> DocumentName {
-    (&blaze_domain::InstanceName::first()).into()
+    (&InstanceName::first()).into()
 }
 
 fn first_key(kind: Kind) -> Key {
@@ -373,11 +425,10 @@ fn first_key(kind: Kind) -> Key {
 
 /// Documents that may count elsewhere although they did not change: instances with their node or service, roll-outs with
 /// their target.
-fn moved_with(before: &State, after: &State, commit: &Commit) -> Vec<Key> {
-    let keys: BTreeSet<&Key> = commit.changes.iter().map(|change| &change.document.key).collect();
+fn moved_with(before: &State, after: &State, changed: &[Key]) -> Vec<Key> {
+    let keys: BTreeSet<&Key> = changed.iter().collect();
     let mut out: Vec<Key> = Vec::new();
-    for change in &commit.changes {
-        let key = &change.document.key;
+    for key in changed {
         let is_moved = match (before.get(key), after.get(key)) {
             (Some(was), Some(is)) => placement(before, &was.document) != placement(after, &is.document),
             _ => true,

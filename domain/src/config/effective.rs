@@ -1,39 +1,42 @@
 //! The effective configuration of a service at a place.
 
-use blaze_domain::config::merge::{Part, Source};
-use blaze_domain::config::selector::LabelSelector;
-use blaze_domain::config::{Document, Key, canonical, merge, secret};
-use blaze_domain::{DocumentName, LayerName, NodeName, ServiceName};
-use serde_json::Value;
 use std::sync::Arc;
 
+use serde_json::Value;
+
+use super::merge::{Part, Source};
+use super::placement::placement;
+use super::selector::LabelSelector;
 use super::state::State;
+use super::{Document, Key, canonical, merge, secret};
+use crate::{DocumentName, LayerName, NodeName, ServiceName};
 
 /// The documents whose configurations are merged, weakest first.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Sources {
-    pub(crate) service: Option<Arc<Document>>,
-    pub(crate) layer: Option<Arc<Document>>,
-    pub(crate) node: Option<Arc<Document>>,
-    pub(crate) instance: Option<Arc<Document>>,
+pub struct Sources {
+    pub service: Option<Arc<Document>>,
+    pub layer: Option<Arc<Document>>,
+    pub node: Option<Arc<Document>>,
+    pub instance: Option<Arc<Document>>,
     /// The roll-out that changed one of them.
-    pub(crate) rollout: Option<DocumentName>,
+    pub rollout: Option<DocumentName>,
     /// Whose overrides count.
     service_name: Option<ServiceName>,
 }
 
 /// For whom, in names.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub(crate) struct At {
-    pub(crate) service: Option<ServiceName>,
-    pub(crate) instance: Option<DocumentName>,
-    pub(crate) layer: Option<LayerName>,
-    pub(crate) node: Option<NodeName>,
+pub struct At {
+    pub service: Option<ServiceName>,
+    pub instance: Option<DocumentName>,
+    pub layer: Option<LayerName>,
+    pub node: Option<NodeName>,
 }
 
 impl Sources {
     /// The documents that count at a place; a roll-out counts on its canary nodes.
-    pub(crate) fn at(state: &State, at: &At) -> Self {
+    #[must_use]
+    pub fn at(state: &State, at: &At) -> Self {
         let document = |key: Key| state.get(&key).map(|held| Arc::clone(&held.document));
         let mut sources = Self {
             service: at.service.as_ref().and_then(|name| document(Key::service(name))),
@@ -51,8 +54,9 @@ impl Sources {
     }
 
     /// Where an instance's own document places it.
-    pub(crate) fn placed(state: &State, service: &ServiceName, instance: &Document) -> At {
-        let placement = super::placement::placement(state, instance);
+    #[must_use]
+    pub fn placed(state: &State, service: &ServiceName, instance: &Document) -> At {
+        let placement = placement(state, instance);
         At {
             service: Some(service.clone()),
             instance: Some(instance.key.name().clone()),
@@ -82,7 +86,8 @@ impl Sources {
     }
 
     /// The parts, weakest first, each with the document that it is of.
-    pub(crate) fn parts(&self) -> Vec<(&Document, bool, &Value)> {
+    #[must_use]
+    pub fn parts(&self) -> Vec<(&Document, bool, &Value)> {
         let service = self.service_name.as_ref().map(ServiceName::as_str);
         let mut out = Vec::with_capacity(6);
         for (document, with_overrides) in [
@@ -103,7 +108,8 @@ impl Sources {
     }
 
     /// The effective configuration, secrets as they are in the documents.
-    pub(crate) fn merged(&self) -> Value {
+    #[must_use]
+    pub fn merged(&self) -> Value {
         let mut out = Value::Object(serde_json::Map::new());
         for (_, _, value) in self.parts() {
             merge::merge_patch(&mut out, value);
@@ -112,7 +118,8 @@ impl Sources {
     }
 
     /// The same with each part changed first, for secrets in other forms.
-    pub(crate) fn merged_with(&self, form: impl Fn(&Document, &Value) -> Value) -> Value {
+    #[must_use]
+    pub fn merged_with(&self, form: impl Fn(&Document, &Value) -> Value) -> Value {
         let mut out = Value::Object(serde_json::Map::new());
         for (document, _, value) in self.parts() {
             merge::merge_patch(&mut out, &form(document, value));
@@ -121,7 +128,8 @@ impl Sources {
     }
 
     /// Where each key comes from.
-    pub(crate) fn explain(&self, form: impl Fn(&Document, &Value) -> Value) -> Value {
+    #[must_use]
+    pub fn explain(&self, form: impl Fn(&Document, &Value) -> Value) -> Value {
         let values: Vec<Value> = self
             .parts()
             .iter()
@@ -146,30 +154,35 @@ impl Sources {
     }
 
     /// The hash that tells whether the configuration is another one.
-    pub(crate) fn hash(&self) -> String {
+    #[must_use]
+    pub fn hash(&self) -> String {
         canonical::hash(&secret::for_hash(&self.merged()))
     }
 
     /// An upper bound of the size, in bytes.
-    pub(crate) fn size_bound(&self) -> usize {
+    #[must_use]
+    pub fn size_bound(&self) -> usize {
         self.parts().iter().map(|(_, _, value)| value.to_string().len()).sum()
     }
 }
 
 /// Whether a node is one that a roll-out tries its change on.
-pub(crate) fn is_canary(rollout: &Document, node: &Document) -> bool {
+#[must_use]
+pub fn is_canary(rollout: &Document, node: &Document) -> bool {
     canaries(rollout).is_some_and(|selector| selector.matches(&node.labels))
 }
 
 /// The nodes that a roll-out tries its change on.
-pub(crate) fn canaries(rollout: &Document) -> Option<LabelSelector> {
+#[must_use]
+pub fn canaries(rollout: &Document) -> Option<LabelSelector> {
     let canary = rollout.spec_member("canary")?;
     canary.get("node_selector")?.as_str()?.parse().ok()
 }
 
 /// A document with a roll-out's change in its spec. Secrets of the change were encrypted for the roll-out, so they are
 /// not carried over here: a roll-out may not change secrets.
-pub(crate) fn patched(document: &Document, patch: &Value) -> Document {
+#[must_use]
+pub fn patched(document: &Document, patch: &Value) -> Document {
     let mut out = document.clone();
     let mut spec = (*document.spec).clone();
     merge::merge_patch(&mut spec, patch);

@@ -1,0 +1,12 @@
+//! BlazeConfig's worker: keeps a copy of what its layer sees, and gives every service its configuration over the local
+//! broker, also while the main service, the broker or the local database is away.
+//!
+//! ```text
+//! main service ──Sync──▶ core::Replica ──▶ core::Served ──▶ answers and notices on the local broker
+//!                            │   ▲
+//!                            ▼   │ at the start: local database, else last-known-good file, else mounted file
+//!                          copy::Copies
+//! ```
+
+pub mod copy;
+pub mod core;
