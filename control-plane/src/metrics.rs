@@ -169,12 +169,11 @@ impl ApiMetrics {
         OpenWatch(self.watchers.clone())
     }
 
-    /// How far a worker is behind; `None` once it has gone.
-    pub fn worker_lag(&self, layer: &str, node: &str, revisions: Option<u64>) {
-        match revisions {
-            Some(revisions) => self.lag.with_label_values(&[layer, node]).set(revisions as f64),
-            // Gone already is as good.
-            None => drop(self.lag.remove_label_values(&[layer, node])),
+    /// How far the connected workers are behind, by layer and node; those that are not named have gone.
+    pub fn worker_lags<'a>(&self, lags: impl IntoIterator<Item = (&'a str, &'a str, u64)>) {
+        self.lag.reset();
+        for (layer, node, revisions) in lags {
+            self.lag.with_label_values(&[layer, node]).set(revisions as f64);
         }
     }
 
@@ -221,7 +220,7 @@ mod tests {
         for _ in 0..2 {
             metrics.state(412, 7, 10, 5);
         }
-        metrics.worker_lag("edge", "robot-1", Some(3));
+        metrics.worker_lags([("edge", "robot-1", 3)]);
         let open = metrics.watcher();
         let text = metrics.text();
         for line in [
@@ -245,7 +244,7 @@ mod tests {
             "{text}"
         );
         drop(open);
-        metrics.worker_lag("edge", "robot-1", None);
+        metrics.worker_lags([]);
         let text = metrics.text();
         assert!(text.contains("blaze_config_watchers 0"), "{text}");
         assert!(!text.contains("robot-1"), "{text}");

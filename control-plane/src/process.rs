@@ -361,6 +361,11 @@ async fn admin(
                 core.documents(),
                 core.denials_skipped(),
             );
+            let lags = core.worker_lags();
+            metrics.worker_lags(lags.iter().map(|((layer, node), lag)| {
+                let node = node.as_ref().map_or("", |node| node.as_str());
+                (layer.as_str(), node, *lag)
+            }));
             text.push_str(&metrics_text(&running.counters));
         }
         metrics.text() + &text

@@ -2,6 +2,7 @@
 
 mod history;
 mod read;
+mod sync;
 mod tasks;
 mod token;
 mod topology;
@@ -22,6 +23,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::barrier::{Barrier, barrier};
 use super::committer::{Committer, OnCommit, QUEUE, QUEUE_BYTES, Queued, RunningKeys, now};
+use super::digests::Digests;
 use super::evaluate::Evaluator;
 use super::log::Log;
 use super::page::Pages;
@@ -30,11 +32,13 @@ use super::secrets;
 use blaze_domain::config::state::State;
 use super::view;
 use super::watch::Watches;
+use super::workers::Workers;
 use crate::auth::{Authenticator, Claims, Revocations, Right, dev};
 use crate::secrets::Keyring;
 use crate::store::{AuditEntry, Store, StoreError};
 
 pub use history::DiffReport;
+pub use sync::{SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream};
 
 /// Refusals that wait to be written to the audit, at most.
 const DENIED_QUEUE: usize = 1024;
@@ -95,6 +99,10 @@ struct Inner {
     dry_waiting: Semaphore,
     denied: mpsc::Sender<AuditEntry>,
     denials: Mutex<token::DenialLimit>,
+    workers: Arc<Workers>,
+    digests: Digests,
+    /// Snapshots that may still begin.
+    snapshots: Arc<Semaphore>,
 }
 
 impl ConfigService {
@@ -153,6 +161,9 @@ impl ConfigService {
                 dry_waiting: Semaphore::new(DRY_WAITING),
                 denied,
                 denials: Mutex::default(),
+                workers: Arc::default(),
+                digests: Digests::default(),
+                snapshots: Arc::new(Semaphore::new(sync::SNAPSHOTS)),
             }),
         };
         service.refresh_tokens().await?;

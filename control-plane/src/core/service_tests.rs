@@ -4,6 +4,7 @@ mod once;
 mod pages;
 mod rollouts;
 mod secrets;
+mod sync;
 mod views;
 mod watches;
 mod writes;

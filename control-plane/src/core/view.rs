@@ -51,6 +51,13 @@ pub(crate) fn may_reveal(claims: &Claims) -> bool {
 }
 
 impl View {
+    /// What a layer sees.
+    pub(crate) fn of_layer(layer: &LayerName) -> Self {
+        Self {
+            layer: Some(layer.clone()),
+        }
+    }
+
     /// The layer that it is bound to.
     pub(crate) fn layer(&self) -> Option<&LayerName> {
         self.layer.as_ref()

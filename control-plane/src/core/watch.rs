@@ -49,6 +49,8 @@ pub(crate) struct Filter {
     layer: Option<LayerName>,
     selector: Option<LabelSelector>,
     view: View,
+    /// Documents as they are stored, with their secrets encrypted; else as users see them.
+    as_stored: bool,
 }
 
 impl Filter {
@@ -64,7 +66,21 @@ impl Filter {
             layer: query.layer.clone(),
             selector,
             view: view(&caller.claims),
+            as_stored: false,
         })
+    }
+
+    /// What a layer sees, as it is stored.
+    fn stored(layer: &LayerName) -> Self {
+        Self {
+            kind: None,
+            name: None,
+            service: None,
+            layer: None,
+            selector: None,
+            view: View::of_layer(layer),
+            as_stored: true,
+        }
     }
 
     fn is_everything(&self) -> bool {
@@ -75,6 +91,7 @@ impl Filter {
             layer,
             selector,
             view,
+            as_stored,
         } = self;
         kind.is_none()
             && name.is_none()
@@ -82,6 +99,7 @@ impl Filter {
             && layer.is_none()
             && selector.is_none()
             && view.layer().is_none()
+            && !as_stored
     }
 
     fn matches(&self, document: &Document, placement: &Placement) -> bool {
@@ -104,7 +122,8 @@ impl Filter {
     fn seen(&self, effect: &Effect) -> Option<(WatchOp, Arc<Document>)> {
         let matching = |side: &Option<(Arc<Held>, Placement)>| {
             let (held, placement) = side.as_ref()?;
-            self.matches(&held.shown, placement).then(|| Arc::clone(&held.shown))
+            let document = if self.as_stored { &held.document } else { &held.shown };
+            self.matches(document, placement).then(|| Arc::clone(document))
         };
         match (matching(&effect.before), matching(&effect.after)) {
             (None, Some(document)) if effect.before.is_none() => Some((WatchOp::Create, document)),
@@ -202,8 +221,10 @@ struct Watcher {
     pending_bytes: usize,
     /// State at `cursor` while commits come from the store.
     rebuilt: Option<State>,
-    /// It has caught up once: from then on it may not fall far behind.
+    /// It has caught up once: from then on it may not fall far behind, unless it is patient.
     live: bool,
+    /// It may fall behind as far as the history reaches: what it is behind is not kept for it.
+    patient: bool,
     /// A bookmark is due as soon as all is told.
     bookmark_due: bool,
     next_bookmark: Instant,
@@ -223,9 +244,19 @@ impl Watches {
         since: u64,
         timeout_s: Option<u32>,
     ) -> WatchStream {
-        self.open.fetch_add(1, Ordering::Relaxed);
         let life = rand::rng().random_range(LIFE);
         let life = timeout_s.map_or(life, |timeout| life.min(u64::from(timeout)));
+        self.stream(caller, filter, since, life, false)
+    }
+
+    /// A stream of what a layer sees, documents as they are stored. It never ends because its reader is slow.
+    pub(crate) fn open_stored(self: &Arc<Self>, caller: &Caller, layer: &LayerName, since: u64) -> WatchStream {
+        let life = rand::rng().random_range(LIFE);
+        self.stream(caller, Filter::stored(layer), since, life, true)
+    }
+
+    fn stream(self: &Arc<Self>, caller: &Caller, filter: Filter, since: u64, life: u64, patient: bool) -> WatchStream {
+        self.open.fetch_add(1, Ordering::Relaxed);
         let watcher = Watcher {
             shared: Arc::clone(self),
             everything: filter.is_everything(),
@@ -238,6 +269,7 @@ impl Watches {
             pending_bytes: 0,
             rebuilt: None,
             live: false,
+            patient,
             bookmark_due: true,
             next_bookmark: Instant::now() + BOOKMARK,
             end: Instant::now() + Duration::from_secs(life),
@@ -327,7 +359,7 @@ impl Watcher {
             let detail = "the token ran out or was revoked; go on with the last id and a new token";
             return Some(Problem::new(Code::Unauthenticated, detail));
         }
-        if self.live && (self.pending.len() > MAX_BEHIND || self.pending_bytes > MAX_BEHIND_BYTES) {
+        if self.live && !self.patient && (self.pending.len() > MAX_BEHIND || self.pending_bytes > MAX_BEHIND_BYTES) {
             return Some(too_slow());
         }
         None
@@ -337,8 +369,9 @@ impl Watcher {
     async fn read(&mut self) -> Result<(), Problem> {
         if self.rebuilt.is_none() {
             // A watcher that has caught up looks at all there is, to know how far it is behind.
-            let limit = if self.live { usize::MAX } else { READ };
-            if !self.live && !self.pending.is_empty() {
+            let counts = self.live && !self.patient;
+            let limit = if counts { usize::MAX } else { READ };
+            if !counts && !self.pending.is_empty() {
                 return Ok(());
             }
             match self.shared.log.after(self.cursor, limit) {
@@ -351,7 +384,7 @@ impl Watcher {
                         None => Ok(()),
                     };
                 }
-                None if self.live => return Err(too_slow()),
+                None if counts => return Err(too_slow()),
                 None => self.rebuild().await?,
             }
         }

@@ -3,8 +3,8 @@
 use serde_json::Value;
 
 use super::state::State;
-use super::{Document, Key, Kind, spec};
-use crate::{LayerName, NodeName};
+use super::{Document, Key, Kind, canonical, spec};
+use crate::{LayerName, NodeName, ServiceName};
 
 /// Layers that see a document.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -117,6 +117,26 @@ fn instance(state: &State, document: &Document) -> Placement {
         layer,
         node,
     }
+}
+
+/// Digest of what a layer sees.
+#[must_use]
+pub fn layer_digest(state: &State, layer: &LayerName) -> String {
+    digest_of(state, |document| placement(state, document).visible.contains(layer))
+}
+
+/// Digest of all documents of a state, which is what a worker holds.
+#[must_use]
+pub fn whole_digest(state: &State) -> String {
+    digest_of(state, |_| true)
+}
+
+fn digest_of(state: &State, is_seen: impl Fn(&Document) -> bool) -> String {
+    let seen = state.all().filter(|(_, held)| is_seen(&held.document));
+    canonical::digest(seen.map(|(key, held)| {
+        let service = key.service_name().map(ServiceName::as_str);
+        (key.kind(), service, key.name().as_str(), held.document.revision)
+    }))
 }
 
 /// The document that a roll-out changes.

@@ -112,7 +112,11 @@ impl Gate {
                     address: head.address,
                 };
                 let limits = &self.limits;
-                let request = request.map(|body| limits.metered(&caller.claims.subject, body));
+                // The messages of a worker come as long as its stream is open: they are no upload on its way.
+                let request = match method == methods::SYNC {
+                    true => request,
+                    false => request.map(|body| limits.metered(&caller.claims.subject, body)),
+                };
                 serve(Call::new(caller, method), time, request, next).await
             }
             Err(problem) => {
@@ -146,7 +150,7 @@ impl Gate {
     /// Which method, and how long it may take.
     fn admit(&self, head: &Head, claims: &Claims, headers: &HeaderMap) -> Result<(&'static Method, Duration), Problem> {
         self.limits.count_request(&claims.subject)?;
-        let none = || Problem::new(Code::MethodNotAllowed, "blaze.v1.ConfigService has no such method");
+        let none = || Problem::new(Code::MethodNotAllowed, "there is no such service or method here");
         let method = head.method.ok_or_else(none)?;
         self.core.authorize(claims, method.right)?;
         Ok((method, call_time(headers)?))

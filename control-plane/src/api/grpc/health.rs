@@ -12,7 +12,7 @@ use tonic_health::pb::health_server::Health;
 use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
 
 /// Names that can be asked for; the empty one is the whole process.
-const SERVICES: [&str; 2] = ["", "blaze.v1.ConfigService"];
+const SERVICES: [&str; 3] = ["", "blaze.v1.ConfigService", "blaze.v1.SyncService"];
 
 /// Follows the readiness of the process.
 pub(super) struct Readyz {

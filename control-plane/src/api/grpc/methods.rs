@@ -5,6 +5,9 @@ use crate::auth::Right;
 /// Path of the service, with the slash before the method.
 pub(super) const PATH: &str = "/blaze.v1.ConfigService/";
 
+/// The one method of the workers, `blaze.v1.SyncService`.
+pub(super) const SYNC_PATH: &str = "/blaze.v1.SyncService/Sync";
+
 /// One method.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Method {
@@ -71,8 +74,19 @@ pub(super) const METHODS: &[Method] = &[
     writes("Revert", "revert"),
 ];
 
+/// What workers call. It has a stream in both directions, so neither its body nor its answer ends soon.
+pub(super) const SYNC: &Method = &Method {
+    name: "Sync",
+    right: Right::Sync,
+    action: "sync",
+    writes: false,
+};
+
 /// The method of a path.
 pub(super) fn of_path(path: &str) -> Option<&'static Method> {
+    if path == SYNC_PATH {
+        return Some(SYNC);
+    }
     let name = path.strip_prefix(PATH)?;
     METHODS.iter().find(|method| method.name == name)
 }
@@ -96,10 +110,12 @@ mod tests {
     #[test]
     fn only_exact_paths_are_methods() {
         assert_eq!(of_path("/blaze.v1.ConfigService/Get").unwrap().name, "Get");
+        assert_eq!(of_path(SYNC_PATH), Some(SYNC));
         for path in [
             "/blaze.v1.ConfigService/get",
             "/blaze.v1.ConfigService/Get/",
-            "/blaze.v1.SyncService/Sync",
+            "/blaze.v1.SyncService/Get",
+            "/blaze.v1.ConfigService/Sync",
             "/",
         ] {
             assert_eq!(of_path(path), None, "{path}");

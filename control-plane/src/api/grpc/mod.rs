@@ -1,8 +1,9 @@
-//! gRPC: `blaze.v1.ConfigService` on the core, health, reflection.
+//! gRPC: `blaze.v1.ConfigService` and `blaze.v1.SyncService` on the core, health, reflection.
 //!
 //! ```text
 //! axum::Router ─┬─ blaze.v1.ConfigService ─ gate ─▶ service ─▶ operations ─▶ core::ConfigService
 //!               │                                     └─ incoming, outgoing, watch, status
+//!               ├─ blaze.v1.SyncService ─── gate ─▶ sync ─────────────────▶ core::ConfigService
 //!               ├─ grpc.health.v1.Health            without a token, follows readiness
 //!               └─ grpc.reflection.v1, v1alpha      without a token, only if it is switched on
 //! ```
@@ -17,6 +18,7 @@ mod operations;
 mod outgoing;
 mod service;
 mod status;
+mod sync;
 #[cfg(test)]
 mod tests;
 mod watch;
@@ -26,6 +28,7 @@ use std::sync::Arc;
 use axum::{Router, middleware};
 use blaze_proto::CONFIG_DESCRIPTORS;
 use blaze_proto::v1::config_service_server::ConfigServiceServer;
+use blaze_proto::v1::sync_service_server::SyncServiceServer;
 use blaze_runtime::Readiness;
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
@@ -69,9 +72,12 @@ pub fn router(service: ConfigService, options: GrpcOptions) -> Router {
         metrics: Arc::clone(&options.metrics),
         dev: options.dev,
     });
+    let workers = sync::Service::new(service.clone(), Arc::clone(&options.limits), Arc::clone(&options.metrics));
+    let workers = SyncServiceServer::new(workers).max_decoding_message_size(MAX_MESSAGE_BYTES);
     let config = ConfigServiceServer::new(service::Service::new(service, options.limits, options.metrics))
         .max_decoding_message_size(MAX_MESSAGE_BYTES);
     let config = Routes::new(config)
+        .add_service(workers)
         .into_axum_router()
         .reset_fallback()
         .route_layer(middleware::from_fn_with_state(Arc::clone(&gate), gate::gate));

@@ -25,7 +25,7 @@ pub(super) struct Service {
 
 impl Call {
     /// The caller that the gate let through, and the message.
-    fn open<T>(request: Request<T>) -> Result<(Self, T), Status> {
+    pub(super) fn open<T>(request: Request<T>) -> Result<(Self, T), Status> {
         let (_, mut extensions, message) = request.into_parts();
         match extensions.remove::<Self>() {
             Some(call) => {
