@@ -22,6 +22,10 @@ const ALLOWED: &[(&str, &[&str])] = &[
         &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"],
     ),
     (
+        "blaze-worker",
+        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"],
+    ),
+    (
         "blaze-sdk",
         &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"],
     ),
@@ -58,10 +62,10 @@ const OUTSIDE: &[(&str, &[&str])] = &[
     ("axum", &["blaze-runtime", "blaze-flow", "blaze-config"]),
     (
         "anyhow",
-        &["blaze-runtime", "blaze-flow", "blaze-config", "blaze", "blaze-tests"],
+        &["blaze-runtime", "blaze-flow", "blaze-config", "blaze-worker", "blaze", "blaze-tests"],
     ),
-    ("mongodb", &["blaze-config", "blaze-tests"]),
-    ("rusqlite", &["blaze-config"]),
+    ("mongodb", &["blaze-config", "blaze-worker", "blaze-tests"]),
+    ("rusqlite", &["blaze-config", "blaze-worker"]),
     (
         "tokio",
         &[
@@ -69,6 +73,7 @@ const OUTSIDE: &[(&str, &[&str])] = &[
             "blaze-brokers",
             "blaze-flow",
             "blaze-config",
+            "blaze-worker",
             "blaze-sdk",
             "blaze",
             "blaze-tests",

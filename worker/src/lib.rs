@@ -10,3 +10,5 @@
 
 pub mod copy;
 pub mod core;
+pub mod serve;
+pub mod sync;

@@ -15,6 +15,7 @@ mod connection;
 mod flow_side;
 mod gate;
 mod kept;
+mod keys;
 mod leases;
 mod owner;
 mod publisher;
@@ -42,6 +43,7 @@ use tokio_util::sync::CancellationToken;
 
 pub use gate::MAX_QUEUE_BYTES;
 pub use kept::{MAX_KEPT_BYTES, MAX_KEPT_WRITERS};
+pub use keys::{KeyChange, KeyError, Record, RedisKeys};
 pub use leases::MAX_LEASES;
 pub use subscriptions::MAX_CHANNELS;
 

@@ -143,6 +143,11 @@ impl Names {
         Arc::from(format!("{}{channel}", self.prefix))
     }
 
+    /// A key that is none of a channel's.
+    pub(super) fn key(&self, key: &str) -> String {
+        format!("{}{key}", self.prefix)
+    }
+
     /// Hash of what is kept of a channel for late joiners: writer → its last frames.
     pub(super) fn last(&self, channel: &ChannelName) -> Arc<str> {
         Arc::from(format!("{}blaze:last:{channel}", self.prefix))

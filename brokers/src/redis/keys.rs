@@ -1,0 +1,348 @@
+//! Keys on a Redis server: values, records with an expiry, a lease. What the worker of BlazeConfig and the cache of a service
+//! keep there, beside messages.
+//!
+//! ```text
+//! apply(changes, messages) ─► MULTI … EXEC   all of it or nothing
+//! hold(key, owner, time)   ─► one script      who has it, and for how long
+//! ```
+//!
+//! A connection is made when it is needed and forgotten when it fails: every call either does what it should within its time
+//! or says that it did not.
+
+use std::collections::BTreeMap;
+use std::future::Future;
+use std::time::Duration;
+
+use blaze_domain::names::ChannelName;
+use blaze_domain::node_file::RedisBroker as Section;
+use bytes::Bytes;
+use parking_lot::Mutex;
+use redis::aio::MultiplexedConnection;
+use redis::{AsyncConnectionConfig, RedisError, Script};
+
+use super::settings::Settings;
+use crate::open::OpenError;
+
+/// Time for a connection to come about.
+const CONNECT: Duration = Duration::from_secs(1);
+/// Time for one call.
+const CALL: Duration = Duration::from_secs(2);
+/// Between two looks whether the server is still the same.
+const LOOK: Duration = Duration::from_millis(500);
+/// Keys that one look at many takes from the server at a time.
+const SCAN: usize = 500;
+
+/// Why a call did nothing, or nobody knows whether it did.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum KeyError {
+    /// The server does not answer. What was asked for may have been done.
+    #[error("{place}: {reason}")]
+    Away {
+        /// Host and port, or path.
+        place: String,
+        /// For people.
+        reason: String,
+    },
+    /// The server said no.
+    #[error("{place} refuses: {reason}")]
+    Refused {
+        /// Host and port, or path.
+        place: String,
+        /// In its words.
+        reason: String,
+    },
+}
+
+/// One change of a key. Keys are given without the prefix of the section.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum KeyChange {
+    /// It has this value, without expiry.
+    Put {
+        /// Name.
+        key: String,
+        /// Value.
+        value: Bytes,
+    },
+    /// It is a record with these members and no others, for so long.
+    PutRecord {
+        /// Name.
+        key: String,
+        /// Members.
+        members: BTreeMap<String, String>,
+        /// After this time it vanishes.
+        expires: Duration,
+    },
+    /// There is no such key.
+    Delete {
+        /// Name.
+        key: String,
+    },
+}
+
+/// Members of a record, by their names.
+pub type Record = BTreeMap<String, String>;
+
+/// A client for keys. Clones of what is behind it are cheap; calls may overlap.
+pub struct RedisKeys {
+    settings: Settings,
+    connection: Mutex<Option<MultiplexedConnection>>,
+    /// Which start of the server was met last.
+    run: Mutex<Option<String>>,
+    hold: Script,
+    release: Script,
+}
+
+impl RedisKeys {
+    /// Reads what the section names. Connects nowhere.
+    ///
+    /// # Errors
+    /// [`OpenError`] where it can never work.
+    pub fn open(section: &Section) -> Result<Self, OpenError> {
+        Ok(Self {
+            settings: Settings::read(section)?,
+            connection: Mutex::new(None),
+            run: Mutex::new(None),
+            hold: Script::new(HOLD),
+            release: Script::new(RELEASE),
+        })
+    }
+
+    /// Host and port, or path: for people, without secrets.
+    #[must_use]
+    pub fn place(&self) -> &str {
+        &self.settings.place
+    }
+
+    /// Makes all changes, then publishes all messages: everything or nothing.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn apply(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), KeyError> {
+        if changes.is_empty() && messages.is_empty() {
+            return Ok(());
+        }
+        let mut pipe = redis::pipe();
+        pipe.atomic();
+        for change in changes {
+            self.add(&mut pipe, change);
+        }
+        for (channel, payload) in messages {
+            let channel = self.settings.names.channel(channel);
+            pipe.publish(&*channel, payload.as_ref()).ignore();
+        }
+        self.call(|mut connection| async move { pipe.query_async::<()>(&mut connection).await })
+            .await
+    }
+
+    fn add(&self, pipe: &mut redis::Pipeline, change: &KeyChange) {
+        match change {
+            KeyChange::Put { key, value } => {
+                pipe.set(self.settings.names.key(key), value.as_ref()).ignore();
+            }
+            KeyChange::PutRecord { key, members, expires } => {
+                let key = self.settings.names.key(key);
+                let members: Vec<(&str, &str)> = members.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
+                let expires_ms = i64::try_from(expires.as_millis()).unwrap_or(i64::MAX).max(1);
+                pipe.del(&key).ignore();
+                if !members.is_empty() {
+                    pipe.hset_multiple(&key, &members).ignore();
+                    pipe.pexpire(&key, expires_ms).ignore();
+                }
+            }
+            KeyChange::Delete { key } => {
+                pipe.del(self.settings.names.key(key)).ignore();
+            }
+        }
+    }
+
+    /// The value of a key.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn get(&self, key: &str) -> Result<Option<Bytes>, KeyError> {
+        let key = self.settings.names.key(key);
+        let value = self
+            .call(|mut connection| async move {
+                redis::cmd("GET").arg(key).query_async::<Option<Vec<u8>>>(&mut connection).await
+            })
+            .await?;
+        Ok(value.map(Bytes::from))
+    }
+
+    /// A record; `None` if there is none or it has vanished.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn record(&self, key: &str) -> Result<Option<Record>, KeyError> {
+        let key = self.settings.names.key(key);
+        let members = self
+            .call(|mut connection| async move {
+                redis::cmd("HGETALL").arg(key).query_async::<Record>(&mut connection).await
+            })
+            .await?;
+        Ok((!members.is_empty()).then_some(members))
+    }
+
+    /// All records whose key begins so, at most so many; keys are given without the prefix of the section.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn records(&self, beginning: &str, most: usize) -> Result<Vec<(String, Record)>, KeyError> {
+        let prefix = self.settings.names.key("");
+        let pattern = format!("{}*", escaped(&self.settings.names.key(beginning)));
+        let keys = self.keys(&pattern, most).await?;
+        let mut out = Vec::with_capacity(keys.len());
+        for part in keys.chunks(SCAN) {
+            let mut pipe = redis::pipe();
+            for key in part {
+                pipe.cmd("HGETALL").arg(key);
+            }
+            let found = self
+                .call(|mut connection| async move { pipe.query_async::<Vec<Record>>(&mut connection).await })
+                .await?;
+            let named = part.iter().zip(found).filter(|(_, members)| !members.is_empty());
+            out.extend(named.map(|(key, members)| (key.strip_prefix(&prefix).unwrap_or(key).to_owned(), members)));
+        }
+        Ok(out)
+    }
+
+    async fn keys(&self, pattern: &str, most: usize) -> Result<Vec<String>, KeyError> {
+        let mut keys: std::collections::BTreeSet<String> = std::collections::BTreeSet::new();
+        let mut cursor = 0_u64;
+        loop {
+            let (next, part) = self
+                .call(|mut connection| async move {
+                    let mut scan = redis::cmd("SCAN");
+                    scan.arg(cursor).arg("MATCH").arg(pattern).arg("COUNT").arg(SCAN);
+                    scan.query_async::<(u64, Vec<String>)>(&mut connection).await
+                })
+                .await?;
+            keys.extend(part);
+            if next == 0 || keys.len() >= most {
+                return Ok(keys.into_iter().take(most).collect());
+            }
+            cursor = next;
+        }
+    }
+
+    /// Takes a lease that nobody has, or goes on having it, for so long from now. Returns whether `owner` has it.
+    ///
+    /// # Errors
+    /// [`KeyError`]: then it may run out, or be had.
+    pub async fn hold(&self, key: &str, owner: &str, time: Duration) -> Result<bool, KeyError> {
+        let mut call = self.hold.key(self.settings.names.key(key));
+        call.arg(owner).arg(u64::try_from(time.as_millis()).unwrap_or(u64::MAX).max(1));
+        self.call(|mut connection| async move { call.invoke_async::<bool>(&mut connection).await })
+            .await
+    }
+
+    /// Gives a lease up, if `owner` has it.
+    ///
+    /// # Errors
+    /// [`KeyError`]: then it runs out by itself.
+    pub async fn release(&self, key: &str, owner: &str) -> Result<(), KeyError> {
+        let mut call = self.release.key(self.settings.names.key(key));
+        call.arg(owner);
+        self.call(|mut connection| async move { call.invoke_async::<()>(&mut connection).await })
+            .await
+    }
+
+    /// Waits until the server has been started anew: then it may have lost what it had. One that does not say which start it
+    /// is (no right to `INFO`) is never found to be another.
+    pub async fn restarted(&self) {
+        loop {
+            if let Ok(Some(run)) = self.run_id().await {
+                let mut last = self.run.lock();
+                let is_another = last.as_ref().is_some_and(|last| *last != run);
+                *last = Some(run);
+                if is_another {
+                    return;
+                }
+            }
+            tokio::time::sleep(LOOK).await;
+        }
+    }
+
+    async fn run_id(&self) -> Result<Option<String>, KeyError> {
+        let info = self
+            .call(|mut connection| async move {
+                let mut info = redis::cmd("INFO");
+                info.arg("server").query_async::<String>(&mut connection).await
+            })
+            .await?;
+        let run = info.lines().find_map(|line| line.strip_prefix("run_id:"));
+        Ok(run.map(|run| run.trim().to_owned()))
+    }
+
+    async fn call<T, F>(&self, ask: impl FnOnce(MultiplexedConnection) -> F) -> Result<T, KeyError>
+    where
+        F: Future<Output = Result<T, RedisError>>,
+    {
+        let connection = self.connection().await?;
+        let answer = tokio::time::timeout(CALL, ask(connection)).await;
+        let answer = answer.unwrap_or_else(|_| Err(RedisError::from((redis::ErrorKind::Io, "no answer within 2 s"))));
+        answer.map_err(|error| self.failed(&error))
+    }
+
+    async fn connection(&self) -> Result<MultiplexedConnection, KeyError> {
+        if let Some(connection) = self.connection.lock().clone() {
+            return Ok(connection);
+        }
+        let config = AsyncConnectionConfig::new()
+            .set_connection_timeout(Some(CONNECT))
+            .set_response_timeout(Some(CALL));
+        let made = self.settings.client.get_multiplexed_async_connection_with_config(&config);
+        let made = tokio::time::timeout(CONNECT, made).await;
+        let made = made.unwrap_or_else(|_| Err(RedisError::from((redis::ErrorKind::Io, "no connection within 1 s"))));
+        let connection = made.map_err(|error| self.failed(&error))?;
+        *self.connection.lock() = Some(connection.clone());
+        Ok(connection)
+    }
+
+    fn failed(&self, error: &RedisError) -> KeyError {
+        let (place, reason) = (self.settings.place.clone(), error.to_string());
+        if error.is_io_error() || error.is_timeout() || error.is_connection_dropped() || error.is_connection_refusal() {
+            *self.connection.lock() = None;
+            KeyError::Away { place, reason }
+        } else {
+            KeyError::Refused { place, reason }
+        }
+    }
+}
+
+/// Taken when free, prolonged when one's own.
+const HOLD: &str = r"
+local owner = redis.call('GET', KEYS[1])
+if owner and owner ~= ARGV[1] then return 0 end
+redis.call('SET', KEYS[1], ARGV[1], 'PX', ARGV[2])
+return 1
+";
+
+/// Deleted when one's own.
+const RELEASE: &str = r"
+if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end
+return 1
+";
+
+/// A text that a pattern of the server finds as it is.
+fn escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for character in text.chars() {
+        if matches!(character, '*' | '?' | '[' | ']' | '\\' | '^' | '-') {
+            out.push('\\');
+        }
+        out.push(character);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pattern_finds_the_text_itself() {
+        assert_eq!(escaped("blaze:watchdog:"), "blaze:watchdog:");
+        assert_eq!(escaped("a*b?[c]\\"), "a\\*b\\?\\[c\\]\\\\");
+    }
+}

@@ -1,0 +1,12 @@
+//! The local broker's side: what services ask and are told.
+//!
+//! ```text
+//! blaze/config/get ─▶ engine ─▶ reply_to
+//! engine ─▶ Speaker (the newest for each place) ─▶ Outlet ─▶ keys, then blaze/config/changed/<service>
+//! ```
+
+pub mod outlet;
+pub mod speaker;
+
+pub use outlet::{BrokerOutlet, Outlet, OutletError};
+pub use speaker::{Speaker, SpeakerCounts, Told};

@@ -1,0 +1,148 @@
+//! Where keys and notices go: a broker, and a Redis for the keys where there is one.
+
+use std::num::NonZeroUsize;
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use blaze_brokers::redis::{KeyChange, KeyError, RedisKeys};
+use blaze_brokers::{Broker, BrokerError, Health, PublishOutcome, Publisher, PublisherOptions};
+use blaze_domain::names::ChannelName;
+use bytes::Bytes;
+use lru::LruCache;
+use parking_lot::Mutex;
+
+/// Publishers that are kept; the one that was used longest ago goes first.
+const PUBLISHERS: NonZeroUsize = NonZeroUsize::MIN.saturating_add(1023);
+
+/// Why nothing was delivered, or nobody knows whether it was.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum OutletError {
+    /// The broker does not answer.
+    #[error("the broker is away: {0}")]
+    Away(String),
+    /// The broker cannot have such a channel.
+    #[error(transparent)]
+    Broker(#[from] BrokerError),
+    /// The server of the keys does not do it.
+    #[error(transparent)]
+    Keys(#[from] KeyError),
+}
+
+/// Where keys and notices go.
+#[async_trait]
+pub trait Outlet: Send + Sync + 'static {
+    /// Makes all changes of keys, then publishes all messages, in their order.
+    ///
+    /// # Errors
+    /// [`OutletError`]: some of it may have been done; doing all of it again does no harm.
+    async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError>;
+
+    /// Whether keys are kept at all.
+    fn has_keys(&self) -> bool;
+
+    /// Waits until the server of the keys may have lost them: it was away and is back.
+    async fn keys_lost(&self);
+}
+
+/// A broker, and a Redis for the keys.
+pub struct BrokerOutlet {
+    broker: Arc<dyn Broker>,
+    keys: Option<Keys>,
+    publishers: Mutex<LruCache<ChannelName, Arc<dyn Publisher>>>,
+}
+
+struct Keys {
+    client: Arc<RedisKeys>,
+    /// It is the broker's own server: keys and notices go in one transaction.
+    is_broker: bool,
+}
+
+impl BrokerOutlet {
+    /// A broker without keys.
+    #[must_use]
+    pub fn new(broker: Arc<dyn Broker>) -> Self {
+        Self {
+            broker,
+            keys: None,
+            publishers: Mutex::new(LruCache::new(PUBLISHERS)),
+        }
+    }
+
+    /// The same with keys on a Redis; `is_broker`: it is the broker's own server.
+    #[must_use]
+    pub fn with_keys(mut self, client: Arc<RedisKeys>, is_broker: bool) -> Self {
+        self.keys = Some(Keys { client, is_broker });
+        self
+    }
+
+    /// Publishes one message, now. What a broker that is away does not take is dropped: whoever asked asks again.
+    ///
+    /// # Errors
+    /// [`OutletError`].
+    pub fn publish(&self, channel: &ChannelName, payload: &Bytes) -> Result<(), OutletError> {
+        let publisher = self.publisher(channel)?;
+        match publisher.publish_bare(payload, None) {
+            PublishOutcome::Taken => Ok(()),
+            PublishOutcome::Dropped => Err(OutletError::Away(self.broker.status().borrow().detail.clone())),
+            PublishOutcome::TooLarge => Err(OutletError::Away(format!(
+                "{} bytes are more than it carries",
+                payload.len()
+            ))),
+        }
+    }
+
+    fn publisher(&self, channel: &ChannelName) -> Result<Arc<dyn Publisher>, BrokerError> {
+        if let Some(known) = self.publishers.lock().get(channel) {
+            return Ok(Arc::clone(known));
+        }
+        let options = PublisherOptions {
+            reliable: true,
+            ..PublisherOptions::default()
+        };
+        let made = self.broker.publisher(channel, options)?;
+        self.publishers.lock().put(channel.clone(), Arc::clone(&made));
+        Ok(made)
+    }
+
+    fn check_up(&self) -> Result<(), OutletError> {
+        let status = self.broker.status();
+        let status = status.borrow();
+        match status.health {
+            Health::Up => Ok(()),
+            Health::Connecting | Health::Down | Health::InUse | Health::Closed => {
+                Err(OutletError::Away(status.detail.clone()))
+            }
+        }
+    }
+}
+
+#[async_trait]
+impl Outlet for BrokerOutlet {
+    async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+        match &self.keys {
+            Some(keys) if keys.is_broker => {
+                keys.client.apply(changes, messages).await?;
+                return Ok(());
+            }
+            Some(keys) => keys.client.apply(changes, &[]).await?,
+            None => {}
+        }
+        if !messages.is_empty() {
+            self.check_up()?;
+        }
+        messages
+            .iter()
+            .try_for_each(|(channel, payload)| self.publish(channel, payload))
+    }
+
+    fn has_keys(&self) -> bool {
+        self.keys.is_some()
+    }
+
+    async fn keys_lost(&self) {
+        match &self.keys {
+            Some(keys) => keys.client.restarted().await,
+            None => std::future::pending().await,
+        }
+    }
+}

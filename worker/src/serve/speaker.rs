@@ -1,0 +1,356 @@
+//! Tells services what has changed, one after the other, and never twice what is old already: of what waits, only the newest
+//! of each place counts. A broker that is away holds up nobody; what waits then is bounded by the places that there are.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use blaze_brokers::redis::KeyChange;
+use blaze_domain::names::ChannelName;
+use bytes::Bytes;
+use parking_lot::Mutex;
+use tokio::sync::Notify;
+
+use super::outlet::Outlet;
+
+/// Places that are told of in one transaction.
+const BATCH: usize = 256;
+/// Upper bounds of the pause after a failure, which doubles; full jitter.
+const PAUSE: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
+
+/// What is told of one place.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Told {
+    /// Which place: a name that no other has.
+    pub place: String,
+    /// Its key and what it has from now on, `None`: there is none; absent where the place has no key.
+    pub key: Option<(String, Option<Bytes>)>,
+    /// Channel and text of the notice, if there is one.
+    pub notice: Option<(ChannelName, Bytes)>,
+}
+
+/// What happened to notices and keys.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct SpeakerCounts {
+    /// Notices that the broker took.
+    pub notices: u64,
+    /// Notices that were replaced by newer ones before the broker took them.
+    pub replaced: u64,
+    /// Keys that were written or deleted.
+    pub keys: u64,
+    /// Transactions that failed and were tried again.
+    pub failures: u64,
+    /// Places that wait.
+    pub waiting: u64,
+}
+
+#[derive(Default)]
+struct State {
+    /// All keys as they should be, to be written again when the server has lost them.
+    wanted: BTreeMap<String, Bytes>,
+    /// Places in the order in which they are told of; each stands here once.
+    order: VecDeque<String>,
+    waiting: BTreeMap<String, Told>,
+}
+
+impl State {
+    /// Takes in what is newer than what waits of the same place. Returns whether a notice gave way.
+    fn put(&mut self, told: Told) -> bool {
+        if let Some((key, value)) = &told.key {
+            match value {
+                Some(value) => self.wanted.insert(key.clone(), value.clone()),
+                None => self.wanted.remove(key),
+            };
+        }
+        let place = told.place.clone();
+        match self.waiting.insert(place.clone(), told) {
+            None => {
+                self.order.push_back(place);
+                false
+            }
+            Some(old) => {
+                let now = self.waiting.get_mut(&place);
+                let is_replaced = now.as_ref().is_some_and(|now| now.notice.is_some()) && old.notice.is_some();
+                if let Some(now) = now {
+                    now.notice = now.notice.take().or(old.notice);
+                    now.key = now.key.take().or(old.key);
+                }
+                is_replaced
+            }
+        }
+    }
+
+    fn take(&mut self) -> Vec<Told> {
+        let count = self.order.len().min(BATCH);
+        let places: Vec<String> = self.order.drain(..count).collect();
+        places.iter().filter_map(|place| self.waiting.remove(place)).collect()
+    }
+
+    /// What could not be told goes back to the front; what has come meanwhile is newer.
+    fn put_back(&mut self, batch: Vec<Told>) {
+        for told in batch.into_iter().rev() {
+            if let Some(now) = self.waiting.get_mut(&told.place) {
+                now.notice = now.notice.take().or(told.notice);
+                now.key = now.key.take().or(told.key);
+                continue;
+            }
+            self.order.push_front(told.place.clone());
+            self.waiting.insert(told.place.clone(), told);
+        }
+    }
+
+    /// All keys are to be written again.
+    fn write_all(&mut self) {
+        let all: Vec<_> = self.wanted.iter().map(|(key, value)| (key.clone(), value.clone())).collect();
+        for (key, value) in all {
+            // A name of its own: it takes nothing from what waits of the place, and the value is the same.
+            self.put(Told {
+                place: format!("key {key}"),
+                key: Some((key, Some(value))),
+                notice: None,
+            });
+        }
+    }
+}
+
+struct Shared {
+    state: Mutex<State>,
+    more: Notify,
+    notices: AtomicU64,
+    replaced: AtomicU64,
+    keys: AtomicU64,
+    failures: AtomicU64,
+}
+
+/// Clones share it. [`Speaker::run`] must run once.
+#[derive(Clone)]
+pub struct Speaker {
+    shared: Arc<Shared>,
+}
+
+impl Default for Speaker {
+    fn default() -> Self {
+        Self {
+            shared: Arc::new(Shared {
+                state: Mutex::default(),
+                more: Notify::new(),
+                notices: AtomicU64::new(0),
+                replaced: AtomicU64::new(0),
+                keys: AtomicU64::new(0),
+                failures: AtomicU64::new(0),
+            }),
+        }
+    }
+}
+
+impl Speaker {
+    /// Tells it as soon as the broker takes it. Never waits.
+    pub fn tell(&self, told: impl IntoIterator<Item = Told>) {
+        let mut replaced = 0;
+        {
+            let mut state = self.shared.state.lock();
+            for one in told {
+                replaced += u64::from(state.put(one));
+            }
+        }
+        self.shared.replaced.fetch_add(replaced, Ordering::Relaxed);
+        self.shared.more.notify_one();
+    }
+
+    /// What has happened so far.
+    #[must_use]
+    pub fn counts(&self) -> SpeakerCounts {
+        let count = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        SpeakerCounts {
+            notices: count(&self.shared.notices),
+            replaced: count(&self.shared.replaced),
+            keys: count(&self.shared.keys),
+            failures: count(&self.shared.failures),
+            waiting: self.shared.state.lock().order.len() as u64,
+        }
+    }
+
+    /// Tells what waits, for ever.
+    pub async fn run(self, outlet: Arc<dyn Outlet>) {
+        let lost = async {
+            loop {
+                outlet.keys_lost().await;
+                self.shared.state.lock().write_all();
+                self.shared.more.notify_one();
+            }
+        };
+        tokio::select! {
+            () = self.speak(&*outlet) => {}
+            () = lost => {}
+        }
+    }
+
+    async fn speak(&self, outlet: &dyn Outlet) {
+        let mut pause = PAUSE.0;
+        loop {
+            let batch = self.shared.state.lock().take();
+            if batch.is_empty() {
+                self.shared.more.notified().await;
+                continue;
+            }
+            let changes: Vec<KeyChange> = match outlet.has_keys() {
+                true => batch.iter().filter_map(|told| told.key.as_ref().map(change)).collect(),
+                false => Vec::new(),
+            };
+            let messages: Vec<_> = batch.iter().filter_map(|told| told.notice.clone()).collect();
+            match outlet.deliver(&changes, &messages).await {
+                Ok(()) => {
+                    pause = PAUSE.0;
+                    self.shared.keys.fetch_add(changes.len() as u64, Ordering::Relaxed);
+                    self.shared.notices.fetch_add(messages.len() as u64, Ordering::Relaxed);
+                }
+                Err(error) => {
+                    tracing::debug!(%error, "services could not be told");
+                    self.shared.failures.fetch_add(1, Ordering::Relaxed);
+                    self.shared.state.lock().put_back(batch);
+                    tokio::time::sleep(pause.mul_f64(rand::random())).await;
+                    pause = (pause * 2).min(PAUSE.1);
+                }
+            }
+        }
+    }
+}
+
+fn change((key, value): &(String, Option<Bytes>)) -> KeyChange {
+    match value {
+        Some(value) => KeyChange::Put {
+            key: key.clone(),
+            value: value.clone(),
+        },
+        None => KeyChange::Delete { key: key.clone() },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use async_trait::async_trait;
+    use tokio::sync::{mpsc, watch};
+
+    use super::super::outlet::OutletError;
+    use super::*;
+
+    type Delivered = (Vec<KeyChange>, Vec<(ChannelName, Bytes)>);
+
+    /// A broker that can be away and can lose its keys.
+    struct Fake {
+        is_up: watch::Receiver<bool>,
+        lost: Arc<Notify>,
+        delivered: mpsc::Sender<Delivered>,
+    }
+
+    #[async_trait]
+    impl Outlet for Fake {
+        async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+            if !*self.is_up.borrow() {
+                return Err(OutletError::Away("switched off".to_owned()));
+            }
+            self.delivered.send((changes.to_vec(), messages.to_vec())).await.unwrap();
+            Ok(())
+        }
+
+        fn has_keys(&self) -> bool {
+            true
+        }
+
+        async fn keys_lost(&self) {
+            self.lost.notified().await;
+        }
+    }
+
+    struct World {
+        speaker: Speaker,
+        up: watch::Sender<bool>,
+        lost: Arc<Notify>,
+        delivered: mpsc::Receiver<Delivered>,
+        _run: tokio::task::JoinSet<()>,
+    }
+
+    fn world(is_up: bool) -> World {
+        let (up, seen) = watch::channel(is_up);
+        let (send, delivered) = mpsc::channel(64);
+        let (speaker, lost) = (Speaker::default(), Arc::new(Notify::new()));
+        let outlet = Arc::new(Fake {
+            is_up: seen,
+            lost: Arc::clone(&lost),
+            delivered: send,
+        });
+        let mut run = tokio::task::JoinSet::new();
+        run.spawn(speaker.clone().run(outlet));
+        World {
+            speaker,
+            up,
+            lost,
+            delivered,
+            _run: run,
+        }
+    }
+
+    fn told(place: &str, text: &'static str) -> Told {
+        Told {
+            place: place.to_owned(),
+            key: Some((format!("blaze:config:{place}"), Some(Bytes::from(text)))),
+            notice: Some((format!("blaze/config/changed/{place}").parse().unwrap(), Bytes::from(text))),
+        }
+    }
+
+    fn texts(delivered: &Delivered) -> Vec<Bytes> {
+        delivered.1.iter().map(|(_, text)| text.clone()).collect()
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn of_what_waits_the_newest_of_each_place_is_told_once() {
+        let mut w = world(false);
+        w.speaker.tell([told("slam", "1"), told("nav", "1")]);
+        w.speaker.tell([told("slam", "2")]);
+        while w.speaker.counts().failures < 3 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        w.speaker.tell([told("slam", "3")]);
+        w.up.send_replace(true);
+        let first = w.delivered.recv().await.unwrap();
+        assert_eq!(texts(&first), ["3", "1"]);
+        assert_eq!(first.0.len(), 2);
+        tokio::time::sleep(Duration::from_secs(5)).await;
+        assert!(w.delivered.is_empty());
+        let counts = w.speaker.counts();
+        assert_eq!((counts.notices, counts.replaced, counts.waiting), (2, 2, 0));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn keys_that_the_server_has_lost_are_written_again_without_a_notice() {
+        let mut w = world(true);
+        w.speaker.tell([told("slam", "1"), told("nav", "1")]);
+        w.delivered.recv().await.unwrap();
+        w.speaker.tell([Told {
+            key: Some(("blaze:config:nav".to_owned(), None)),
+            ..told("nav", "gone")
+        }]);
+        let gone = w.delivered.recv().await.unwrap();
+        assert_eq!(gone.0, [KeyChange::Delete { key: "blaze:config:nav".to_owned() }]);
+        w.lost.notify_one();
+        let again = w.delivered.recv().await.unwrap();
+        let slam = KeyChange::Put {
+            key: "blaze:config:slam".to_owned(),
+            value: Bytes::from("1"),
+        };
+        assert_eq!(again, (vec![slam], Vec::new()));
+    }
+
+    #[test]
+    fn what_came_meanwhile_is_newer_than_what_goes_back() {
+        let mut state = State::default();
+        state.put(told("slam", "1"));
+        let batch = state.take();
+        state.put(told("slam", "2"));
+        state.put_back(batch);
+        let left = state.take();
+        assert_eq!(left, [told("slam", "2")]);
+        assert!(state.take().is_empty());
+    }
+}

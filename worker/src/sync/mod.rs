@@ -1,0 +1,12 @@
+//! The way to the main service.
+//!
+//! ```text
+//! client ──[who asks, what it has?]──▶ engine
+//!        ──Hello──▶ main service ──Welcome, Snapshot, Commit, Bookmark──▶ client ──[Incoming]──▶ engine ──[Ack]──▶ client
+//! ```
+
+pub mod backoff;
+pub mod client;
+pub mod wire;
+
+pub use client::{ConnectError, MainService, SyncEvent, follow};
