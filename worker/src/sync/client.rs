@@ -17,7 +17,8 @@ use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint};
 use tonic::{Request, Status, Streaming};
 
 use super::backoff::Backoff;
-use super::wire::{Incoming, WireFault};
+use super::wire::IncomingError;
+use crate::core::Incoming;
 
 /// Largest message that is taken.
 const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;
@@ -70,7 +71,7 @@ pub enum ConnectError {
     Refused(Status),
     /// What it says makes no sense.
     #[error(transparent)]
-    Wire(#[from] WireFault),
+    Wire(#[from] IncomingError),
     /// The engine has ended.
     #[error("the worker is ending")]
     Ending,

@@ -70,7 +70,7 @@ pub enum SyncItem {
         protocol: u32,
         /// Which store this is.
         store_id: String,
-        /// Where the commits that follow begin, or of which revision the snapshot is.
+        /// Where the store stands.
         revision: u64,
         /// Commits follow; else a snapshot does.
         resumed: bool,
@@ -178,7 +178,7 @@ impl ConfigService {
         let welcome = SyncItem::Welcome {
             protocol: SYNC_PROTOCOL.min(hello.protocol),
             store_id: self.inner.store_id.clone(),
-            revision: since,
+            revision: state.revision(),
             resumed,
         };
         let snapshot = match resumed {

@@ -2,6 +2,7 @@
 
 mod access;
 mod kept;
+mod keys;
 mod outages;
 mod owner;
 mod support;
