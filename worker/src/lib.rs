@@ -10,3 +10,4 @@
 
 pub mod copy;
 pub mod core;
+pub mod sync;
