@@ -22,6 +22,7 @@ mod replica;
 mod served;
 #[cfg(test)]
 mod testing;
+mod world;
 
 pub use answer::{Freshness, Reply, answer};
 pub use asked::{ASKED_FOR, MAX_ASKED};
