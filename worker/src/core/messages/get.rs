@@ -3,7 +3,8 @@
 use std::fmt;
 
 use blaze_domain::control::{MAX_ID_BYTES, REPLY_PREFIX};
-use blaze_domain::{ChannelName, InstanceName, NodeName, ServiceName};
+use blaze_domain::names::ChannelName;
+use blaze_domain::{InstanceName, NodeName, ServiceName};
 use serde_json::{Map, Value};
 
 use super::fields::{check_depth, object, parsed, text};
