@@ -164,7 +164,9 @@ pub enum SyncFault {
         theirs: u32,
     },
     /// It goes on from a copy that is of another store, or newer than the store itself.
-    #[error("the main service would go on from revision {ours} of store {store_id:?}, but it is at {theirs} of {other:?}")]
+    #[error(
+        "the main service would go on from revision {ours} of store {store_id:?}, but it is at {theirs} of {other:?}"
+    )]
     OtherStore {
         /// The store of the copy.
         store_id: Option<String>,

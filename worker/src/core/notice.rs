@@ -209,7 +209,10 @@ mod tests {
         let new = json!({"a": {"b": 2, "c": [1, 3]}, "new": {"p": {"q": 1}, "r/s": null}, "same": {"deep": true}});
         let expected = ["/a/b", "/a/c", "/gone/x", "/gone/y", "/new/p/q", "/new/r~1s"];
         assert_eq!(paths(&old, &new), expected);
-        assert_eq!(paths(&json!({}), &json!({"camera": {"rate_hz": 1}})), ["/camera/rate_hz"]);
+        assert_eq!(
+            paths(&json!({}), &json!({"camera": {"rate_hz": 1}})),
+            ["/camera/rate_hz"]
+        );
         // A leaf that becomes an object, and the other way round.
         assert_eq!(paths(&json!({"a": 1}), &json!({"a": {"b": 2}})), ["/a", "/a/b"]);
         assert!(paths(&new, &new).is_empty());

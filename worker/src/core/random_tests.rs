@@ -55,8 +55,7 @@ fn config() -> impl Strategy<Value = Value> {
         1 => (1_u64..3).prop_map(|version| json!({"$secret": {"text": "canary", "version": version}})),
         1 => (0_u64..2).prop_map(|inner| json!({"z": inner})),
     ];
-    proptest::collection::btree_map("[xy]", leaf, 0..3)
-        .prop_map(|members| Value::Object(members.into_iter().collect()))
+    proptest::collection::btree_map("[xy]", leaf, 0..3).prop_map(|members| Value::Object(members.into_iter().collect()))
 }
 
 fn write() -> impl Strategy<Value = Write> {
@@ -234,14 +233,21 @@ impl Run {
         }
         let flushed = self.served.flush(self.now);
         for notice in &flushed.notices {
-            assert_ne!(notice.hash, notice.previous_hash, "{} was told nothing new", notice.place);
+            assert_ne!(
+                notice.hash, notice.previous_hash,
+                "{} was told nothing new",
+                notice.place
+            );
             self.told(&notice.place, notice.revision);
             assert!(notice.revision <= self.truth.revision());
             if let Some(known) = self.known.get(&notice.place) {
                 assert_eq!(&notice.previous_hash, known, "{}", notice.place);
             }
             assert_eq!(notice.hash.is_none(), notice.config.is_none());
-            assert_eq!(notice.hash.is_none(), notice.paths.is_empty() && notice.scopes.is_empty());
+            assert_eq!(
+                notice.hash.is_none(),
+                notice.paths.is_empty() && notice.scopes.is_empty()
+            );
             self.known.insert(notice.place.clone(), notice.hash.clone());
         }
         for place in flushed.tracked {
@@ -262,7 +268,10 @@ impl Run {
             assert_eq!(self.known.get(place), Some(&fresh), "{place}");
         }
         let site = self.served.site();
-        let homes = self.truth.all().filter_map(|(_, held)| site.home(&self.truth, &held.document));
+        let homes = self
+            .truth
+            .all()
+            .filter_map(|(_, held)| site.home(&self.truth, &held.document));
         let expected: BTreeSet<Place> = homes.chain(self.asked.iter().cloned()).collect();
         let told: BTreeSet<Place> = self.served.told().map(|(place, _)| place.clone()).collect();
         assert_eq!(told, expected);
@@ -274,7 +283,9 @@ impl Run {
 fn fresh(served: &Served, truth: &State, place: &Place) -> Option<String> {
     truth.get(&Key::service(&place.service))?;
     let failed = served.failed();
-    let sources = Sources::at_where(truth, &place.at(served.site()), |rollout| !failed.contains(&rollout.uid));
+    let sources = Sources::at_where(truth, &place.at(served.site()), |rollout| {
+        !failed.contains(&rollout.uid)
+    });
     Some(sources.hash())
 }
 

@@ -3,15 +3,7 @@ use serde_json::json;
 use super::super::testing::{document, keys, labelled, place, site, state};
 use super::*;
 
-const TRACKED: [&str; 7] = [
-    "blur",
-    "blur/0@a",
-    "slam",
-    "slam/0@a",
-    "slam/1@b",
-    "slam/2",
-    "slam@a",
-];
+const TRACKED: [&str; 7] = ["blur", "blur/0@a", "slam", "slam/0@a", "slam/1@b", "slam/2", "slam@a"];
 
 fn places() -> Places {
     let mut places = Places::default();
@@ -101,16 +93,28 @@ fn a_roll_out_concerns_what_it_changes_on_nodes() {
     };
     let none = State::default();
     for (target, expected) in [
-        (json!({"kind": "Service", "name": "slam"}), vec!["slam@a", "slam/0@a", "slam/1@b"]),
-        (json!({"kind": "Layer", "name": "edge"}), vec!["blur/0@a", "slam@a", "slam/0@a", "slam/1@b"]),
+        (
+            json!({"kind": "Service", "name": "slam"}),
+            vec!["slam@a", "slam/0@a", "slam/1@b"],
+        ),
+        (
+            json!({"kind": "Layer", "name": "edge"}),
+            vec!["blur/0@a", "slam@a", "slam/0@a", "slam/1@b"],
+        ),
         (json!({"kind": "Node", "name": "b"}), vec!["slam/1@b"]),
-        (json!({"kind": "Instance", "service": "slam", "name": "0"}), vec!["slam/0@a"]),
+        (
+            json!({"kind": "Instance", "service": "slam", "name": "0"}),
+            vec!["slam/0@a"],
+        ),
         (json!({"kind": "Instance", "service": "slam", "name": "2"}), vec![]),
     ] {
         let tried = rollout(target.clone(), "canary");
         assert_eq!(found(&none, &tried, ["Rollout/try"]), expected);
         assert_eq!(found(&tried, &none, ["Rollout/try"]), expected);
-        assert_eq!(found(&tried, &rollout(target.clone(), "failed"), ["Rollout/try"]), expected);
+        assert_eq!(
+            found(&tried, &rollout(target.clone(), "failed"), ["Rollout/try"]),
+            expected
+        );
         let over = rollout(target, "promoted");
         assert!(found(&over, &over, ["Rollout/try"]).is_empty());
     }

@@ -93,7 +93,10 @@ fn a_snapshot_is_applied_whole_with_its_last_part() {
     assert_eq!(replica.as_of(), Some(at(5)));
     let digest = replica.digest();
     let point = replica.resume_point();
-    assert_eq!((point.store_id.as_str(), point.revision, point.digest), ("store", 12, digest));
+    assert_eq!(
+        (point.store_id.as_str(), point.revision, point.digest),
+        ("store", 12, digest)
+    );
 }
 
 #[test]
@@ -138,7 +141,10 @@ fn more_documents_than_a_store_may_have_are_not_taken() {
 fn commits_in_a_row_are_applied() {
     let mut replica = replica();
     let first = change(replica.apply(commit(12, 10, Op::Create, node("c", 12)), at(1)));
-    assert_eq!((first.keys, first.old.revision(), first.new.revision()), (keys(["Node/c"]), 10, 12));
+    assert_eq!(
+        (first.keys, first.old.revision(), first.new.revision()),
+        (keys(["Node/c"]), 10, 12)
+    );
     let second = change(replica.apply(commit(15, 12, Op::Leave, node("a", 3)), at(2)));
     assert_eq!((second.old.len(), second.new.len()), (3, 2));
     change(replica.apply(commit(16, 15, Op::Delete, node("c", 12)), at(3)));
@@ -150,14 +156,23 @@ fn commits_in_a_row_are_applied() {
 #[test]
 fn a_lost_commit_is_noticed_and_leads_to_a_snapshot() {
     let mut replica = replica();
-    let fault = replica.apply(commit(14, 12, Op::Create, node("c", 14)), at(1)).unwrap_err();
+    let fault = replica
+        .apply(commit(14, 12, Op::Create, node("c", 14)), at(1))
+        .unwrap_err();
     assert_eq!(fault, SyncFault::Gap { expected: 10, got: 12 });
     assert!(!replica.is_in_sync());
     // What was there is still served, and nothing else comes in before a new stream.
     assert_eq!((replica.state().len(), replica.state().revision()), (2, 10));
     let after = replica.apply(commit(11, 10, Op::Create, node("c", 11)), at(1));
     assert!(matches!(after, Err(SyncFault::Unexpected { .. })));
-    assert_eq!(replica.resume_point(), ResumePoint { store_id: String::new(), revision: 0, digest: String::new() });
+    assert_eq!(
+        replica.resume_point(),
+        ResumePoint {
+            store_id: String::new(),
+            revision: 0,
+            digest: String::new()
+        }
+    );
     replica.disconnected();
     replica.apply(welcome(14, false), at(2)).unwrap();
     change(replica.apply(part(14, vec![node("a", 3), node("b", 4), node("c", 14)], true), at(2)));
@@ -174,7 +189,9 @@ fn a_bookmark_raises_the_revision_but_not_what_commits_follow_on() {
     assert_eq!(replica.state().revision(), 30);
     // The last commit that was told is still the one of the snapshot.
     change(replica.apply(commit(31, 10, Op::Create, node("c", 31)), at(8)));
-    let fault = replica.apply(commit(31, 31, Op::Create, node("c", 31)), at(8)).unwrap_err();
+    let fault = replica
+        .apply(commit(31, 31, Op::Create, node("c", 31)), at(8))
+        .unwrap_err();
     assert_eq!(fault, SyncFault::Gap { expected: 31, got: 31 });
 }
 
@@ -182,7 +199,9 @@ fn a_bookmark_raises_the_revision_but_not_what_commits_follow_on() {
 fn a_commit_below_the_bookmark_is_a_gap() {
     let mut replica = replica();
     replica.apply(bookmark(30, ""), at(7)).unwrap();
-    let fault = replica.apply(commit(25, 10, Op::Create, node("c", 25)), at(8)).unwrap_err();
+    let fault = replica
+        .apply(commit(25, 10, Op::Create, node("c", 25)), at(8))
+        .unwrap_err();
     assert_eq!(fault, SyncFault::Gap { expected: 10, got: 25 });
 }
 
@@ -193,7 +212,14 @@ fn other_documents_at_the_same_revision_are_noticed() {
     let ours = replica.digest();
     let fault = replica.apply(bookmark(12, "sha256:other"), at(2)).unwrap_err();
     let theirs = "sha256:other".to_owned();
-    assert_eq!(fault, SyncFault::Digest { revision: 12, ours, theirs });
+    assert_eq!(
+        fault,
+        SyncFault::Digest {
+            revision: 12,
+            ours,
+            theirs
+        }
+    );
     assert_eq!((replica.resume_point().revision, replica.as_of()), (0, Some(at(1))));
 }
 
@@ -207,10 +233,14 @@ fn the_digest_follows_the_documents() {
     change(replica.apply(commit(13, 12, Op::Delete, node("c", 12)), at(1)));
     assert_eq!(replica.digest(), before);
     let lines = b"Node - a 3\nNode - b 4\n";
-    assert_eq!(before, canonical::digest([
-        (blaze_domain::config::Kind::Node, None, "a", 3),
-        (blaze_domain::config::Kind::Node, None, "b", 4),
-    ]), "{lines:?}");
+    assert_eq!(
+        before,
+        canonical::digest([
+            (blaze_domain::config::Kind::Node, None, "a", 3),
+            (blaze_domain::config::Kind::Node, None, "b", 4),
+        ]),
+        "{lines:?}"
+    );
 }
 
 #[test]
@@ -231,7 +261,9 @@ fn after_a_resume_what_was_applied_already_may_come_again() {
         }
         change(replica.apply(commit(16, previous, Op::Create, node("c", 16)), at(3)));
         // From now on nothing comes twice.
-        let fault = replica.apply(commit(14, 9, Op::Delete, node("a", 3)), at(4)).unwrap_err();
+        let fault = replica
+            .apply(commit(14, 9, Op::Delete, node("a", 3)), at(4))
+            .unwrap_err();
         assert_eq!(fault, SyncFault::Gap { expected: 16, got: 9 });
     }
 }
@@ -239,7 +271,9 @@ fn after_a_resume_what_was_applied_already_may_come_again() {
 #[test]
 fn after_a_resume_a_gap_is_one_all_the_same() {
     let mut replica = resumed(14);
-    let fault = replica.apply(commit(18, 16, Op::Create, node("c", 18)), at(2)).unwrap_err();
+    let fault = replica
+        .apply(commit(18, 16, Op::Create, node("c", 18)), at(2))
+        .unwrap_err();
     assert_eq!(fault, SyncFault::Gap { expected: 14, got: 16 });
 }
 
@@ -287,20 +321,37 @@ fn a_mounted_file_is_nothing_to_go_on_from() {
 fn messages_out_of_order_are_faults() {
     let mut replica = Replica::new(layer());
     let fault = replica.apply(bookmark(3, ""), at(0)).unwrap_err();
-    assert_eq!(fault, SyncFault::Unexpected { message: "Bookmark", waited_for: "a Welcome" });
+    assert_eq!(
+        fault,
+        SyncFault::Unexpected {
+            message: "Bookmark",
+            waited_for: "a Welcome"
+        }
+    );
     // Nothing is known to be wrong with the copy.
     let mut replica = self::replica();
     replica.apply(welcome(10, true), at(0)).unwrap_err();
     assert_eq!(replica.resume_point().revision, 10);
     replica.disconnected();
-    let other = Incoming::Welcome { protocol: 2, store_id: String::new(), revision: 1, resumed: false };
-    assert_eq!(replica.apply(other, at(0)).unwrap_err(), SyncFault::Protocol { theirs: 2 });
+    let other = Incoming::Welcome {
+        protocol: 2,
+        store_id: String::new(),
+        revision: 1,
+        resumed: false,
+    };
+    assert_eq!(
+        replica.apply(other, at(0)).unwrap_err(),
+        SyncFault::Protocol { theirs: 2 }
+    );
 }
 
 #[test]
 fn being_sent_away_changes_nothing() {
     let mut replica = replica();
-    let away = Incoming::GoAway { retry_after: Duration::from_secs(2), reason: "draining".to_owned() };
+    let away = Incoming::GoAway {
+        retry_after: Duration::from_secs(2),
+        reason: "draining".to_owned(),
+    };
     let applied = replica.apply(away, at(9)).unwrap();
     assert!(matches!(applied, Applied::GoAway { retry_after, .. } if retry_after == Duration::from_secs(2)));
     assert_eq!((replica.state().len(), replica.as_of()), (2, Some(at(0))));

@@ -346,9 +346,7 @@ impl Served {
         };
         if let Some((new, hash)) = new {
             let config = Config::of(&new);
-            let before = old
-                .as_ref()
-                .map_or_else(|| Value::Object(Map::new()), Sources::merged);
+            let before = old.as_ref().map_or_else(|| Value::Object(Map::new()), Sources::merged);
             notice.paths = paths(&before, config.value());
             notice.scopes = scopes(&old.unwrap_or_default(), &new, place.service.as_str());
             notice.config = Some(config);
@@ -415,8 +413,8 @@ impl Served {
 }
 
 #[cfg(test)]
-#[path = "served_tests.rs"]
-mod tests;
-#[cfg(test)]
 #[path = "random_tests.rs"]
 mod random_tests;
+#[cfg(test)]
+#[path = "served_tests.rs"]
+mod tests;

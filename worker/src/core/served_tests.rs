@@ -90,9 +90,17 @@ fn the_first_documents_are_told_to_everybody_who_has_one() {
     let expected = ["slam", "slam/0 at robot-1", "slam/1 at robot-2", "slam/2", "slam/3"];
     assert_eq!(places(&flushed.notices), expected);
     assert_eq!(flushed.tracked.len(), 5);
-    assert!(flushed.notices.iter().all(|notice| notice.previous_hash.is_none() && notice.revision == 10));
+    assert!(
+        flushed
+            .notices
+            .iter()
+            .all(|notice| notice.previous_hash.is_none() && notice.revision == 10)
+    );
     assert_eq!(flushed.notices[1].paths, ["/fov", "/log", "/rate_hz"]);
-    assert_eq!(flushed.notices[1].scopes, [Scope::Layer, Scope::Service, Scope::Instance]);
+    assert_eq!(
+        flushed.notices[1].scopes,
+        [Scope::Layer, Scope::Service, Scope::Instance]
+    );
     assert_eq!(flushed.notices[0].source, Source::File);
     assert!(served.is_ready() && !served.has_pending());
 }
@@ -101,14 +109,27 @@ fn the_first_documents_are_told_to_everybody_who_has_one() {
 fn on_a_node_those_are_told_that_may_run_there() {
     let served = served(Some("robot-1"));
     let told: Vec<String> = served.told().map(|(place, _)| place.to_string()).collect();
-    let expected = ["slam at robot-1", "slam/0 at robot-1", "slam/2 at robot-1", "slam/3 at robot-1"];
+    let expected = [
+        "slam at robot-1",
+        "slam/0 at robot-1",
+        "slam/2 at robot-1",
+        "slam/3 at robot-1",
+    ];
     assert_eq!(told, expected);
 }
 
 #[test]
 fn a_change_is_told_to_those_whose_hash_it_changes() {
     let mut served = served(None);
-    put(&mut served, 11, vec![document("Instance/slam/0", 11, json!({"node": "robot-1", "config": {"fov": 2}}))]);
+    put(
+        &mut served,
+        11,
+        vec![document(
+            "Instance/slam/0",
+            11,
+            json!({"node": "robot-1", "config": {"fov": 2}}),
+        )],
+    );
     let notices = flush(&mut served);
     assert_eq!(places(&notices), ["slam/0 at robot-1"]);
     let notice = &notices[0];
@@ -137,7 +158,15 @@ fn what_changes_no_configuration_is_not_told() {
     assert_eq!(told, ["slam", "slam/1 at robot-2", "slam/2", "slam/3"]);
     // There and back within one flush.
     put(&mut served, 13, vec![slam(1, 13)]);
-    put(&mut served, 14, vec![document("Service/slam", 14, json!({"config": {"rate_hz": 30, "fov": 7}}))]);
+    put(
+        &mut served,
+        14,
+        vec![document(
+            "Service/slam",
+            14,
+            json!({"config": {"rate_hz": 30, "fov": 7}}),
+        )],
+    );
     assert!(flush(&mut served).is_empty());
 }
 
@@ -145,7 +174,11 @@ fn what_changes_no_configuration_is_not_told() {
 fn several_commits_become_one_notice_with_the_last_state() {
     let mut served = served(Some("robot-1"));
     put(&mut served, 11, vec![slam(31, 11)]);
-    put(&mut served, 12, vec![document("Layer/edge", 12, json!({"config": {"log": "debug"}}))]);
+    put(
+        &mut served,
+        12,
+        vec![document("Layer/edge", 12, json!({"config": {"log": "debug"}}))],
+    );
     put(&mut served, 13, vec![slam(32, 13)]);
     let notices = flush(&mut served);
     assert_eq!(notices.len(), 4);
@@ -163,7 +196,12 @@ fn a_deleted_service_is_told_once_to_all_its_places() {
     let now = Instant::now();
     let mut served = served(Some("robot-1"));
     served.ask(&place("slam/9@robot-1"), now).unwrap();
-    let instances = ["Instance/slam/0", "Instance/slam/1", "Instance/slam/2", "Instance/slam/3"];
+    let instances = [
+        "Instance/slam/0",
+        "Instance/slam/1",
+        "Instance/slam/2",
+        "Instance/slam/3",
+    ];
     remove(&mut served, 11, instances);
     remove(&mut served, 12, ["Service/slam"]);
     let flushed = served.flush(now);
@@ -179,7 +217,11 @@ fn a_deleted_service_is_told_once_to_all_its_places() {
     put(&mut served, 13, vec![slam(30, 13)]);
     let notices = served.flush(now).notices;
     assert_eq!(places(&notices), ["slam at robot-1", "slam/9 at robot-1"]);
-    assert!(notices.iter().all(|notice| notice.previous_hash.is_none() && notice.revision == 13));
+    assert!(
+        notices
+            .iter()
+            .all(|notice| notice.previous_hash.is_none() && notice.revision == 13)
+    );
 }
 
 #[test]
@@ -225,11 +267,23 @@ fn a_roll_out_is_told_on_its_canaries_alone() {
     let notices = flush(&mut served);
     assert_eq!(places(&notices), ["slam/0 at robot-1"]);
     assert_eq!(notices[0].rollout.as_ref().unwrap().as_str(), "slower");
-    assert_eq!((notices[0].paths.as_slice(), notices[0].scopes.as_slice()), (&["/rate_hz".to_owned()][..], &[Scope::Service][..]));
+    assert_eq!(
+        (notices[0].paths.as_slice(), notices[0].scopes.as_slice()),
+        (&["/rate_hz".to_owned()][..], &[Scope::Service][..])
+    );
     assert_eq!(served.changed_by("Rollout/slower"), [place("slam/0@robot-1")]);
     assert!(served.changed_by("other").is_empty());
     // A second canary, by its label.
-    put(&mut served, 12, vec![labelled("Node/robot-2", 12, json!({"layer": "edge"}), ("canary", "true"))]);
+    put(
+        &mut served,
+        12,
+        vec![labelled(
+            "Node/robot-2",
+            12,
+            json!({"layer": "edge"}),
+            ("canary", "true"),
+        )],
+    );
     assert_eq!(places(&flush(&mut served)), ["slam/1 at robot-2"]);
     // The main service says that it failed.
     put(&mut served, 13, vec![rollout(13, "failed")]);
@@ -286,11 +340,17 @@ fn of_too_many_failed_roll_outs_those_that_are_over_go() {
         served.fail_rollout(&number.to_string());
     }
     assert_eq!(served.failed().len(), MAX_FAILED);
-    assert_eq!((served.failed()[0].as_str(), served.failed()[1].as_str()), ("Rollout/slower", "1"));
+    assert_eq!(
+        (served.failed()[0].as_str(), served.failed()[1].as_str()),
+        ("Rollout/slower", "1")
+    );
 }
 
 fn remembered(served: &Served) -> Vec<(Place, Told)> {
-    served.told().map(|(place, told)| (place.clone(), told.clone())).collect()
+    served
+        .told()
+        .map(|(place, told)| (place.clone(), told.clone()))
+        .collect()
 }
 
 #[test]
@@ -304,13 +364,25 @@ fn after_a_restart_only_what_differs_is_told() {
     served.load(state(10, documents()), Source::Copy).unwrap();
     let notices = flush(&mut served);
     assert_eq!(notices.len(), 4);
-    assert!(notices.iter().all(|notice| notice.revision == 20 && notice.previous_hash.is_some()));
-    assert_eq!(notices[0].paths, ["/log", "/rate_hz"], "what was told is not known any more");
+    assert!(
+        notices
+            .iter()
+            .all(|notice| notice.revision == 20 && notice.previous_hash.is_some())
+    );
+    assert_eq!(
+        notices[0].paths,
+        ["/log", "/rate_hz"],
+        "what was told is not known any more"
+    );
     // Then the main service comes back.
     put(&mut served, 21, vec![slam(31, 20)]);
     let notices = flush(&mut served);
     assert_eq!(notices.len(), 4);
-    assert!(notices.iter().all(|notice| notice.revision == 21 && notice.paths == ["/rate_hz"]));
+    assert!(
+        notices
+            .iter()
+            .all(|notice| notice.revision == 21 && notice.paths == ["/rate_hz"])
+    );
 }
 
 #[test]
@@ -319,10 +391,16 @@ fn a_service_that_went_while_the_worker_was_down_is_told() {
     before.ask(&place("slam/9@robot-1"), Instant::now()).unwrap();
     let mut served = Served::new(site(Some("robot-1")));
     served.restore(remembered(&before), [], Instant::now());
-    served.load(state(12, [document("Layer/edge", 1, json!({}))]), Source::Copy).unwrap();
+    served
+        .load(state(12, [document("Layer/edge", 1, json!({}))]), Source::Copy)
+        .unwrap();
     let notices = flush(&mut served);
     assert_eq!(notices.len(), 5);
-    assert!(notices.iter().all(|notice| notice.hash.is_none() && notice.revision == 12));
+    assert!(
+        notices
+            .iter()
+            .all(|notice| notice.hash.is_none() && notice.revision == 12)
+    );
 }
 
 #[test]
@@ -330,12 +408,22 @@ fn a_weaker_source_never_replaces_a_stronger_one() {
     let mut served = served(Some("robot-1"));
     for source in [Source::File, Source::Copy] {
         let error = served.load(state(99, []), source).unwrap_err();
-        assert_eq!(error, WeakerSource { held: Source::Main, offered: source });
+        assert_eq!(
+            error,
+            WeakerSource {
+                held: Source::Main,
+                offered: source
+            }
+        );
     }
     assert!(!served.has_pending());
     assert_eq!(served.source(), Some(Source::Main));
     served.set_in_sync(false);
-    assert_eq!(served.source(), Some(Source::Copy), "it may be older than what the main service has");
+    assert_eq!(
+        served.source(),
+        Some(Source::Copy),
+        "it may be older than what the main service has"
+    );
     assert!(served.load(state(99, []), Source::Copy).is_err());
     let mut file = Served::new(site(None));
     for (source, revision) in [(Source::File, 0), (Source::File, 0), (Source::Copy, 8)] {
@@ -353,7 +441,12 @@ fn a_store_that_is_behind_makes_no_revision_go_back() {
     let change = Change {
         keys: keys(["Service/slam"]),
         old: served.state().clone(),
-        new: { let mut new = served.state().clone(); new.put(Arc::new(slam(32, 7))); new.advance(7, []); new },
+        new: {
+            let mut new = served.state().clone();
+            new.put(Arc::new(slam(32, 7)));
+            new.advance(7, []);
+            new
+        },
     };
     served.apply(&change);
     assert!(flush(&mut served).iter().all(|notice| notice.revision == 50));

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use blaze_domain::ServiceName;
+use blaze_domain::config::Key;
 use blaze_domain::config::effective::{At, Sources};
 use blaze_domain::config::state::State;
-use blaze_domain::config::Key;
 
 use super::place::{Place, Site};
 

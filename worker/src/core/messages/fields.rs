@@ -26,11 +26,7 @@ pub(super) fn object(bytes: &[u8]) -> Result<Map<String, Value>, String> {
         Ok(Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) | Value::Array(_)) => {
             Err("is no JSON object".to_owned())
         }
-        Err(error) => Err(format!(
-            "is no JSON: line {} column {}",
-            error.line(),
-            error.column()
-        )),
+        Err(error) => Err(format!("is no JSON: line {} column {}", error.line(), error.column())),
     }
 }
 
@@ -55,9 +51,10 @@ pub(super) fn text<'m>(
 ) -> Result<Option<&'m str>, String> {
     match members.get(name) {
         None | Some(Value::Null) => Ok(None),
-        Some(Value::String(text)) if text.len() > max_bytes => {
-            Err(format!("{name}: has {} bytes, at most {max_bytes} are allowed", text.len()))
-        }
+        Some(Value::String(text)) if text.len() > max_bytes => Err(format!(
+            "{name}: has {} bytes, at most {max_bytes} are allowed",
+            text.len()
+        )),
         Some(Value::String(text)) if text.chars().any(char::is_control) => {
             Err(format!("{name}: holds control characters"))
         }

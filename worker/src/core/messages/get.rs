@@ -193,7 +193,10 @@ mod tests {
             let mut request = json!({"id": "7f1c", "service": "slam", "reply_to": "blaze/reply/me"});
             request[member] = value;
             let refused = parse(&request).unwrap_err();
-            assert_eq!(refused.reply_to.as_ref().map(ChannelName::as_str), Some("blaze/reply/me"));
+            assert_eq!(
+                refused.reply_to.as_ref().map(ChannelName::as_str),
+                Some("blaze/reply/me")
+            );
             assert_eq!(refused.id.as_deref(), (member != "id").then_some("7f1c"));
             assert_eq!(refused.error.code, ErrorCode::InvalidRequest);
             assert!(refused.error.detail.starts_with(&format!("{member}: ")), "{refused}");

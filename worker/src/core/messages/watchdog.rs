@@ -167,7 +167,10 @@ mod tests {
             "state": "ready", "since_ms": 1_795_244_472_345_u64, "version": "1.2.3", "config_revision": 431,
             "config_hash": "sha256:ab", "ttl_ms": 15000});
         assert_eq!(ServiceState::parse(message.to_string().as_bytes()), Ok(of_hash.clone()));
-        assert_eq!((of_hash.epoch, of_hash.health, of_hash.config_revision), (17, Health::Ready, 431));
+        assert_eq!(
+            (of_hash.epoch, of_hash.health, of_hash.config_revision),
+            (17, Health::Ready, 431)
+        );
         assert_eq!(
             WatchdogKey::parse("lab:", "lab:blaze:watchdog:slam:robot-1:0"),
             Some(of_hash.key)

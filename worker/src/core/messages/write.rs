@@ -40,7 +40,9 @@ impl Delivery {
             let known = Secret::of(value).and_then(Result::ok);
             let text = match (self, known) {
                 (Self::Text, Some(Secret::Text(text) | Secret::Revealed { text, .. })) => Some(text),
-                (Self::Text, Some(Secret::Redacted { .. } | Secret::Stored { .. }) | None) | (Self::Redacted, _) => None,
+                (Self::Text, Some(Secret::Redacted { .. } | Secret::Stored { .. }) | None) | (Self::Redacted, _) => {
+                    None
+                }
             };
             Some(text.map_or_else(|| secret::redact(value).into_owned(), Value::from))
         });

@@ -158,13 +158,23 @@ fn what_is_too_large_is_refused() {
             Delivery::Text,
             freshness(),
         );
-        assert_eq!(answer.starts_with(r#"{"id":"7f1c","error":{"code":"too_large","detail":"#), !fits);
+        assert_eq!(
+            answer.starts_with(r#"{"id":"7f1c","error":{"code":"too_large","detail":"#),
+            !fits
+        );
     }
 }
 
 #[test]
 fn an_age_has_one_decimal_and_is_never_negative() {
-    for (ms, text) in [(0, "0.0"), (49, "0.0"), (50, "0.1"), (3100, "3.1"), (61_000, "61.0"), (-5000, "0.0")] {
+    for (ms, text) in [
+        (0, "0.0"),
+        (49, "0.0"),
+        (50, "0.1"),
+        (3100, "3.1"),
+        (61_000, "61.0"),
+        (-5000, "0.0"),
+    ] {
         let freshness = Freshness {
             as_of: Some(Timestamp::from_millis(NOW)),
             now: Timestamp::from_millis(NOW + ms),
