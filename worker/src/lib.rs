@@ -10,5 +10,7 @@
 
 pub mod copy;
 pub mod core;
+pub mod lease;
 pub mod serve;
+pub mod settings;
 pub mod sync;

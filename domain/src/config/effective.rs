@@ -14,9 +14,13 @@ use crate::{DocumentName, LayerName, NodeName, ServiceName};
 /// The documents whose configurations are merged, weakest first.
 #[derive(Debug, Clone, Default)]
 pub struct Sources {
+    /// Of the service: its defaults.
     pub service: Option<Arc<Document>>,
+    /// Of the layer that it runs in.
     pub layer: Option<Arc<Document>>,
+    /// Of the node that it runs on.
     pub node: Option<Arc<Document>>,
+    /// Of the instance.
     pub instance: Option<Arc<Document>>,
     /// The roll-out that changed one of them.
     pub rollout: Option<DocumentName>,
@@ -27,9 +31,13 @@ pub struct Sources {
 /// For whom, in names.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct At {
+    /// Which service; `None`: layer and node alone.
     pub service: Option<ServiceName>,
+    /// Which instance of it.
     pub instance: Option<DocumentName>,
+    /// Where it runs.
     pub layer: Option<LayerName>,
+    /// On which node of that layer.
     pub node: Option<NodeName>,
 }
 
@@ -37,6 +45,13 @@ impl Sources {
     /// The documents that count at a place; a roll-out counts on its canary nodes.
     #[must_use]
     pub fn at(state: &State, at: &At) -> Self {
+        Self::at_where(state, at, |_| true)
+    }
+
+    /// The same with those roll-outs alone that `counts` lets pass: a worker undoes one that failed on its node before the
+    /// main service knows.
+    #[must_use]
+    pub fn at_where(state: &State, at: &At, counts: impl Fn(&Document) -> bool) -> Self {
         let document = |key: Key| state.get(&key).map(|held| Arc::clone(&held.document));
         let mut sources = Self {
             service: at.service.as_ref().and_then(|name| document(Key::service(name))),
@@ -49,7 +64,7 @@ impl Sources {
             rollout: None,
             service_name: at.service.clone(),
         };
-        sources.roll_out(state);
+        sources.roll_out(state, counts);
         sources
     }
 
@@ -65,7 +80,7 @@ impl Sources {
         }
     }
 
-    fn roll_out(&mut self, state: &State) {
+    fn roll_out(&mut self, state: &State, counts: impl Fn(&Document) -> bool) {
         let Some(node) = self.node.clone() else { return };
         let parts = [&mut self.service, &mut self.layer, &mut self.node, &mut self.instance];
         for part in parts {
@@ -77,6 +92,7 @@ impl Sources {
                 if let Some(patch) = rollout.spec_member("patch")
                     && let Some(document) = part.as_ref()
                     && is_canary(rollout, &node)
+                    && counts(rollout)
                 {
                     *part = Some(Arc::new(patched(document, patch)));
                     self.rollout = Some(rollout.key.name().clone());

@@ -27,6 +27,7 @@ pub struct Held {
 }
 
 impl Held {
+    /// The document, and what users see of it.
     #[must_use]
     pub fn new(document: Arc<Document>) -> Self {
         let shown = redacted(&document);
@@ -183,10 +184,7 @@ impl State {
 
     /// Instances of a service.
     #[must_use]
-    pub fn instances<'a>(
-        &'a self,
-        service: &ServiceName,
-    ) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
+    pub fn instances<'a>(&'a self, service: &ServiceName) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
         let service = service.clone();
         let start = Key::instance(service.clone(), first_name());
         self.documents

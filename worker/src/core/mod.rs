@@ -1,1 +1,34 @@
 //! What the worker knows and what follows from it. No I/O and no clock: everything comes in as an argument.
+//!
+//! ```text
+//! Incoming ──▶ Replica ──Change──▶ Served ──Flushed──▶ notices, keys of Redis            [messages] writes them
+//!              (the layer's view)    │ ▲
+//!                                    ▼ └── GetRequest                                    [messages] reads it
+//!                                  Reply
+//! ```
+//!
+//! [`Replica`] checks what the main service tells and has the documents; [`Served`] knows who is served with what, and
+//! works out from a change who must be told.
+
+mod answer;
+mod asked;
+mod change;
+mod incoming;
+pub mod messages;
+mod notice;
+mod place;
+mod reach;
+mod replica;
+mod served;
+#[cfg(test)]
+mod testing;
+mod world;
+
+pub use answer::{Freshness, Reply, answer};
+pub use asked::{ASKED_FOR, MAX_ASKED};
+pub use change::Change;
+pub use incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, Op, PROTOCOL, SyncFault, TooLarge};
+pub use notice::{Config, Notice, Scope, Standing};
+pub use place::{Place, Site, Source};
+pub use replica::{Applied, Replica, ResumePoint};
+pub use served::{Flushed, MAX_FAILED, Served, Told, WeakerSource};

@@ -13,7 +13,7 @@ use blaze_domain::config::state::{Held, State};
 use blaze_domain::config::{Code, Document, Problem, secret};
 use blaze_domain::{LayerName, NodeName};
 use futures::stream::{self, BoxStream};
-use futures::{Stream, StreamExt as _};
+use futures::StreamExt as _;
 use rand::RngExt as _;
 use tokio::sync::OwnedSemaphorePermit;
 

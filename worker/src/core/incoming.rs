@@ -1,0 +1,213 @@
+//! What the main service tells a worker, and what can be wrong with it.
+
+use std::fmt;
+use std::time::Duration;
+
+use blaze_domain::config::{Document, MAX_DOCUMENTS, Timestamp};
+
+/// Version of the protocol that is spoken here.
+pub const PROTOCOL: u32 = 1;
+/// Specs of a snapshot, in bytes of their compact JSON, at most (512 MiB).
+pub const MAX_SNAPSHOT_BYTES: usize = 512 * 1024 * 1024;
+
+/// What a commit does to a document.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Op {
+    /// It is new.
+    Create,
+    /// It is another one.
+    Update,
+    /// It is gone.
+    Delete,
+    /// It is still there, but the layer does not see it any more.
+    Leave,
+    /// It is again what it was.
+    Rollback,
+}
+
+/// One document of a commit: after it, or for [`Op::Delete`] and [`Op::Leave`] before it.
+#[derive(Clone)]
+pub struct Edit {
+    /// What is done to it.
+    pub op: Op,
+    /// The document, with secrets in clear.
+    pub document: Document,
+}
+
+/// What the main service tells.
+#[derive(Clone)]
+pub enum Incoming {
+    /// The first message of a stream.
+    Welcome {
+        /// Version of the protocol that it speaks.
+        protocol: u32,
+        /// Which store it serves.
+        store_id: String,
+        /// Where that store stands.
+        revision: u64,
+        /// Whether it goes on from the revision of the Hello; if not, a snapshot follows.
+        resumed: bool,
+    },
+    /// A part of all documents.
+    Snapshot {
+        /// At which revision; the same in all parts.
+        revision: u64,
+        /// The documents of this part.
+        documents: Vec<Document>,
+        /// Whether it is the last part.
+        last: bool,
+    },
+    /// A commit, as far as the layer sees it.
+    Commit {
+        /// Its revision.
+        revision: u64,
+        /// The commit that was told before it in this stream, or where the stream began.
+        previous: u64,
+        /// When it was made.
+        time: Timestamp,
+        /// By whom.
+        subject: String,
+        /// What it did.
+        edits: Vec<Edit>,
+    },
+    /// Everything up to a revision has been told.
+    Bookmark {
+        /// Which revision.
+        revision: u64,
+        /// Digest of the view there; empty: not told.
+        digest: String,
+    },
+    /// The stream is about to end.
+    GoAway {
+        /// When to come again.
+        retry_after: Duration,
+        /// Why.
+        reason: String,
+    },
+}
+
+/// Without the documents: they hold secrets in clear.
+impl fmt::Debug for Edit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:?} {}", self.op, self.document.key)
+    }
+}
+
+/// Without the documents: they hold secrets in clear.
+impl fmt::Debug for Incoming {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.word())?;
+        match self {
+            Self::Welcome { revision, resumed, .. } => write!(f, "({revision}, resumed: {resumed})"),
+            Self::Snapshot {
+                revision,
+                documents,
+                last,
+            } => write!(f, "({revision}, {} documents, last: {last})", documents.len()),
+            Self::Commit {
+                revision,
+                previous,
+                edits,
+                ..
+            } => write!(f, "({revision} after {previous}, {edits:?})"),
+            Self::Bookmark { revision, .. } => write!(f, "({revision})"),
+            Self::GoAway { retry_after, reason } => write!(f, "({retry_after:?}, {reason:?})"),
+        }
+    }
+}
+
+impl Incoming {
+    pub(super) fn word(&self) -> &'static str {
+        match self {
+            Self::Welcome { .. } => "Welcome",
+            Self::Snapshot { .. } => "Snapshot",
+            Self::Commit { .. } => "Commit",
+            Self::Bookmark { .. } => "Bookmark",
+            Self::GoAway { .. } => "GoAway",
+        }
+    }
+}
+
+/// Why a stream must begin anew. The documents are what they were before the message.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SyncFault {
+    /// A commit follows on another one than the last that was told: something is missing.
+    #[error("the commit follows on revision {got}, but {expected} was told last: something is missing")]
+    Gap {
+        /// What was told last in this stream.
+        expected: u64,
+        /// What the commit says was told before it; for a commit that is not newer than the last, its own revision.
+        got: u64,
+    },
+    /// Both have other documents at the same revision.
+    #[error("at revision {revision} the digest here is {ours}, that of the main service {theirs}")]
+    Digest {
+        /// Which revision.
+        revision: u64,
+        /// Over what is here.
+        ours: String,
+        /// What the main service says.
+        theirs: String,
+    },
+    /// A message at a time at which it makes no sense.
+    #[error("{message} when {waited_for} was waited for")]
+    Unexpected {
+        /// Which message.
+        message: &'static str,
+        /// What could have come.
+        waited_for: &'static str,
+    },
+    /// The main service speaks another version.
+    #[error("the main service speaks version {theirs} of the protocol, this worker {PROTOCOL}")]
+    Protocol {
+        /// Its version.
+        theirs: u32,
+    },
+    /// It goes on from a copy that is of another store, or newer than the store itself.
+    #[error(
+        "the main service would go on from revision {ours} of store {store_id:?}, but it is at {theirs} of {other:?}"
+    )]
+    OtherStore {
+        /// The store of the copy.
+        store_id: Option<String>,
+        /// The store of the main service.
+        other: String,
+        /// Where the copy stands.
+        ours: u64,
+        /// Where the store stands.
+        theirs: u64,
+    },
+    /// The parts of a snapshot are of different revisions.
+    #[error("a part of the snapshot of revision {expected} is of revision {got}")]
+    Mixed {
+        /// Of the first part.
+        expected: u64,
+        /// Of this one.
+        got: u64,
+    },
+    /// There are more documents than any store may have.
+    #[error(transparent)]
+    TooLarge(#[from] TooLarge),
+}
+
+/// More than is taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum TooLarge {
+    /// Too many documents.
+    #[error("there are more than {MAX_DOCUMENTS} documents")]
+    Documents,
+    /// Too many bytes.
+    #[error("the documents of the snapshot have more than {MAX_SNAPSHOT_BYTES} bytes")]
+    Bytes,
+}
+
+impl SyncFault {
+    /// Whether the copy cannot be gone on from: what is missing or different is only found again by a snapshot.
+    #[must_use]
+    pub fn needs_snapshot(&self) -> bool {
+        match self {
+            Self::Gap { .. } | Self::Digest { .. } | Self::OtherStore { .. } => true,
+            Self::Unexpected { .. } | Self::Protocol { .. } | Self::Mixed { .. } | Self::TooLarge(_) => false,
+        }
+    }
+}

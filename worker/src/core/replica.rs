@@ -1,0 +1,452 @@
+//! The layer's view, as the main service tells it.
+//!
+//! ```text
+//! connect ─▶ Hello(resume_point) ─▶ Welcome ─┬─ resumed ──────────────────────▶ Commit, Bookmark, … ─▶ disconnected
+//!                                            └─ Snapshot … Snapshot(last) ────▶        │
+//!                                                                                      └─ a fault: Hello with 0
+//! ```
+//!
+//! Whatever goes wrong, the documents stay as they were: those that have been served go on being served.
+
+use std::fmt;
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use blaze_domain::LayerName;
+use blaze_domain::config::state::State;
+use blaze_domain::config::{Document, Key, MAX_DOCUMENTS, Timestamp, canonical};
+
+use super::change::{Change, difference};
+use super::incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, Op, PROTOCOL, SyncFault, TooLarge};
+
+/// What a message did.
+#[derive(Debug)]
+pub enum Applied {
+    /// Nothing to the documents; the known revision may be a higher one.
+    Nothing,
+    /// The documents are others. After a snapshot that holds what was there, no key has changed.
+    Changed(Change),
+    /// The stream is about to end; come again after this time.
+    GoAway {
+        /// When to come again.
+        retry_after: Duration,
+        /// Why.
+        reason: String,
+    },
+}
+
+/// What a Hello says of the copy.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ResumePoint {
+    /// Store that the copy is of; empty: no copy.
+    pub store_id: String,
+    /// Revision of the copy; 0: no copy.
+    pub revision: u64,
+    /// Digest of the copy; empty: no copy.
+    pub digest: String,
+}
+
+/// Where a stream stands.
+enum Stream {
+    /// There is none, or it has not begun.
+    Closed,
+    /// The parts of a snapshot come.
+    Snapshot {
+        store_id: String,
+        /// Of the first part, once it is there.
+        revision: Option<u64>,
+        documents: Vec<Document>,
+        bytes: usize,
+    },
+    /// Commits come.
+    Live {
+        /// The commit that was told last, or where the stream began.
+        told: u64,
+        /// Until the first commit that is new, older ones may come again; the revision from which the stream was resumed.
+        resumed: Option<u64>,
+    },
+    /// Nothing sensible comes any more.
+    Over,
+}
+
+/// The same without what belongs to it.
+#[derive(Clone, Copy)]
+enum Phase {
+    Closed,
+    Snapshot,
+    Live,
+    Over,
+}
+
+impl Stream {
+    fn phase(&self) -> Phase {
+        match self {
+            Self::Closed => Phase::Closed,
+            Self::Snapshot { .. } => Phase::Snapshot,
+            Self::Live { .. } => Phase::Live,
+            Self::Over => Phase::Over,
+        }
+    }
+}
+
+/// The layer's view at a revision.
+pub struct Replica {
+    layer: LayerName,
+    store_id: Option<String>,
+    state: State,
+    /// When it last knew itself in sync.
+    as_of: Option<Timestamp>,
+    /// The digest of `state`, once it was needed.
+    digest: Option<String>,
+    stream: Stream,
+    in_sync: bool,
+    /// Where the store stood when the stream began: nobody is in sync before having that.
+    goal: u64,
+    /// The copy cannot be gone on from.
+    is_stale: bool,
+}
+
+/// Without the documents: they hold secrets in clear.
+impl fmt::Debug for Replica {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Replica")
+            .field("layer", &self.layer)
+            .field("store_id", &self.store_id)
+            .field("revision", &self.state.revision())
+            .field("documents", &self.state.len())
+            .field("in_sync", &self.in_sync)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Replica {
+    /// Nothing yet.
+    #[must_use]
+    pub fn new(layer: LayerName) -> Self {
+        Self::from_copy(layer, None, State::default(), None)
+    }
+
+    /// From a copy; `store_id` is `None` for a mounted file, which is of no store and cannot be gone on from.
+    #[must_use]
+    pub fn from_copy(layer: LayerName, store_id: Option<String>, state: State, as_of: Option<Timestamp>) -> Self {
+        Self {
+            layer,
+            store_id,
+            state,
+            as_of,
+            digest: None,
+            stream: Stream::Closed,
+            in_sync: false,
+            goal: 0,
+            is_stale: false,
+        }
+    }
+
+    /// Its layer.
+    #[must_use]
+    pub fn layer(&self) -> &LayerName {
+        &self.layer
+    }
+
+    /// The store that it is a copy of.
+    #[must_use]
+    pub fn store_id(&self) -> Option<&str> {
+        self.store_id.as_deref()
+    }
+
+    /// All documents, at the newest revision of which everything was told.
+    #[must_use]
+    pub fn state(&self) -> &State {
+        &self.state
+    }
+
+    /// Whether the stream is there and everything was told.
+    #[must_use]
+    pub fn is_in_sync(&self) -> bool {
+        self.in_sync
+    }
+
+    /// When it last knew itself in sync; `None`: never.
+    #[must_use]
+    pub fn as_of(&self) -> Option<Timestamp> {
+        self.as_of
+    }
+
+    /// The digest over all documents; kept until they change.
+    pub fn digest(&mut self) -> String {
+        let state = &self.state;
+        self.digest.get_or_insert_with(|| digest_of(state)).clone()
+    }
+
+    /// What the next Hello says.
+    pub fn resume_point(&mut self) -> ResumePoint {
+        match &self.store_id {
+            Some(store_id) if !self.is_stale => ResumePoint {
+                store_id: store_id.clone(),
+                revision: self.state.revision(),
+                digest: self.digest(),
+            },
+            Some(_) | None => ResumePoint {
+                store_id: String::new(),
+                revision: 0,
+                digest: String::new(),
+            },
+        }
+    }
+
+    /// The stream is gone. A snapshot that has not come whole is forgotten.
+    pub fn disconnected(&mut self) {
+        self.stream = Stream::Closed;
+        self.in_sync = false;
+    }
+
+    /// Takes a message, told at a time.
+    ///
+    /// # Errors
+    /// The stream must begin anew, with [`Replica::resume_point`]; the documents stay as they are.
+    pub fn apply(&mut self, incoming: Incoming, now: Timestamp) -> Result<Applied, SyncFault> {
+        let applied = self.take(incoming);
+        match &applied {
+            Ok(Applied::GoAway { .. }) => {}
+            Ok(Applied::Nothing | Applied::Changed(_)) => self.note_sync(now),
+            Err(fault) => {
+                self.stream = Stream::Over;
+                self.in_sync = false;
+                self.is_stale |= fault.needs_snapshot();
+            }
+        }
+        applied
+    }
+
+    fn note_sync(&mut self, now: Timestamp) {
+        self.in_sync = matches!(self.stream, Stream::Live { .. }) && self.state.revision() >= self.goal;
+        if self.in_sync {
+            // A clock that was set back does not make the copy older than it is.
+            self.as_of = Some(self.as_of.map_or(now, |before| before.max(now)));
+        }
+    }
+
+    fn take(&mut self, incoming: Incoming) -> Result<Applied, SyncFault> {
+        let message = incoming.word();
+        match (self.stream.phase(), incoming) {
+            (_, Incoming::GoAway { retry_after, reason }) => Ok(Applied::GoAway { retry_after, reason }),
+            (
+                Phase::Closed,
+                Incoming::Welcome {
+                    protocol,
+                    store_id,
+                    revision,
+                    resumed,
+                },
+            ) => self
+                .welcome(protocol, store_id, revision, resumed)
+                .map(|()| Applied::Nothing),
+            (
+                Phase::Snapshot,
+                Incoming::Snapshot {
+                    revision,
+                    documents,
+                    last,
+                },
+            ) => self.snapshot(revision, documents, last),
+            (
+                Phase::Live,
+                Incoming::Commit {
+                    revision,
+                    previous,
+                    edits,
+                    ..
+                },
+            ) => self.commit(revision, previous, edits),
+            (Phase::Live, Incoming::Bookmark { revision, digest }) => {
+                self.bookmark(revision, digest).map(|()| Applied::Nothing)
+            }
+            (phase, _) => Err(SyncFault::Unexpected {
+                message,
+                waited_for: match phase {
+                    Phase::Closed => "a Welcome",
+                    Phase::Snapshot => "a Snapshot",
+                    Phase::Live => "a Commit or a Bookmark",
+                    Phase::Over => "nothing after a fault",
+                },
+            }),
+        }
+    }
+
+    fn welcome(&mut self, protocol: u32, store_id: String, revision: u64, resumed: bool) -> Result<(), SyncFault> {
+        if protocol != PROTOCOL {
+            return Err(SyncFault::Protocol { theirs: protocol });
+        }
+        self.goal = revision;
+        let ours = self.state.revision();
+        if !resumed {
+            self.stream = Stream::Snapshot {
+                store_id,
+                revision: None,
+                documents: Vec::new(),
+                bytes: 0,
+            };
+            return Ok(());
+        }
+        if self.is_stale || self.store_id.as_ref() != Some(&store_id) || revision < ours {
+            return Err(SyncFault::OtherStore {
+                store_id: self.store_id.clone(),
+                other: store_id,
+                ours,
+                theirs: revision,
+            });
+        }
+        self.stream = Stream::Live {
+            told: ours,
+            resumed: Some(ours),
+        };
+        Ok(())
+    }
+
+    /// Collects the parts; only the last one changes anything.
+    fn snapshot(&mut self, revision: u64, part: Vec<Document>, last: bool) -> Result<Applied, SyncFault> {
+        let Stream::Snapshot {
+            store_id,
+            revision: first,
+            documents,
+            bytes,
+        } = &mut self.stream
+        else {
+            return Ok(Applied::Nothing);
+        };
+        let expected = *first.get_or_insert(revision);
+        if expected != revision {
+            return Err(SyncFault::Mixed {
+                expected,
+                got: revision,
+            });
+        }
+        if documents.len() + part.len() > MAX_DOCUMENTS {
+            return Err(TooLarge::Documents.into());
+        }
+        *bytes += part.iter().map(spec_bytes).sum::<usize>();
+        if *bytes > MAX_SNAPSHOT_BYTES {
+            return Err(TooLarge::Bytes.into());
+        }
+        documents.extend(part);
+        if !last {
+            return Ok(Applied::Nothing);
+        }
+        let new = State::new(revision, std::mem::take(documents));
+        self.store_id = Some(std::mem::take(store_id));
+        self.stream = Stream::Live {
+            told: revision,
+            resumed: None,
+        };
+        self.goal = revision;
+        self.is_stale = false;
+        let keys = difference(&self.state, &new);
+        Ok(self.changed(keys, new))
+    }
+
+    fn commit(&mut self, revision: u64, previous: u64, edits: Vec<Edit>) -> Result<Applied, SyncFault> {
+        let Stream::Live { told, resumed } = &mut self.stream else {
+            return Ok(Applied::Nothing);
+        };
+        if let Some(start) = *resumed {
+            if revision <= start {
+                // It was applied before the copy was made. What follows names it as told.
+                *told = revision;
+                return Ok(Applied::Nothing);
+            }
+            // Nothing is missing either way: everything up to the start was applied, whatever came again.
+            if previous == start {
+                *told = start;
+            }
+        }
+        if previous != *told {
+            return Err(SyncFault::Gap {
+                expected: *told,
+                got: previous,
+            });
+        }
+        // Also behind a bookmark everything is new: up to it all was told.
+        if revision <= (*told).max(self.state.revision()) {
+            return Err(SyncFault::Gap {
+                expected: *told,
+                got: revision,
+            });
+        }
+        let mut new = self.state.clone();
+        let mut keys: Vec<Key> = Vec::with_capacity(edits.len());
+        for edit in edits {
+            keys.push(edit.document.key.clone());
+            match edit.op {
+                Op::Create | Op::Update | Op::Rollback => new.put(Arc::new(edit.document)),
+                Op::Delete | Op::Leave => {
+                    new.remove(&edit.document.key);
+                }
+            }
+        }
+        if new.len() > MAX_DOCUMENTS {
+            return Err(TooLarge::Documents.into());
+        }
+        new.advance(revision, []);
+        *told = revision;
+        *resumed = None;
+        keys.sort();
+        keys.dedup();
+        Ok(self.changed(keys, new))
+    }
+
+    fn changed(&mut self, keys: Vec<Key>, new: State) -> Applied {
+        let old = std::mem::replace(&mut self.state, new);
+        self.digest = None;
+        Applied::Changed(Change {
+            keys,
+            old,
+            new: self.state.clone(),
+        })
+    }
+
+    fn bookmark(&mut self, revision: u64, theirs: String) -> Result<(), SyncFault> {
+        if revision < self.state.revision() {
+            // Nothing is to be learnt of what lies behind.
+            return Ok(());
+        }
+        if !theirs.is_empty() {
+            let ours = self.digest();
+            if ours != theirs {
+                return Err(SyncFault::Digest { revision, ours, theirs });
+            }
+        }
+        self.state.advance(revision, []);
+        Ok(())
+    }
+}
+
+fn digest_of(state: &State) -> String {
+    canonical::digest(state.all().map(|(key, held)| {
+        let service = key.service_name().map(blaze_domain::ServiceName::as_str);
+        (key.kind(), service, key.name().as_str(), held.document.revision)
+    }))
+}
+
+/// Bytes of a spec as compact JSON, without writing it anywhere.
+fn spec_bytes(document: &Document) -> usize {
+    struct Count(usize);
+    impl io::Write for Count {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0 += bytes.len();
+            Ok(bytes.len())
+        }
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+    let mut count = Count(0);
+    // Nothing can fail: the names of objects are texts and the counter takes everything.
+    match serde_json::to_writer(&mut count, &*document.spec) {
+        Ok(()) | Err(_) => count.0,
+    }
+}
+
+#[cfg(test)]
+#[path = "replica_tests.rs"]
+mod tests;

@@ -1,0 +1,420 @@
+//! Who is served with what, and who must be told of a change.
+//!
+//! ```text
+//! load, apply, fail_rollout ──▶ next documents + keys that changed      (any number of times, at most 20 ms)
+//!                                    │ flush
+//!                                    ▼
+//!   places that they can concern ──▶ another hash? ──▶ Notice
+//!                                    │
+//!                                    ▼
+//!                              shown documents ──▶ answers
+//! ```
+//!
+//! Answers come from the documents of the last [`Served::flush`], as notices do: so what a place was told last is always
+//! what its configuration is in the shown documents, and no configuration has to be kept beside them.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::sync::Arc;
+use std::time::Instant;
+
+use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::placement::is_active;
+use blaze_domain::config::state::State;
+use blaze_domain::config::{Key, Kind};
+use serde_json::{Map, Value};
+
+use super::asked::Asked;
+use super::change::{Change, difference};
+use super::notice::{Config, Notice, Standing, paths, scopes};
+use super::place::{Place, Site, Source};
+use super::reach::{Places, concerned};
+use super::world::World;
+
+/// Roll-outs that are remembered as failed here, at most.
+pub const MAX_FAILED: usize = 1_000;
+
+/// What a place was told last.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Told {
+    /// Where the store stood when its configuration became what it is.
+    pub revision: u64,
+    /// Over the configuration; `None`: that its service is deleted.
+    pub hash: Option<String>,
+}
+
+/// Documents of a weaker source than those that are served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("documents from {offered} do not replace those from {held}")]
+pub struct WeakerSource {
+    /// Where those come from that are served.
+    pub held: Source,
+    /// Where those come from that were refused.
+    pub offered: Source,
+}
+
+/// What follows from the changes since the last time.
+#[derive(Debug, Default)]
+pub struct Flushed {
+    /// In the order of the services; those of one service all with the same revision, or older ones.
+    pub notices: Vec<Notice>,
+    /// Places that are told of changes from now on, whether there is a notice now or not.
+    pub tracked: Vec<Place>,
+    /// Places that are not told any more: whatever is kept for them outside would become old.
+    pub untracked: Vec<Place>,
+}
+
+/// Who is served with what.
+pub struct Served {
+    site: Site,
+    /// What is answered from.
+    shown: World,
+    /// What it will be after the next flush.
+    next: World,
+    /// Documents that differ between the two, and failed roll-outs.
+    pending: BTreeSet<Key>,
+    /// Where the next documents come from.
+    rank: Option<Source>,
+    /// Whether the stream from the main service is there and everything was told.
+    in_sync: bool,
+    /// No place is told a lower revision from now on, whatever store follows.
+    floor: u64,
+    places: Places,
+    asked: Asked,
+    /// Places that went since the last flush.
+    untracked: Vec<Place>,
+}
+
+/// Without the documents: they hold secrets in clear.
+impl fmt::Debug for Served {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Served")
+            .field("site", &self.site)
+            .field("source", &self.source())
+            .field("revision", &self.shown.state.revision())
+            .field("pending", &self.pending.len())
+            .finish_non_exhaustive()
+    }
+}
+
+impl Served {
+    /// Nobody yet.
+    #[must_use]
+    pub fn new(site: Site) -> Self {
+        Self {
+            site,
+            shown: World::default(),
+            next: World::default(),
+            pending: BTreeSet::new(),
+            rank: None,
+            in_sync: false,
+            floor: 0,
+            places: Places::default(),
+            asked: Asked::default(),
+            untracked: Vec::new(),
+        }
+    }
+
+    /// Takes over what an earlier life knew, before anything is loaded: what places were told, so that nothing older is
+    /// told now and what did not change is not told again, and which roll-outs failed. The places count as if they had
+    /// asked now, because they may well be running.
+    pub fn restore(
+        &mut self,
+        told: impl IntoIterator<Item = (Place, Told)>,
+        failed: impl IntoIterator<Item = String>,
+        now: Instant,
+    ) {
+        for (place, told) in told {
+            self.floor = self.floor.max(told.revision);
+            if told.hash.is_some() {
+                self.note_asked(&place, now);
+                self.places.insert(place, told);
+            }
+        }
+        self.next.failed = Arc::new(failed.into_iter().take(MAX_FAILED).collect());
+        self.shown.failed = Arc::clone(&self.next.failed);
+    }
+
+    /// What is served.
+    #[must_use]
+    pub fn site(&self) -> &Site {
+        &self.site
+    }
+
+    /// Where the documents come from: those that the main service told are a copy as soon as it is not certain any more
+    /// that they are its newest.
+    #[must_use]
+    pub fn source(&self) -> Option<Source> {
+        match self.rank? {
+            Source::Main if !self.in_sync => Some(Source::Copy),
+            rank => Some(rank),
+        }
+    }
+
+    /// Whether anybody can be answered.
+    #[must_use]
+    pub fn is_ready(&self) -> bool {
+        self.shown.is_loaded
+    }
+
+    /// The documents that answers come from.
+    #[must_use]
+    pub fn state(&self) -> &State {
+        &self.shown.state
+    }
+
+    /// Every place that is told of changes, with what it was told last.
+    pub fn told(&self) -> impl Iterator<Item = (&Place, &Told)> {
+        self.places.all()
+    }
+
+    /// Uids of the roll-outs that failed here, the oldest first.
+    #[must_use]
+    pub fn failed(&self) -> &[String] {
+        &self.next.failed
+    }
+
+    /// Places that asked and had to go before their time, because too many ask.
+    #[must_use]
+    pub fn evicted(&self) -> u64 {
+        self.asked.evicted()
+    }
+
+    /// Takes documents from a copy or a file.
+    ///
+    /// # Errors
+    /// What is served comes from a stronger source, and stays.
+    pub fn load(&mut self, state: State, source: Source) -> Result<(), WeakerSource> {
+        match self.rank {
+            Some(held) if held > source => return Err(WeakerSource { held, offered: source }),
+            Some(_) | None => {}
+        }
+        self.pending.extend(difference(&self.next.state, &state));
+        self.replace(state, source);
+        Ok(())
+    }
+
+    /// Takes a change that the main service told.
+    pub fn apply(&mut self, change: &Change) {
+        match self.rank {
+            Some(Source::Main) => self.pending.extend(change.keys.iter().cloned()),
+            // Whether it began from the same documents as are served is not certain.
+            Some(Source::Copy | Source::File) | None => {
+                self.pending.extend(difference(&self.next.state, &change.new));
+            }
+        }
+        self.replace(change.new.clone(), Source::Main);
+    }
+
+    fn replace(&mut self, state: State, source: Source) {
+        self.next.state = state;
+        self.next.is_loaded = true;
+        self.rank = Some(source);
+    }
+
+    /// Says whether the documents are known to be the main service's newest. If so, they count as coming from there, also
+    /// if it had nothing to add to the copy.
+    pub fn set_in_sync(&mut self, in_sync: bool) {
+        self.in_sync = in_sync;
+        if in_sync && self.rank.is_some() {
+            self.rank = Some(Source::Main);
+        }
+    }
+
+    /// Undoes a roll-out here, before the main service knows. Of too many those go first that are over.
+    pub fn fail_rollout(&mut self, uid: &str) {
+        if self.next.failed.iter().any(|failed| failed == uid) {
+            return;
+        }
+        let state = &self.next.state;
+        let found = |uid: &str| {
+            let mut rollouts = state.of_kind(Kind::Rollout, None);
+            rollouts.find(|(_, held)| held.document.uid == uid)
+        };
+        self.pending.extend(found(uid).map(|(key, _)| key.clone()));
+        let failed = Arc::make_mut(&mut self.next.failed);
+        if failed.len() >= MAX_FAILED {
+            let is_over = |uid: &String| found(uid).is_none_or(|(_, held)| !is_active(&held.document));
+            let oldest = failed.iter().position(is_over).unwrap_or(0);
+            failed.remove(oldest);
+        }
+        failed.push(uid.to_owned());
+    }
+
+    /// Places on whose configuration a roll-out that is on its canaries has an effect, in the shown documents: those whose
+    /// health tells whether it goes well.
+    #[must_use]
+    pub fn changed_by(&self, uid: &str) -> Vec<Place> {
+        let is_changed = |place: &Place| {
+            let at = place.at(&self.site);
+            let without = Sources::at_where(&self.shown.state, &at, |rollout| {
+                rollout.uid != uid && !self.shown.failed.contains(&rollout.uid)
+            });
+            let with = self.shown.sources(&at);
+            with.rollout.is_some() && with.hash() != without.hash()
+        };
+        let places = self.places.all().map(|(place, _)| place);
+        places
+            .filter(|place| place.node.is_some() && is_changed(place))
+            .cloned()
+            .collect()
+    }
+
+    /// Whether a flush would look at anything.
+    #[must_use]
+    pub fn has_pending(&self) -> bool {
+        !self.pending.is_empty() || self.next.is_loaded != self.shown.is_loaded || !self.untracked.is_empty()
+    }
+
+    /// Shows the newest documents, and tells whose configuration is another one than the last that they were told.
+    pub fn flush(&mut self, now: Instant) -> Flushed {
+        let mut out = Flushed {
+            untracked: std::mem::take(&mut self.untracked),
+            ..Flushed::default()
+        };
+        for place in self.asked.expire(now) {
+            if self.drop_unless_home(&place) {
+                out.untracked.push(place);
+            }
+        }
+        let keys = std::mem::take(&mut self.pending);
+        self.floor = self.floor.max(self.next.state.revision());
+        if self.next.is_loaded {
+            let (old, new) = (&self.shown.state, &self.next.state);
+            let mut looked = concerned(&self.site, &self.places, old, new, &keys);
+            if !self.shown.is_loaded {
+                // What an earlier life told may have changed, or gone, without any trace in these documents.
+                looked.extend(self.places.all().map(|(place, _)| place.clone()));
+            }
+            for place in looked {
+                self.look(place, &mut out);
+            }
+        }
+        self.shown = self.next.clone();
+        out
+    }
+
+    fn look(&mut self, place: Place, out: &mut Flushed) {
+        let told = self.places.get(&place);
+        let old = self.shown.at(&self.site, &place);
+        let new = self.next.at(&self.site, &place);
+        let old_hash = old.as_ref().map(Sources::hash);
+        let hash = new.as_ref().map(Sources::hash);
+        // Who was not told anything yet could have asked: the configuration was there without its document.
+        let before = told.map_or_else(|| old_hash.clone(), |told| told.hash.clone());
+        let is_tracked = told.is_some();
+        let revision = match told {
+            Some(told) if told.hash == hash => told.revision,
+            Some(_) | None => self.floor,
+        };
+        if before != hash {
+            let known = old.filter(|_| old_hash == before);
+            out.notices
+                .push(self.notice(&place, revision, before, known, new.zip(hash.clone())));
+        }
+        let is_asked = self.asked.contains(&place);
+        if is_asked || self.site.is_home(&self.next.state, &place) {
+            if !is_tracked {
+                out.tracked.push(place.clone());
+            }
+            self.places.insert(place, Told { revision, hash });
+        } else if self.places.remove(&place) {
+            out.untracked.push(place);
+        }
+    }
+
+    /// `old` is what the place was told last, as far as it is known.
+    fn notice(
+        &self,
+        place: &Place,
+        revision: u64,
+        previous_hash: Option<String>,
+        old: Option<Sources>,
+        new: Option<(Sources, String)>,
+    ) -> Notice {
+        let mut notice = Notice {
+            place: place.clone(),
+            layer: self.site.layer.clone(),
+            revision,
+            hash: None,
+            previous_hash,
+            paths: Vec::new(),
+            scopes: Vec::new(),
+            config: None,
+            source: self.source().unwrap_or(Source::File),
+            rollout: None,
+        };
+        if let Some((new, hash)) = new {
+            let config = Config::of(&new);
+            let before = old.as_ref().map_or_else(|| Value::Object(Map::new()), Sources::merged);
+            notice.paths = paths(&before, config.value());
+            notice.scopes = scopes(&old.unwrap_or_default(), &new, place.service.as_str());
+            notice.config = Some(config);
+            notice.hash = Some(hash);
+            notice.rollout = new.rollout;
+        }
+        notice
+    }
+
+    /// Notes that a place asked, so that it is told of changes for a while.
+    fn note_asked(&mut self, place: &Place, now: Instant) {
+        if let Some(evicted) = self.asked.touch(place, now)
+            && self.drop_unless_home(&evicted)
+        {
+            self.untracked.push(evicted);
+        }
+    }
+
+    /// Whether it is not told any more.
+    fn drop_unless_home(&mut self, place: &Place) -> bool {
+        !self.site.is_home(&self.next.state, place) && self.places.remove(place)
+    }
+
+    /// The configuration of a place that asks; `None` if there is no such service.
+    pub(super) fn ask(&mut self, place: &Place, now: Instant) -> Option<Standing> {
+        let sources = self.shown.at(&self.site, place)?;
+        self.note_asked(place, now);
+        if self.places.get(place).is_none() {
+            let told = Told {
+                revision: self.floor,
+                hash: Some(sources.hash()),
+            };
+            self.places.insert(place.clone(), told);
+        }
+        self.standing_of(place)
+    }
+
+    /// The configuration of a place that is told of changes, as it was told last.
+    #[must_use]
+    pub fn standing_of(&self, place: &Place) -> Option<Standing> {
+        let told = self.places.get(place)?;
+        let hash = told.hash.clone()?;
+        let sources = self.shown.at(&self.site, place)?;
+        Some(self.standing(place.at(&self.site), told.revision, hash, sources))
+    }
+
+    /// The configuration of a layer, or of a node of it, without any service.
+    pub(super) fn standing_at(&self, at: At) -> Standing {
+        let sources = self.shown.sources(&at);
+        let hash = sources.hash();
+        self.standing(at, self.floor, hash, sources)
+    }
+
+    fn standing(&self, at: At, revision: u64, hash: String, sources: Sources) -> Standing {
+        Standing {
+            at,
+            revision,
+            hash,
+            config: Config::of(&sources),
+            source: self.source().unwrap_or(Source::File),
+            rollout: sources.rollout,
+        }
+    }
+}
+
+#[cfg(test)]
+#[path = "random_tests.rs"]
+mod random_tests;
+#[cfg(test)]
+#[path = "served_tests.rs"]
+mod tests;
