@@ -10,6 +10,7 @@
 
 pub mod copy;
 pub mod core;
+pub mod engine;
 pub mod lease;
 pub mod serve;
 pub mod settings;

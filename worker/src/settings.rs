@@ -8,16 +8,8 @@ use blaze_domain::node_file::{
 };
 
 use crate::core::Site;
+use crate::core::messages::Delivery;
 use crate::sync::MainService;
-
-/// Whether services get secrets as their text.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Delivery {
-    /// As text.
-    Text,
-    /// Redacted.
-    Redacted,
-}
 
 /// Which broker services are on.
 #[derive(Debug, Clone, PartialEq)]

@@ -260,6 +260,13 @@ impl Served {
             .collect()
     }
 
+    /// Whether a place has a key of its own in Redis: there, a place is service and instance alone. On the broker of a layer
+    /// one instance may ask from several nodes, so only the place of its document has it.
+    #[must_use]
+    pub fn has_key(&self, place: &Place) -> bool {
+        self.site.node.is_some() || self.site.is_home(&self.shown.state, place)
+    }
+
     /// Whether a flush would look at anything.
     #[must_use]
     pub fn has_pending(&self) -> bool {

@@ -1,0 +1,418 @@
+//! The worker at work: one task that owns what is known and does one thing after the other, so that nothing needs a lock and
+//! every order is kept. It waits for nobody: what goes out is taken by tasks of their own.
+//!
+//! ```text
+//! sync::follow ──SyncEvent──▶┌────────┐──Ack (newest)──▶ sync::follow
+//! broker: get ──────────────▶│ Engine │──reply─────────▶ broker
+//! mounted file ─────────────▶│        │──Told──────────▶ serve::Speaker ─▶ keys, notices
+//! lease: leader? ───────────▶│        │──Update────────▶ copy::Copies
+//! admin: Query ─────────────▶└────────┘
+//! ```
+
+mod status;
+mod tell;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use blaze_domain::config::Timestamp;
+use blaze_domain::config::state::State;
+use blaze_domain::names::ChannelName;
+use blaze_domain::{LayerName, NodeName};
+use blaze_proto::v1;
+use bytes::Bytes;
+use tokio::sync::{mpsc, oneshot, watch};
+use tokio::time::{Instant, sleep_until};
+use tokio_util::sync::CancellationToken;
+
+use crate::copy::{Changed, Copies, Loaded, Notes, Position, Update, defaults};
+use crate::core::messages::{self, Delivery, GetRequest, RefusedRequest};
+use crate::core::{Applied, Freshness, PROTOCOL, Place, Replica, Served, Site, Source, answer};
+use crate::serve::{Speaker, Told};
+use crate::sync::SyncEvent;
+
+pub use status::Status;
+
+/// Within this time several changes may become one notice.
+const TOGETHER: Duration = Duration::from_millis(20);
+/// What the worker has is said this long after it became so, and with it what came meanwhile.
+const ACK_AFTER: Duration = Duration::from_millis(50);
+/// It is said again after this time without news.
+const ACK_AGAIN: Duration = Duration::from_secs(15);
+/// Events that wait for the engine.
+pub const QUEUE: usize = 256;
+
+/// Gives answers to those who ask.
+pub trait Replies: Send + Sync + 'static {
+    /// Sends one, now. What cannot be sent is dropped: whoever asked asks again.
+    ///
+    /// # Errors
+    /// For people.
+    fn reply(&self, to: &ChannelName, payload: Bytes) -> Result<(), String>;
+
+    /// The one channel that all answers go to, where the broker cannot make one for each who asks; then an id is needed.
+    fn shared(&self) -> Option<ChannelName>;
+}
+
+/// Who the worker is and how it serves.
+#[derive(Debug, Clone)]
+pub struct Identity {
+    /// Whom it serves.
+    pub site: Site,
+    /// The node that it runs on.
+    pub node: Option<NodeName>,
+    /// Its name among the workers of its layer; no other life of it has the same.
+    pub worker_id: String,
+    /// How secrets reach services.
+    pub delivery: Delivery,
+}
+
+/// What comes in.
+pub struct Inputs {
+    /// From the main service.
+    pub sync: mpsc::Receiver<SyncEvent>,
+    /// Requests for configurations, as they came.
+    pub gets: mpsc::Receiver<Bytes>,
+    /// The mounted file.
+    pub defaults: watch::Receiver<defaults::Status>,
+    /// Whether this worker answers and notifies.
+    pub leader: watch::Receiver<bool>,
+    /// Questions of the admin port.
+    pub queries: mpsc::Receiver<Query>,
+}
+
+/// Where things go.
+pub struct Outputs {
+    /// Answers.
+    pub replies: Arc<dyn Replies>,
+    /// Keys and notices.
+    pub speaker: Speaker,
+    /// Copies; absent where nothing is kept.
+    pub copies: Option<Copies>,
+    /// What the worker has, for the main service.
+    pub acks: watch::Sender<Option<v1::Ack>>,
+}
+
+/// A question to the engine.
+#[derive(Debug)]
+pub enum Query {
+    /// How it is.
+    Status(oneshot::Sender<Status>),
+}
+
+/// What happened since the start.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Requests that were answered.
+    pub answered: u64,
+    /// Requests that could not be read or answered.
+    pub refused: u64,
+    /// Requests that another worker of the layer answers.
+    pub left_to_others: u64,
+    /// Commits and snapshots that were taken over.
+    pub changes: u64,
+    /// Streams that were begun anew because something was missing or different.
+    pub faults: u64,
+    /// Notices that followed from changes.
+    pub notices: u64,
+}
+
+/// What the engine owns. Everything that it does happens in [`Engine::run`].
+pub struct Engine {
+    identity: Identity,
+    outputs: Outputs,
+    replica: Replica,
+    served: Served,
+    notes: Notes,
+    /// The copy has no texts of secrets: everything is to be asked for.
+    lacks_secrets: bool,
+    stream: Option<CancellationToken>,
+    /// Why there is no stream.
+    reason: Option<String>,
+    is_leader: bool,
+    flushed: Option<Instant>,
+    flush_at: Option<Instant>,
+    ack_at: Instant,
+    /// Places whose key is kept.
+    keyed: BTreeSet<Place>,
+    /// What was told, or would have been if this worker were the leader, a short while ago.
+    recent: VecDeque<(Instant, Told)>,
+    defaults_problem: Option<String>,
+    counts: Counts,
+}
+
+impl Engine {
+    /// An engine that serves what is found at the start, if anything is.
+    #[must_use]
+    pub fn new(identity: Identity, outputs: Outputs, start: Option<Loaded>) -> Self {
+        let layer = identity.site.layer.clone();
+        let now = Instant::now();
+        let mut engine = Self {
+            served: Served::new(identity.site.clone()),
+            replica: Replica::new(layer.clone()),
+            notes: Notes::default(),
+            lacks_secrets: false,
+            stream: None,
+            reason: None,
+            is_leader: false,
+            flushed: None,
+            flush_at: None,
+            ack_at: now + ACK_AGAIN,
+            keyed: BTreeSet::new(),
+            recent: VecDeque::new(),
+            defaults_problem: None,
+            counts: Counts::default(),
+            identity,
+            outputs,
+        };
+        if let Some(loaded) = start {
+            engine.begin_with(layer, loaded, now);
+        }
+        engine
+    }
+
+    fn begin_with(&mut self, layer: LayerName, loaded: Loaded, now: Instant) {
+        self.lacks_secrets = loaded.lacks_secrets();
+        let Position {
+            store_id,
+            revision,
+            as_of,
+            ..
+        } = loaded.position;
+        let mut state = State::new(revision, []);
+        for document in loaded.documents {
+            state.put(document);
+        }
+        let told = tell::told_of(&loaded.notes);
+        let failed: Vec<String> = loaded.notes.failed().map(str::to_owned).collect();
+        self.served.restore(told, failed, now.into_std());
+        self.notes = (*loaded.notes).clone();
+        self.replica = Replica::from_copy(layer, Some(store_id), state.clone(), Some(as_of));
+        // Nothing was loaded before it.
+        if let Err(error) = self.served.load(state, Source::Copy) {
+            tracing::error!(%error, "the copy is not used");
+        }
+        self.flush_at = Some(now);
+    }
+
+    /// Works until `stop`.
+    pub async fn run(mut self, mut inputs: Inputs, stop: CancellationToken) {
+        self.is_leader = *inputs.leader.borrow_and_update();
+        self.take_defaults(&inputs.defaults.borrow_and_update().clone());
+        loop {
+            let flush_at = self.flush_at;
+            tokio::select! {
+                biased;
+                () = stop.cancelled() => return,
+                () = sleep_until(flush_at.unwrap_or_else(Instant::now)), if flush_at.is_some() => self.flush(),
+                Some(query) = inputs.queries.recv() => self.answer_query(query),
+                Ok(()) = inputs.leader.changed() => {
+                    let is_leader = *inputs.leader.borrow_and_update();
+                    self.lead(is_leader);
+                }
+                Some(event) = inputs.sync.recv() => self.on_sync(event),
+                Some(request) = inputs.gets.recv() => self.on_get(&request),
+                Ok(()) = inputs.defaults.changed() => {
+                    let status = inputs.defaults.borrow_and_update().clone();
+                    self.take_defaults(&status);
+                }
+                () = sleep_until(self.ack_at) => self.acknowledge(),
+            }
+        }
+    }
+
+    fn on_sync(&mut self, event: SyncEvent) {
+        match event {
+            SyncEvent::Greeting(asked) => {
+                // Whoever asked may have gone.
+                let _ = asked.send(self.hello());
+            }
+            SyncEvent::Opened(stream) => {
+                self.stream = Some(stream);
+                self.reason = None;
+            }
+            SyncEvent::Said(incoming) => {
+                let now = now();
+                match self.replica.apply(incoming, now) {
+                    Ok(Applied::Nothing) => {}
+                    Ok(Applied::Changed(change)) => {
+                        self.counts.changes += 1;
+                        self.lacks_secrets = false;
+                        self.served.apply(&change);
+                        self.keep(Changed::Keys(change.keys));
+                        self.flush_soon();
+                    }
+                    Ok(Applied::GoAway { retry_after, reason }) => {
+                        tracing::info!(reason, ?retry_after, "the main service ends the stream");
+                    }
+                    Err(fault) => {
+                        tracing::warn!(%fault, "the stream begins anew");
+                        self.counts.faults += 1;
+                        if let Some(stream) = &self.stream {
+                            stream.cancel();
+                        }
+                    }
+                }
+                self.note_sync();
+            }
+            SyncEvent::Closed { reason } => {
+                if self.stream.take().is_some() {
+                    tracing::warn!(reason, "the main service is away; services get what is here");
+                }
+                self.reason = Some(reason);
+                self.replica.disconnected();
+                self.note_sync();
+            }
+        }
+    }
+
+    fn hello(&mut self) -> v1::Hello {
+        self.replica.disconnected();
+        let resume = self.replica.resume_point();
+        let site = &self.identity.site;
+        let node = site.node.as_ref().or(self.identity.node.as_ref());
+        let mut hello = v1::Hello {
+            protocol: PROTOCOL,
+            layer: site.layer.to_string(),
+            node: node.map(ToString::to_string).unwrap_or_default(),
+            worker_id: self.identity.worker_id.clone(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            store_id: resume.store_id,
+            revision: resume.revision,
+            digest: resume.digest,
+        };
+        if self.lacks_secrets {
+            (hello.store_id, hello.revision, hello.digest) = Default::default();
+        }
+        hello
+    }
+
+    fn note_sync(&mut self) {
+        let in_sync = self.replica.is_in_sync();
+        let was = self.served.source();
+        self.served.set_in_sync(in_sync);
+        if was != self.served.source() {
+            tracing::info!(in_sync, revision = self.replica.state().revision(), "source of configurations");
+        }
+        if self.stream.is_some() {
+            self.ack_at = self.ack_at.min(Instant::now() + ACK_AFTER);
+        }
+    }
+
+    /// Says what is here, if somebody listens.
+    fn acknowledge(&mut self) {
+        self.ack_at = Instant::now() + ACK_AGAIN;
+        if self.stream.is_none() {
+            return;
+        }
+        let ack = v1::Ack {
+            revision: self.replica.state().revision(),
+            digest: self.replica.digest(),
+            services: Vec::new(),
+            rollouts: Vec::new(),
+        };
+        self.outputs.acks.send_replace(Some(ack));
+    }
+
+    /// Has the newest state kept.
+    fn keep(&mut self, changed: Changed) {
+        let Some(copies) = &self.outputs.copies else { return };
+        let (Some(store_id), Some(as_of)) = (self.replica.store_id(), self.replica.as_of()) else {
+            return;
+        };
+        copies.store(&Update {
+            position: Position {
+                store_id: store_id.to_owned(),
+                layer: self.identity.site.layer.clone(),
+                revision: self.replica.state().revision(),
+                as_of,
+            },
+            state: self.replica.state().clone(),
+            changed,
+            notes: None,
+        });
+    }
+
+    fn take_defaults(&mut self, status: &defaults::Status) {
+        self.defaults_problem = status.problem.as_ref().map(ToString::to_string);
+        let Some(current) = &status.current else { return };
+        let mut state = State::new(0, []);
+        for document in &current.documents {
+            state.put(Arc::clone(document));
+        }
+        // What came from the main service or a copy of it is better.
+        if self.served.load(state, Source::File).is_ok() {
+            self.flush_soon();
+        }
+    }
+
+    fn on_get(&mut self, request: &[u8]) {
+        let shared = self.outputs.replies.shared();
+        let (to, text) = match GetRequest::parse(request) {
+            Ok(request) => {
+                if !self.is_leader {
+                    self.counts.left_to_others += 1;
+                    return;
+                }
+                let reply = answer(&mut self.served, &request, Instant::now().into_std());
+                let id = request.id.as_deref();
+                let text = messages::reply(&reply, id, self.identity.delivery, self.freshness());
+                self.key_of_asker(&request);
+                (Some((request.reply_to, request.id)), text)
+            }
+            Err(RefusedRequest { id, reply_to, error }) => {
+                self.counts.refused += 1;
+                if !self.is_leader {
+                    return;
+                }
+                let text = messages::refusal(&error, id.as_deref());
+                (reply_to.map(|to| (to, id)), text)
+            }
+        };
+        let Some((to, id)) = to else { return };
+        let to = match shared {
+            // Nobody could tell whose answer it is.
+            Some(_) if id.is_none() => {
+                self.counts.refused += 1;
+                return;
+            }
+            Some(shared) => shared,
+            None => to,
+        };
+        match self.outputs.replies.reply(&to, Bytes::from(text)) {
+            Ok(()) => self.counts.answered += 1,
+            Err(error) => {
+                self.counts.refused += 1;
+                tracing::debug!(error, %to, "an answer was not sent");
+            }
+        }
+    }
+
+    fn freshness(&self) -> Freshness {
+        Freshness {
+            as_of: self.replica.as_of(),
+            now: now(),
+        }
+    }
+
+    fn answer_query(&mut self, query: Query) {
+        match query {
+            Query::Status(asked) => {
+                let status = self.status();
+                // Whoever asked may have gone.
+                let _ = asked.send(status);
+            }
+        }
+    }
+}
+
+/// The time, for people.
+fn now() -> Timestamp {
+    let since = std::time::SystemTime::now()
+        .duration_since(std::time::UNIX_EPOCH)
+        .unwrap_or_default();
+    Timestamp::from_millis(i64::try_from(since.as_millis()).unwrap_or(i64::MAX))
+}

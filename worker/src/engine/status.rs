@@ -1,0 +1,78 @@
+//! How the worker is.
+
+use blaze_domain::NodeName;
+use blaze_domain::config::Timestamp;
+use serde_json::{Value, json};
+
+use super::{Counts, Engine, now};
+use crate::core::Source;
+use crate::core::Freshness;
+
+/// What the admin port shows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Status {
+    /// As JSON: `/v1/status`.
+    pub json: Value,
+    /// For the metrics.
+    pub counts: Counts,
+    /// Whether anybody can be answered.
+    pub is_ready: bool,
+    /// Whether it is certain that what is served is the main service's newest.
+    pub in_sync: bool,
+    /// Revision of what is served.
+    pub revision: u64,
+    /// Documents.
+    pub documents: usize,
+    /// Why the mounted file is not used.
+    pub defaults_problem: Option<String>,
+    /// Why there is no stream.
+    pub reason: Option<String>,
+}
+
+impl Engine {
+    pub(super) fn status(&mut self) -> Status {
+        let site = self.identity.site.clone();
+        let node = site.node.as_ref().or(self.identity.node.as_ref());
+        let freshness = Freshness {
+            as_of: self.replica.as_of(),
+            now: now(),
+        };
+        let digest = self.replica.digest();
+        let services: Vec<Value> = self
+            .served
+            .told()
+            .map(|(place, told)| {
+                json!({
+                    "service": place.service.as_str(), "instance": place.instance.as_ref().map(|name| name.as_str()),
+                    "node": place.node.as_ref().map(NodeName::as_str), "revision": told.revision, "hash": told.hash,
+                })
+            })
+            .collect();
+        let revision = self.replica.state().revision();
+        let json = json!({
+            "layer": site.layer.as_str(),
+            "node": node.map(NodeName::as_str),
+            "worker_id": self.identity.worker_id,
+            "leader": self.is_leader,
+            "source": self.served.source().map(Source::as_str),
+            "connected": self.stream.is_some(),
+            "revision": revision,
+            "digest": digest,
+            "as_of": freshness.as_of.map(|time: Timestamp| time.to_string()),
+            "age_s": freshness.age_s(),
+            "services": services,
+            "rollouts": [],
+            "reason": self.reason,
+        });
+        Status {
+            json,
+            counts: self.counts,
+            is_ready: self.served.is_ready(),
+            in_sync: self.replica.is_in_sync(),
+            revision,
+            documents: self.replica.state().len(),
+            defaults_problem: self.defaults_problem.clone(),
+            reason: self.reason.clone(),
+        }
+    }
+}
