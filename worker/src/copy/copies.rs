@@ -208,7 +208,9 @@ impl Slot {
         if before.is_some() {
             self.coalesced.fetch_add(1, Ordering::Relaxed);
         }
-        let (keys, had_notes) = before.map_or((Some(BTreeSet::new()), false), |next| (next.keys, next.have_notes_changed));
+        let (keys, had_notes) = before.map_or((Some(BTreeSet::new()), false), |next| {
+            (next.keys, next.have_notes_changed)
+        });
         let mut next = Next {
             number: self.stored.fetch_add(1, Ordering::AcqRel) + 1,
             position: update.position.clone(),
@@ -300,7 +302,11 @@ impl Writer {
     }
 
     async fn write(&self, next: &Next) -> Result<(), CopyError> {
-        if let Some(keys) = next.keys.as_ref().filter(|_| self.is_current && !self.copy.writes_whole()) {
+        if let Some(keys) = next
+            .keys
+            .as_ref()
+            .filter(|_| self.is_current && !self.copy.writes_whole())
+        {
             let document = |key: &Key| next.state.get(key).map(|held| Arc::clone(&held.document));
             let puts: Vec<_> = keys.iter().filter_map(document).collect();
             let is_gone = |key: &&Key| next.state.get(key).is_none();
@@ -336,7 +342,10 @@ impl Writer {
         let text = error.to_string();
         let told = slot.error.lock().replace(text.clone());
         if told.is_none() {
-            tracing::warn!(error = text, "a copy of the configuration is not written; it is tried again");
+            tracing::warn!(
+                error = text,
+                "a copy of the configuration is not written; it is tried again"
+            );
         }
         let bound = PAUSE.0.saturating_mul(1 << self.failures.min(16)).min(PAUSE.1);
         self.failures = self.failures.saturating_add(1);

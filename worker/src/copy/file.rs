@@ -192,7 +192,8 @@ impl Inner {
         options.write(true).create(true).truncate(true).mode(0o600);
         let mut file = options.open(path).map_err(failed)?;
         // One that a crash has left may have other rights.
-        file.set_permissions(fs::Permissions::from_mode(0o600)).map_err(failed)?;
+        file.set_permissions(fs::Permissions::from_mode(0o600))
+            .map_err(failed)?;
         let (first, second) = content.split_at(content.len() / 2);
         for part in [first, second] {
             self.steps.pass()?;

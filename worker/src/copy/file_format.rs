@@ -242,7 +242,13 @@ mod tests {
     fn small() -> Loaded {
         Loaded {
             notes: Arc::new(notes("uid-1", 6)),
-            ..loaded(7, [with_secret("slam", 7, CANARY), service("log", 3, json!({ "config": { "a": 1 } }))])
+            ..loaded(
+                7,
+                [
+                    with_secret("slam", 7, CANARY),
+                    service("log", 3, json!({ "config": { "a": 1 } })),
+                ],
+            )
         }
     }
 
@@ -273,8 +279,16 @@ mod tests {
         let size = CHUNK_BYTES + TAG_BYTES;
         assert_eq!(decrypt(&drawn, b"header", &sealed).unwrap(), text.as_bytes());
         assert_eq!(decrypt(&drawn, b"other", &sealed), None);
-        assert_eq!(decrypt(&drawn, b"header", &sealed[..2 * size]), None, "the last one is missing");
-        assert_eq!(decrypt(&drawn, b"header", &sealed[size..]), None, "the first one is missing");
+        assert_eq!(
+            decrypt(&drawn, b"header", &sealed[..2 * size]),
+            None,
+            "the last one is missing"
+        );
+        assert_eq!(
+            decrypt(&drawn, b"header", &sealed[size..]),
+            None,
+            "the first one is missing"
+        );
         let swapped = [&sealed[size..2 * size], &sealed[..size], &sealed[2 * size..]].concat();
         assert_eq!(decrypt(&drawn, b"header", &swapped), None);
     }

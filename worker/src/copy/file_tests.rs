@@ -33,7 +33,10 @@ async fn only_its_owner_reads_it_and_nothing_else_is_left() {
     fs::write(folder.path().join("last-known-good.new"), "rest").unwrap();
     file.replace(&loaded(7, [service("slam", 7, json!({}))])).await.unwrap();
     assert_eq!(names(&folder), [FILE_NAME]);
-    let mode = fs::metadata(folder.path().join(FILE_NAME)).unwrap().permissions().mode();
+    let mode = fs::metadata(folder.path().join(FILE_NAME))
+        .unwrap()
+        .permissions()
+        .mode();
     assert_eq!(mode & 0o777, 0o600);
 }
 
@@ -85,5 +88,8 @@ async fn a_folder_that_is_not_there_is_named() {
     let file = FileCopy::new(&folder.path().join("missing"), layer("edge"), Vault::default());
     assert_eq!(file.load().await, Ok(None));
     let error = file.replace(&loaded(7, [])).await.unwrap_err();
-    assert!(matches!(&error, CopyError::Refused { place, .. } if place.contains("missing")), "{error}");
+    assert!(
+        matches!(&error, CopyError::Refused { place, .. } if place.contains("missing")),
+        "{error}"
+    );
 }

@@ -219,7 +219,16 @@ mod tests {
     fn each_member_is_needed_and_has_a_form() {
         let document = crate::copy::samples::service("slam", 7, json!({ "config": {} })).to_json();
         for name in [
-            "kind", "name", "uid", "revision", "create_time", "update_time", "updated_by", "labels", "annotations", "spec",
+            "kind",
+            "name",
+            "uid",
+            "revision",
+            "create_time",
+            "update_time",
+            "updated_by",
+            "labels",
+            "annotations",
+            "spec",
         ] {
             let mut without = document.clone();
             without.as_object_mut().unwrap().remove(name);

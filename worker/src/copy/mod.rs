@@ -22,6 +22,8 @@ mod conformance;
 mod copies;
 pub mod defaults;
 mod error;
+#[cfg(test)]
+mod fake;
 mod file;
 mod file_format;
 mod json;
@@ -195,7 +197,8 @@ mod tests {
         let with = loaded(serde_json::json!({ "config": { "pw": { "$secret": { "text": "canary", "version": 3 } } } }));
         assert!(!with.lacks_secrets());
         assert!(!format!("{with:?}").contains("canary"));
-        let without = loaded(serde_json::json!({ "config": { "pw": [{ "$secret": { "redacted": true, "version": 3 } }] } }));
+        let without =
+            loaded(serde_json::json!({ "config": { "pw": [{ "$secret": { "redacted": true, "version": 3 } }] } }));
         assert!(without.lacks_secrets());
     }
 }

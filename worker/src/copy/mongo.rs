@@ -17,7 +17,6 @@
 //! late finds a newer generation and changes nothing. Generations begin with the time, later than that of the head.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::future::IntoFuture;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -30,7 +29,7 @@ use mongodb::bson::{Document, doc};
 use mongodb::options::{ReadPreference, SelectionCriteria};
 use tokio::sync::Mutex;
 
-use super::mongo_client::{OPERATION, Server, Tables, is_duplicate};
+use super::mongo_client::{Server, Tables, is_duplicate};
 use super::mongo_rows::{self as rows, Head, NOTES, Row};
 use super::steps::Steps;
 use super::{CopyError, Loaded, LocalCopy, Notes, Position, Vault, json, progress};
@@ -106,7 +105,8 @@ impl MongoCopy {
     /// The head record. `preference` is who may answer: at the start also a member that is not the primary.
     async fn head(&self, tables: &Tables, preference: ReadPreference) -> Result<Option<Document>, CopyError> {
         let find = tables.head.find_one(doc! { "_id": &self.copy });
-        self.server.limited(find.selection_criteria(SelectionCriteria::ReadPreference(preference)))
+        self.server
+            .limited(find.selection_criteria(SelectionCriteria::ReadPreference(preference)))
             .await
     }
 
@@ -123,14 +123,19 @@ impl MongoCopy {
             left = rest;
             self.steps.pass()?;
             let documents = now.iter().map(|row| rows::write_row(&self.copy, generation, turn, row));
-            self.server.limited(tables.documents.insert_many(documents).ordered(false)).await?;
+            self.server
+                .limited(tables.documents.insert_many(documents).ordered(false))
+                .await?;
         }
         Ok(())
     }
 
     async fn delete(&self, tables: &Tables, filter: Document) -> Result<(), CopyError> {
         self.steps.pass()?;
-        self.server.limited(tables.documents.delete_many(filter)).await.map(|_| ())
+        self.server
+            .limited(tables.documents.delete_many(filter))
+            .await
+            .map(|_| ())
     }
 
     fn row(&self, document: &Arc<config::Document>) -> Result<Row, CopyError> {
@@ -171,11 +176,9 @@ impl MongoCopy {
             .head
             .update_one(doc! { "_id": &self.copy, "generation": newer }, update)
             .upsert(true);
-        let moved = tokio::time::timeout(OPERATION, moved.into_future()).await;
-        match moved {
-            Ok(Err(error)) if is_duplicate(&error) => return Err(self.taken(&whole.position)),
-            Ok(moved) => moved.map_err(|error| self.server.failed(&error)).map(|_| ())?,
-            Err(_) => return self.server.limited(std::future::pending()).await,
+        match self.server.within(moved).await? {
+            Err(error) if is_duplicate(&error) => return Err(self.taken(&whole.position)),
+            moved => moved.map_err(|error| self.server.failed(&error)).map(|_| ())?,
         }
         self.delete(&tables, rows::of_earlier(&self.copy, &generation)).await?;
         Ok(Written {
@@ -234,13 +237,18 @@ impl MongoCopy {
             return Err(self.taken(position));
         }
         for some in all.chunks(KEYS) {
-            let old = some.iter().map(|row| rows::before_turn(&self.copy, generation, &row.key, turn));
+            let old = some
+                .iter()
+                .map(|row| rows::before_turn(&self.copy, generation, &row.key, turn));
             self.delete(&tables, doc! { "$or": old.collect::<Vec<_>>() }).await?;
         }
         // Only now: before, one of them may have hidden an older row.
         for some in all.get(gone_at..).unwrap_or_default().chunks(KEYS) {
-            let ids = some.iter().map(|row| rows::row_id(&self.copy, generation, &row.key, turn));
-            self.delete(&tables, doc! { "_id": { "$in": ids.collect::<Vec<_>>() } }).await?;
+            let ids = some
+                .iter()
+                .map(|row| rows::row_id(&self.copy, generation, &row.key, turn));
+            self.delete(&tables, doc! { "_id": { "$in": ids.collect::<Vec<_>>() } })
+                .await?;
         }
         written.turn = turn;
         Ok(written)
@@ -272,7 +280,9 @@ impl MongoCopy {
     }
 
     fn read(&self, head: Head, mut found: BTreeMap<String, String>) -> Result<Loaded, CopyError> {
-        let notes = found.remove(NOTES).ok_or_else(|| self.broken("its notes are missing"))?;
+        let notes = found
+            .remove(NOTES)
+            .ok_or_else(|| self.broken("its notes are missing"))?;
         if count(found.len()) != head.documents {
             return Err(self.broken(format_args!("it has {} documents of {}", found.len(), head.documents)));
         }
@@ -389,9 +399,17 @@ mod tests {
             MongoCopy::new(uri, database, "edge".parse().unwrap(), node.as_ref(), Vault::default())
         };
         assert_eq!(copy("blaze", None).unwrap().describe(), "MongoDB blaze, copy edge");
-        assert!(copy("blaze", Some("robot-1")).unwrap().describe().ends_with("copy edge.robot-1"));
+        assert!(
+            copy("blaze", Some("robot-1"))
+                .unwrap()
+                .describe()
+                .ends_with("copy edge.robot-1")
+        );
         for wrong in ["", "a/b", "a.b", "$cmd", "\u{e4}", &"x".repeat(64)] {
-            assert!(matches!(copy(wrong, None).err(), Some(CopyError::Refused { .. })), "{wrong}");
+            assert!(
+                matches!(copy(wrong, None).err(), Some(CopyError::Refused { .. })),
+                "{wrong}"
+            );
         }
     }
 

@@ -15,7 +15,7 @@ use super::CopyError;
 /// Until a server is found, and until a connection stands.
 const SELECTION: Duration = Duration::from_secs(2);
 /// Each operation.
-pub(super) const OPERATION: Duration = Duration::from_secs(5);
+const OPERATION: Duration = Duration::from_secs(5);
 /// Most connections: one who writes, one who reads.
 const CONNECTIONS: u32 = 4;
 /// Longest name of a database.
@@ -100,14 +100,26 @@ impl Server {
     ///
     /// # Errors
     /// [`CopyError::Away`] at the limit, else what the driver says.
-    pub(super) async fn limited<T>(&self, work: impl IntoFuture<Output = mongodb::error::Result<T>>) -> Result<T, CopyError> {
-        match tokio::time::timeout(OPERATION, work.into_future()).await {
-            Ok(done) => done.map_err(|error| self.failed(&error)),
-            Err(_) => Err(CopyError::Away {
-                place: self.place.clone(),
-                detail: format!("no answer within {} ms", OPERATION.as_millis()),
-            }),
-        }
+    pub(super) async fn limited<T>(
+        &self,
+        work: impl IntoFuture<Output = mongodb::error::Result<T>>,
+    ) -> Result<T, CopyError> {
+        self.within(work).await?.map_err(|error| self.failed(&error))
+    }
+
+    /// As [`Self::limited`], with what the driver says as it is.
+    ///
+    /// # Errors
+    /// [`CopyError::Away`] at the limit.
+    pub(super) async fn within<T>(
+        &self,
+        work: impl IntoFuture<Output = mongodb::error::Result<T>>,
+    ) -> Result<mongodb::error::Result<T>, CopyError> {
+        let done = tokio::time::timeout(OPERATION, work.into_future()).await;
+        done.map_err(|_| CopyError::Away {
+            place: self.place.clone(),
+            detail: format!("no answer within {} ms", OPERATION.as_millis()),
+        })
     }
 
     /// What an error of the driver means.

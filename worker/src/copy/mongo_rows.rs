@@ -71,7 +71,11 @@ pub(super) fn write_row(copy: &str, generation: &str, turn: i64, row: &Row) -> D
 }
 
 /// Key, turn and text of a row.
-pub(super) fn read_row<'f>(found: &'f Document, copy: &str, generation: &str) -> Option<(&'f str, i64, Option<&'f str>)> {
+pub(super) fn read_row<'f>(
+    found: &'f Document,
+    copy: &str,
+    generation: &str,
+) -> Option<(&'f str, i64, Option<&'f str>)> {
     let id = found.get_str("_id").ok()?;
     let rest = id.strip_prefix(copy)?.strip_prefix('/')?;
     let (key, turn) = rest.strip_prefix(generation)?.strip_prefix('/')?.rsplit_once('@')?;
@@ -150,12 +154,27 @@ mod tests {
         let mut written = write_head(&head);
         assert_eq!(read_head(&written, "x"), Ok(head));
         written.insert("format", 2);
-        assert!(matches!(read_head(&written, "x"), Err(CopyError::NewerFormat { found: 2, .. })));
-        for name in ["format", "generation", "turn", "documents", "store_id", "layer", "revision", "as_of"] {
+        assert!(matches!(
+            read_head(&written, "x"),
+            Err(CopyError::NewerFormat { found: 2, .. })
+        ));
+        for name in [
+            "format",
+            "generation",
+            "turn",
+            "documents",
+            "store_id",
+            "layer",
+            "revision",
+            "as_of",
+        ] {
             let mut without = written.clone();
             without.insert("format", FORMAT);
             without.insert(name, Bson::Null);
-            assert!(matches!(read_head(&without, "x"), Err(CopyError::Broken { .. })), "{name}");
+            assert!(
+                matches!(read_head(&without, "x"), Err(CopyError::Broken { .. })),
+                "{name}"
+            );
         }
         for text in [None, Some("{}")] {
             let row = Row {
@@ -181,7 +200,10 @@ mod tests {
         assert!(!within(&of_generation("edge", &one), &id("edge", &two, "Node/a")));
         assert!(within(&of_earlier("edge", &two), &id("edge", &one, NOTES)));
         for (copy, generation) in [("edge", &two), ("edge.robot-1", &one), ("edge-1", &one), ("e", &one)] {
-            assert!(!within(&of_earlier("edge", &two), &id(copy, generation, "Node/a")), "{copy}");
+            assert!(
+                !within(&of_earlier("edge", &two), &id(copy, generation, "Node/a")),
+                "{copy}"
+            );
         }
         let before = before_turn("edge", &one, "Node/a", 3);
         assert!(within(&before, &row_id("edge", &one, "Node/a", 2)));

@@ -69,7 +69,11 @@ pub(super) fn notes(uid: &str, revision: u64) -> Notes {
 /// A service whose configuration holds a text that must not be found anywhere.
 pub(super) fn with_secret(name: &str, revision: u64, text: &str) -> Document {
     let secret = json!({ "$secret": { "text": text, "version": revision } });
-    service(name, revision, json!({ "config": { "user": "me", "password": secret, "list": [secret] } }))
+    service(
+        name,
+        revision,
+        json!({ "config": { "user": "me", "password": secret, "list": [secret] } }),
+    )
 }
 
 fn any_value() -> impl Strategy<Value = Value> {
@@ -113,20 +117,29 @@ pub(super) fn any_document() -> impl Strategy<Value = Document> {
     let times = (0_i64..4_000_000_000_000, 0_i64..4_000_000_000_000);
     let status = prop::option::of(any_value().prop_map(|value| json!({ "phase": "canary", "more": value })));
     let texts = ("[0-9a-f-]{0,36}", ".{0,12}");
-    (any_key(), texts, 0..1_u64 << 53, times, (any_labels(), any_labels()), spec, status).prop_map(
-        |(key, (uid, updated_by), revision, times, (labels, annotations), spec, status)| Document {
-            key,
-            uid,
-            revision,
-            create_time: Timestamp::from_millis(times.0),
-            update_time: Timestamp::from_millis(times.1),
-            updated_by,
-            labels,
-            annotations,
-            spec: Arc::new(spec),
-            status,
-        },
+    (
+        any_key(),
+        texts,
+        0..1_u64 << 53,
+        times,
+        (any_labels(), any_labels()),
+        spec,
+        status,
     )
+        .prop_map(
+            |(key, (uid, updated_by), revision, times, (labels, annotations), spec, status)| Document {
+                key,
+                uid,
+                revision,
+                create_time: Timestamp::from_millis(times.0),
+                update_time: Timestamp::from_millis(times.1),
+                updated_by,
+                labels,
+                annotations,
+                spec: Arc::new(spec),
+                status,
+            },
+        )
 }
 
 /// Documents of different keys, in their order.

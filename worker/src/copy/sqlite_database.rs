@@ -123,7 +123,7 @@ impl Database {
         let head = facts.head(connection)?;
         progress::check(head.as_ref().map(|(held, _)| held), position, &facts.place)?;
         self.write(|transaction| {
-            let mut remove = transaction.prepare_cached("DELETE FROM documents WHERE key = ?1")?;
+            let mut remove = transaction.prepare("DELETE FROM documents WHERE key = ?1")?;
             for key in removes {
                 remove.execute([key.to_string()])?;
             }
@@ -185,7 +185,7 @@ impl Facts {
             return Ok(None);
         };
         let mut statement = transaction
-            .prepare_cached("SELECT document FROM documents")
+            .prepare("SELECT document FROM documents")
             .map_err(failed)?;
         let rows = statement.query_map([], |row| row.get::<_, String>(0)).map_err(failed)?;
         let mut documents = Vec::new();
@@ -343,8 +343,10 @@ impl Facts {
 fn put(transaction: &Transaction<'_>, sealed: &[(String, String)]) -> rusqlite::Result<()> {
     const PUT: &str = "INSERT INTO documents (key, document) VALUES (?1, ?2)
                        ON CONFLICT (key) DO UPDATE SET document = excluded.document";
-    let mut statement = transaction.prepare_cached(PUT)?;
-    sealed.iter().try_for_each(|row| statement.execute((&row.0, &row.1)).map(|_| ()))
+    let mut statement = transaction.prepare(PUT)?;
+    sealed
+        .iter()
+        .try_for_each(|row| statement.execute((&row.0, &row.1)).map(|_| ()))
 }
 
 /// Notes that are not given stay.

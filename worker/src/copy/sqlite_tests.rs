@@ -60,7 +60,10 @@ async fn only_its_owner_reads_it_and_reading_makes_none() {
 
 #[tokio::test]
 async fn a_broken_file_is_moved_aside_and_begun_anew() {
-    for content in ["no database at all, but a long text that is none".repeat(100), String::new()] {
+    for content in [
+        "no database at all, but a long text that is none".repeat(100),
+        String::new(),
+    ] {
         let fixture = Fixture::new();
         fs::write(fixture.path(), &content).unwrap();
         let copy = fixture.copy(Vault::default());
@@ -107,7 +110,9 @@ async fn no_text_of_a_secret_is_in_the_file_or_its_log() {
     for vault in [Vault::default(), Vault::with_key([7; 32])] {
         let fixture = Fixture::new();
         let copy = fixture.copy(vault);
-        copy.replace(&loaded(7, [with_secret("slam", 7, CANARY)])).await.unwrap();
+        copy.replace(&loaded(7, [with_secret("slam", 7, CANARY)]))
+            .await
+            .unwrap();
         for entry in fs::read_dir(fixture.folder.path()).unwrap() {
             let content = fs::read(entry.unwrap().path()).unwrap();
             assert!(!String::from_utf8_lossy(&content).contains(CANARY));

@@ -72,7 +72,11 @@ pub async fn choose(
             loaded = &mut database_load, if early.is_none() => early = Some(loaded),
         }
     };
-    let waits_for = if matches!(from_file, Ok(Some(_))) { limit } else { limit * PATIENT };
+    let waits_for = if matches!(from_file, Ok(Some(_))) {
+        limit
+    } else {
+        limit * PATIENT
+    };
     let from_database = match early {
         Some(loaded) => Ok(loaded),
         None => tokio::time::timeout_at(began + waits_for, database_load).await,
@@ -121,11 +125,19 @@ impl Start {
                     && database.notes == file.notes;
                 let is_file = file.position.is_newer_than(&database.position);
                 // Secrets that one of them has and the other has not.
-                let is_file = if is_same { database.lacks_secrets() && !file.lacks_secrets() } else { is_file };
+                let is_file = if is_same {
+                    database.lacks_secrets() && !file.lacks_secrets()
+                } else {
+                    is_file
+                };
                 self.is_database_current = !is_file || is_same;
                 self.is_file_current = is_file || is_same;
                 self.is_from_file = is_file;
-                if is_file { (file, Some(database)) } else { (database, Some(file)) }
+                if is_file {
+                    (file, Some(database))
+                } else {
+                    (database, Some(file))
+                }
             }
         };
         if let Some(other) = other.filter(|other| other.notes != taken.notes) {
