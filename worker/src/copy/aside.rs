@@ -11,7 +11,7 @@ pub(super) const KEPT_ASIDE: usize = 3;
 
 /// A file beside another one: its name and `.ending`.
 pub(super) fn beside(path: &Path, ending: &str) -> PathBuf {
-    companion(path, &format!(".{ending}"))
+    companion(path, format!(".{ending}"))
 }
 
 fn companion(path: &Path, ending: impl AsRef<OsStr>) -> PathBuf {

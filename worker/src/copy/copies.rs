@@ -31,6 +31,9 @@ const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_
 const REST: u32 = 4;
 const REST_BOUNDS: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(10));
 
+/// Where only the time of the position moves on, such a copy is written again when it is this old.
+const MAX_AGE: Duration = Duration::from_secs(300);
+
 /// What changed since the last update.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Changed {
@@ -255,6 +258,8 @@ struct Writer {
     /// The copy holds what the next update is counted from.
     is_current: bool,
     failures: u32,
+    /// What it was last written with.
+    written: Option<Position>,
 }
 
 impl Writer {
@@ -264,6 +269,7 @@ impl Writer {
             slot,
             is_current: target.is_current,
             failures: 0,
+            written: None,
         }
     }
 
@@ -282,12 +288,17 @@ impl Writer {
 
     /// Writes, and says how long to rest.
     async fn write_one(&mut self, next: Next) -> Duration {
+        if self.is_spared(&next) {
+            self.slot.done.send_replace(next.number);
+            return Duration::ZERO;
+        }
         let began = Instant::now();
         let written = self.write(&next).await;
         self.is_current = written.is_ok();
         match written {
             Ok(()) => {
                 self.succeeded(next.number);
+                self.written = Some(next.position);
                 if self.copy.writes_whole() {
                     (began.elapsed() * REST).clamp(REST_BOUNDS.0, REST_BOUNDS.1)
                 } else {
@@ -299,6 +310,21 @@ impl Writer {
                 self.failed(&error)
             }
         }
+    }
+
+    /// Whether a copy that always writes everything is spared a write for the time alone, which moves on every few seconds.
+    fn is_spared(&self, next: &Next) -> bool {
+        let has_same = !next.have_notes_changed && next.keys.as_ref().is_some_and(BTreeSet::is_empty);
+        let is_young = |written: &Position| {
+            let age_ms = next
+                .position
+                .as_of
+                .as_millis()
+                .saturating_sub(written.as_of.as_millis());
+            let is_same = (&written.store_id, written.revision) == (&next.position.store_id, next.position.revision);
+            is_same && u128::from(age_ms.unsigned_abs()) < MAX_AGE.as_millis()
+        };
+        self.copy.writes_whole() && self.is_current && has_same && self.written.as_ref().is_some_and(is_young)
     }
 
     async fn write(&self, next: &Next) -> Result<(), CopyError> {

@@ -185,6 +185,41 @@ async fn a_copy_that_writes_everything_rests() {
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_copy_that_writes_everything_is_spared_writes_for_the_time_alone() {
+    let whole = Fake {
+        is_whole: true,
+        ..Fake::new("file")
+    };
+    let fixture = Fixture::new(whole, false);
+    let later = |seconds: i64| {
+        let as_of = position(1).as_of.as_millis() + seconds * 1_000;
+        let as_of = blaze_domain::config::Timestamp::from_millis(as_of);
+        Position { as_of, ..position(1) }
+    };
+    let store = |position: Position, notes: Option<Arc<Notes>>| {
+        let (state, changed) = (fixture.state.clone(), Changed::Keys(Vec::new()));
+        fixture.copies.store(&Update {
+            position,
+            state,
+            changed,
+            notes,
+        });
+        fixture.copies.flush(LONG)
+    };
+    assert!(store(later(0), None).await);
+    for seconds in [15, 30, 299] {
+        assert!(store(later(seconds), None).await);
+    }
+    assert_eq!(fixture.calls(), (1, 0));
+    assert!(store(later(300), None).await);
+    assert_eq!((fixture.calls(), fixture.held().position), ((2, 0), later(300)));
+    assert!(store(later(315), Some(Arc::new(notes("uid", 1)))).await);
+    assert_eq!(fixture.calls(), (3, 0));
+    assert!(store(position(2), None).await);
+    assert_eq!(fixture.calls(), (4, 0));
+}
+
+#[tokio::test(start_paused = true)]
 async fn very_many_keys_are_everything() {
     let slow = Fake {
         permits: Semaphore::new(0),

@@ -149,7 +149,7 @@ impl Inner {
                 detail: format!("it has more than {MAX_BYTES} bytes"),
             });
         }
-        let (whole, lost) = file_format::decode(content, &self.place(), &self.layer, &self.vault)?;
+        let (whole, lost) = file_format::decode(&content, &self.place(), &self.layer, &self.vault)?;
         if lost > 0 {
             tracing::warn!(file = %self.path.display(), lost, "secrets of the last-known-good file do not open");
         }

@@ -76,7 +76,7 @@ fn hash(header: &[u8], body: &[u8]) -> String {
 /// # Errors
 /// [`CopyError::Broken`], [`CopyError::OtherKey`], [`CopyError::OtherLayer`], [`CopyError::NewerFormat`].
 pub(super) fn decode(
-    content: Vec<u8>,
+    content: &[u8],
     place: &str,
     layer: &LayerName,
     vault: &Vault,
@@ -86,7 +86,7 @@ pub(super) fn decode(
         detail: detail.to_owned(),
     };
     let form = |error: FormError| broken(&error.to_string());
-    let (header, body) = open_envelope(&content, place)?;
+    let (header, body) = open_envelope(content, place)?;
     let read = json::value_from_text(header).map_err(form)?;
     let position = json::position_from_json(read["position"].clone()).map_err(form)?;
     if position.layer != *layer {
@@ -235,7 +235,7 @@ mod tests {
         Vault::with_key([7; 32])
     }
 
-    fn read(content: Vec<u8>, vault: &Vault) -> Result<(Loaded, usize), CopyError> {
+    fn read(content: &[u8], vault: &Vault) -> Result<(Loaded, usize), CopyError> {
         decode(content, "file x", &"edge".parse().unwrap(), vault)
     }
 
@@ -257,7 +257,7 @@ mod tests {
         fn what_is_written_is_read(documents in any_documents(), notes in any_notes()) {
             let whole = Loaded { position: position(7), documents, notes: Arc::new(notes) };
             let content = encode(&whole, &key()).unwrap();
-            prop_assert_eq!(read(content, &key()).unwrap(), (whole, 0));
+            prop_assert_eq!(read(&content, &key()).unwrap(), (whole, 0));
         }
     }
 
@@ -268,7 +268,7 @@ mod tests {
         let whole = loaded(7, documents);
         let content = encode(&whole, &key()).unwrap();
         assert!(content.len() > 4 * CHUNK_BYTES);
-        assert_eq!(read(content, &key()).unwrap().0, whole);
+        assert_eq!(read(&content, &key()).unwrap().0, whole);
     }
 
     #[test]
@@ -298,7 +298,7 @@ mod tests {
         for vault in [key(), Vault::default()] {
             let content = encode(&small(), &vault).unwrap();
             for length in 0..content.len() {
-                let error = read(content[..length].to_vec(), &vault).unwrap_err();
+                let error = read(&content[..length], &vault).unwrap_err();
                 assert!(matches!(error, CopyError::Broken { .. }), "{length}: {error}");
             }
         }
@@ -312,7 +312,7 @@ mod tests {
                 for change in [1, 0x80] {
                     let mut other = content.clone();
                     other[place] ^= change;
-                    let error = read(other, &vault).unwrap_err();
+                    let error = read(&other, &vault).unwrap_err();
                     assert!(error.is_unreadable(), "{place}: {error}");
                 }
             }
@@ -326,7 +326,7 @@ mod tests {
             assert!(!String::from_utf8_lossy(&content).contains(CANARY));
         }
         let content = encode(&small(), &Vault::default()).unwrap();
-        let (whole, lost) = read(content, &Vault::default()).unwrap();
+        let (whole, lost) = read(&content, &Vault::default()).unwrap();
         assert!(whole.lacks_secrets() && lost == 0);
         assert_eq!(
             blaze_domain::config::canonical::hash(&whole.documents[1].spec),
@@ -338,19 +338,19 @@ mod tests {
     fn another_key_layer_or_format_has_a_name() {
         let content = encode(&small(), &key()).unwrap();
         for vault in [Vault::default(), Vault::with_key([8; 32])] {
-            let error = read(content.clone(), &vault).unwrap_err();
+            let error = read(&content, &vault).unwrap_err();
             let CopyError::OtherKey { found, own, .. } = error else {
                 panic!("{error}")
             };
             assert_eq!((Some(found.as_str()), own.as_deref()), (key().key_id(), vault.key_id()));
         }
-        let error = decode(content.clone(), "file x", &"fog".parse().unwrap(), &key()).unwrap_err();
+        let error = decode(&content, "file x", &"fog".parse().unwrap(), &key()).unwrap_err();
         assert!(matches!(error, CopyError::OtherLayer { .. }), "{error}");
         let newer = [b"blaze-copy 2 ".as_slice(), &content[13..]].concat();
-        let error = read(newer, &key()).unwrap_err();
+        let error = read(&newer, &key()).unwrap_err();
         assert_eq!(error.to_string(), "file x has format 2; this version reads up to 1");
         // A file that was written before there was a key is read with it.
         let plain = encode(&small(), &Vault::default()).unwrap();
-        assert!(read(plain, &key()).is_ok());
+        assert!(read(&plain, &key()).is_ok());
     }
 }

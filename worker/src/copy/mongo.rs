@@ -152,12 +152,10 @@ impl MongoCopy {
         }
         let tables = self.server.tables().await?;
         let present = self.head(&tables, ReadPreference::Primary).await?;
-        if let Some(present) = &present {
-            match rows::read_head(present, &self.place) {
-                // An older version would lose what the newer one keeps there.
-                Err(error @ CopyError::NewerFormat { .. }) => return Err(error),
-                Ok(_) | Err(_) => {}
-            }
+        let read = present.as_ref().map(|present| rows::read_head(present, &self.place));
+        if let Some(Err(error @ CopyError::NewerFormat { .. })) = read {
+            // An older version would lose what the newer one keeps there.
+            return Err(error);
         }
         let present = present.as_ref().and_then(|present| present.get_str("generation").ok());
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
@@ -388,37 +386,5 @@ fn count(length: usize) -> i64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn names_of_databases_are_checked_before_anything_is_asked() {
-        let copy = |database: &str, node: Option<&str>| {
-            let node = node.map(|node| node.parse().unwrap());
-            let uri = SecretText::from("mongodb://me:canary@127.0.0.1:1".to_owned());
-            MongoCopy::new(uri, database, "edge".parse().unwrap(), node.as_ref(), Vault::default())
-        };
-        assert_eq!(copy("blaze", None).unwrap().describe(), "MongoDB blaze, copy edge");
-        assert!(
-            copy("blaze", Some("robot-1"))
-                .unwrap()
-                .describe()
-                .ends_with("copy edge.robot-1")
-        );
-        for wrong in ["", "a/b", "a.b", "$cmd", "\u{e4}", &"x".repeat(64)] {
-            assert!(
-                matches!(copy(wrong, None).err(), Some(CopyError::Refused { .. })),
-                "{wrong}"
-            );
-        }
-    }
-
-    #[tokio::test]
-    async fn a_server_that_is_away_is_no_broken_copy_and_its_password_is_not_told() {
-        let uri = SecretText::from("mongodb://me:canary@127.0.0.1:1/?directConnection=true".to_owned());
-        let copy = MongoCopy::new(uri, "blaze", "edge".parse().unwrap(), None, Vault::default()).unwrap();
-        let error = copy.load().await.unwrap_err();
-        assert!(matches!(error, CopyError::Away { .. }), "{error}");
-        assert!(!error.to_string().contains("canary"), "{error}");
-    }
-}
+#[path = "mongo_tests.rs"]
+mod tests;

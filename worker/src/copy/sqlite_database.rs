@@ -184,9 +184,7 @@ impl Facts {
         let Some((position, notes)) = self.head(&transaction)? else {
             return Ok(None);
         };
-        let mut statement = transaction
-            .prepare("SELECT document FROM documents")
-            .map_err(failed)?;
+        let mut statement = transaction.prepare("SELECT document FROM documents").map_err(failed)?;
         let rows = statement.query_map([], |row| row.get::<_, String>(0)).map_err(failed)?;
         let mut documents = Vec::new();
         let mut lost = 0;

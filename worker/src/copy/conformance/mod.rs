@@ -1,86 +1,20 @@
 //! What every copy must do, run on each of them. MongoDB only where `BLAZE_TEST_MONGODB_URI` (or `BLAZE_TEST_MONGODB`) names
 //! a server, standalone or replica set.
 
+mod subject;
+
 use std::sync::Arc;
 
-use blaze_domain::LayerName;
 use blaze_domain::config::{Document, Key};
-use blaze_runtime::Supervisor;
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 use serde_json::json;
-use tempfile::TempDir;
-use tokio::runtime::Runtime;
 
 use super::samples::{any_documents, any_notes, loaded, notes, position, service, with_secret};
-use super::steps::Steps;
-use super::{CopyError, DATABASE_NAME, FileCopy, Loaded, LocalCopy, Notes, Position, SqliteCopy, Vault, progress};
-
-const KEY: [u8; 32] = [7; 32];
-
-enum Kind {
-    File,
-    Sqlite,
-    #[cfg(feature = "mongodb")]
-    Mongo {
-        uri: String,
-        database: String,
-    },
-}
-
-/// One copy that can be opened again and again.
-struct Subject {
-    kind: Kind,
-    folder: TempDir,
-    supervisor: Supervisor,
-    runtime: Runtime,
-}
-
-impl Subject {
-    fn new(kind: Kind) -> Self {
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(1)
-            .enable_all()
-            .build()
-            .unwrap();
-        Self {
-            kind,
-            folder: tempfile::tempdir().unwrap(),
-            supervisor: Supervisor::on(runtime.handle().clone(), "test"),
-            runtime,
-        }
-    }
-
-    fn open(&self) -> Box<dyn LocalCopy> {
-        self.open_as(Vault::with_key(KEY), None)
-    }
-
-    /// `crash_after`: how many steps of writes are done; a copy that is written in one step ignores it.
-    fn open_as(&self, vault: Vault, crash_after: Option<usize>) -> Box<dyn LocalCopy> {
-        let layer: LayerName = "edge".parse().unwrap();
-        let steps = crash_after.map_or_else(Steps::default, Steps::crash_after);
-        match &self.kind {
-            Kind::File => Box::new(FileCopy::with_steps(self.folder.path(), layer, vault, steps)),
-            Kind::Sqlite => {
-                let path = self.folder.path().join(DATABASE_NAME);
-                Box::new(SqliteCopy::new(path, layer, vault, &self.supervisor).unwrap())
-            }
-            #[cfg(feature = "mongodb")]
-            Kind::Mongo { uri, database } => {
-                let copy = super::MongoCopy::new(uri.clone().into(), database, layer, None, vault).unwrap();
-                Box::new(match crash_after {
-                    Some(steps) => copy.crashing_after(steps),
-                    None => copy,
-                })
-            }
-        }
-    }
-
-    /// What a process that starts now finds.
-    async fn found(&self) -> Option<Loaded> {
-        self.open().load().await.unwrap()
-    }
-}
+use super::{CopyError, Loaded, LocalCopy, Notes, Position, Vault, progress};
+#[cfg(feature = "mongodb")]
+use subject::mongo_server;
+use subject::{KEY, Kind, Subject};
 
 /// What a caller does: go on if the copy can, else write everything.
 async fn advance(
@@ -401,28 +335,6 @@ suites! {
 #[cfg(feature = "mongodb")]
 suites! {
     mongo: super::mongo_server();
-}
-
-/// A server, and a database that no other test has.
-#[cfg(feature = "mongodb")]
-fn mongo_server() -> Option<Kind> {
-    use blaze_runtime::environment::variable;
-    let uri = variable("BLAZE_TEST_MONGODB_URI").or_else(|| variable("BLAZE_TEST_MONGODB"))?;
-    let database = format!("blaze_copy_{:016x}", rand::random::<u64>());
-    Some(Kind::Mongo { uri, database })
-}
-
-#[cfg(feature = "mongodb")]
-impl Drop for Subject {
-    fn drop(&mut self) {
-        if let Kind::Mongo { uri, database } = &self.kind {
-            // What is left behind on a test server does no harm.
-            let _ = self.runtime.block_on(async {
-                let client = mongodb::Client::with_uri_str(uri).await?;
-                client.database(database).drop().await
-            });
-        }
-    }
 }
 
 /// Old rows go, and no text of a secret is in any.
