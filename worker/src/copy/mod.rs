@@ -27,6 +27,8 @@ mod fake;
 mod file;
 mod file_format;
 mod json;
+#[cfg(test)]
+mod kill_tests;
 #[cfg(feature = "mongodb")]
 mod mongo;
 #[cfg(feature = "mongodb")]
