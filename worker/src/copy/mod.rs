@@ -9,7 +9,8 @@
 //! ```
 //!
 //! A write is all or nothing: whoever dies in the middle of it leaves the old content or the new one, whole. Serving never
-//! waits for a write. What a copy holds and cannot be read is never written over, but moved aside.
+//! waits for a write. A file that cannot be read is never written over: the first write moves it aside. In MongoDB a copy that
+//! is broken gives way, and one of a newer format stays and is not written.
 //!
 //! # Secrets at rest
 //! In each copy alike, the text of a secret is there only encrypted under `worker.key_file`. Without such a key the texts
