@@ -1,0 +1,384 @@
+//! Writes the newest state to every copy, each at its own pace.
+//!
+//! ```text
+//! store(update) ──▶ slot of the database ──▶ task ──▶ advance, or replace after a failure
+//!               └─▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time
+//! ```
+//!
+//! A slot holds one update: a newer one is merged into it and counted. So whoever stores never waits, a copy that is slow or
+//! away costs one state and the keys that changed since, and what is written is always the newest.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use blaze_domain::config::Key;
+use blaze_domain::config::state::State;
+use blaze_runtime::{Supervisor, TaskPolicy};
+use parking_lot::Mutex;
+use tokio::sync::{Notify, watch};
+use tokio::time::Instant;
+
+use super::{CopyError, Loaded, LocalCopy, Notes, Position};
+
+/// Keys that a slot remembers as changed; beyond that everything is written.
+const MAX_KEYS: usize = 10_000;
+/// Bounds of the pause after a failure; the pause is drawn from zero to the bound, which doubles.
+const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(30));
+/// A copy that always writes everything rests this many times as long as the write took, between these bounds.
+const REST: u32 = 4;
+const REST_BOUNDS: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(10));
+
+/// Where only the time of the position moves on, such a copy is written again when it is this old.
+const MAX_AGE: Duration = Duration::from_secs(300);
+
+/// What changed since the last update.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Changed {
+    /// Perhaps everything: a snapshot, another store.
+    All,
+    /// These documents: they are new, other ones, or gone.
+    Keys(Vec<Key>),
+}
+
+/// A state that is to be kept.
+#[derive(Debug, Clone)]
+pub struct Update {
+    /// How far it is.
+    pub position: Position,
+    /// The documents of the layer's view.
+    pub state: State,
+    /// What is new in it.
+    pub changed: Changed,
+    /// The notes, if they changed.
+    pub notes: Option<Arc<Notes>>,
+}
+
+/// A copy, and what is known of it at the start.
+#[derive(Clone)]
+pub struct Target {
+    /// The copy.
+    pub copy: Arc<dyn LocalCopy>,
+    /// It holds what the first update is counted from; else the first write is everything.
+    pub is_current: bool,
+}
+
+/// What became of the updates, since the start.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Which copy.
+    pub place: String,
+    /// Writes that were done.
+    pub written: u64,
+    /// Writes that failed; each is tried again, then with the newest state.
+    pub failed: u64,
+    /// Updates that were merged into one that waited.
+    pub coalesced: u64,
+    /// Whether the copy holds all that was stored.
+    pub is_current: bool,
+    /// Why the last write failed; none once one was done again.
+    pub error: Option<String>,
+}
+
+/// Keeps the copies up to date. Clones share them.
+#[derive(Clone)]
+pub struct Copies {
+    slots: Arc<[Arc<Slot>]>,
+}
+
+impl Copies {
+    /// Starts one task per copy. `notes` are those that the copies were started from.
+    #[must_use]
+    pub fn start(supervisor: &Supervisor, targets: Vec<Target>, notes: &Arc<Notes>) -> Self {
+        let slots = targets.into_iter().map(|target| {
+            let slot = Arc::new(Slot::new(target.copy.describe(), notes));
+            let (stop, writer) = (supervisor.shutdown_token(), Writer::new(target, Arc::clone(&slot)));
+            supervisor.spawn(format!("copy to {}", slot.place), TaskPolicy::Essential, async move {
+                tokio::select! {
+                    () = writer.run() => {}
+                    () = stop.cancelled() => {}
+                }
+            });
+            slot
+        });
+        Self { slots: slots.collect() }
+    }
+
+    /// Has a state written to every copy, when it can be. Never waits.
+    pub fn store(&self, update: &Update) {
+        for slot in &*self.slots {
+            slot.put(update);
+        }
+    }
+
+    /// Waits until every copy holds what was stored before, at most so long. Gives whether they do.
+    pub async fn flush(&self, limit: Duration) -> bool {
+        let all = async {
+            for slot in &*self.slots {
+                let stored = slot.stored.load(Ordering::Acquire);
+                // The sender lives as long as the slot.
+                let _ = slot.done.subscribe().wait_for(|done| *done >= stored).await;
+            }
+        };
+        tokio::time::timeout(limit, all).await.is_ok()
+    }
+
+    /// What became of the updates, by copy.
+    #[must_use]
+    pub fn counts(&self) -> Vec<Counts> {
+        self.slots.iter().map(|slot| slot.counts()).collect()
+    }
+}
+
+impl fmt::Debug for Copies {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_list().entries(self.counts()).finish()
+    }
+}
+
+/// What waits for one copy.
+struct Slot {
+    place: String,
+    waiting: Mutex<Waiting>,
+    wake: Notify,
+    /// Updates that were stored.
+    stored: AtomicU64,
+    /// Of these, how many the copy holds.
+    done: watch::Sender<u64>,
+    written: AtomicU64,
+    failed: AtomicU64,
+    coalesced: AtomicU64,
+    error: Mutex<Option<String>>,
+}
+
+struct Waiting {
+    next: Option<Next>,
+    /// The newest, for a write of everything.
+    notes: Arc<Notes>,
+}
+
+/// One write that is to be done.
+struct Next {
+    /// How many updates are in it, with all before.
+    number: u64,
+    position: Position,
+    state: State,
+    notes: Arc<Notes>,
+    have_notes_changed: bool,
+    /// None: everything.
+    keys: Option<BTreeSet<Key>>,
+}
+
+impl Next {
+    fn merge_keys(&mut self, changed: &Changed) {
+        match (changed, &mut self.keys) {
+            (Changed::Keys(new), Some(keys)) => keys.extend(new.iter().cloned()),
+            (Changed::All, keys) => *keys = None,
+            (Changed::Keys(_), None) => {}
+        }
+        if self.keys.as_ref().is_some_and(|keys| keys.len() > MAX_KEYS) {
+            self.keys = None;
+        }
+    }
+}
+
+impl Slot {
+    fn new(place: String, notes: &Arc<Notes>) -> Self {
+        Self {
+            place,
+            waiting: Mutex::new(Waiting {
+                next: None,
+                notes: Arc::clone(notes),
+            }),
+            wake: Notify::new(),
+            stored: AtomicU64::new(0),
+            done: watch::Sender::new(0),
+            written: AtomicU64::new(0),
+            failed: AtomicU64::new(0),
+            coalesced: AtomicU64::new(0),
+            error: Mutex::new(None),
+        }
+    }
+
+    fn put(&self, update: &Update) {
+        let mut waiting = self.waiting.lock();
+        if let Some(notes) = &update.notes {
+            waiting.notes = Arc::clone(notes);
+        }
+        let before = waiting.next.take();
+        if before.is_some() {
+            self.coalesced.fetch_add(1, Ordering::Relaxed);
+        }
+        let (keys, had_notes) = before.map_or((Some(BTreeSet::new()), false), |next| {
+            (next.keys, next.have_notes_changed)
+        });
+        let mut next = Next {
+            number: self.stored.fetch_add(1, Ordering::AcqRel) + 1,
+            position: update.position.clone(),
+            state: update.state.clone(),
+            notes: Arc::clone(&waiting.notes),
+            have_notes_changed: had_notes || update.notes.is_some(),
+            keys,
+        };
+        next.merge_keys(&update.changed);
+        waiting.next = Some(next);
+        drop(waiting);
+        self.wake.notify_one();
+    }
+
+    /// A write that failed waits again, unless a newer one does: that one is then to write everything anyway.
+    fn put_back(&self, next: Next) {
+        let mut waiting = self.waiting.lock();
+        if waiting.next.is_some() {
+            self.coalesced.fetch_add(1, Ordering::Relaxed);
+        } else {
+            waiting.next = Some(next);
+        }
+    }
+
+    fn counts(&self) -> Counts {
+        let number = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        Counts {
+            place: self.place.clone(),
+            written: number(&self.written),
+            failed: number(&self.failed),
+            coalesced: number(&self.coalesced),
+            is_current: *self.done.borrow() >= self.stored.load(Ordering::Acquire),
+            error: self.error.lock().clone(),
+        }
+    }
+}
+
+/// The task of one copy.
+struct Writer {
+    copy: Arc<dyn LocalCopy>,
+    slot: Arc<Slot>,
+    /// The copy holds what the next update is counted from.
+    is_current: bool,
+    failures: u32,
+    /// What it was last written with.
+    written: Option<Position>,
+}
+
+impl Writer {
+    fn new(target: Target, slot: Arc<Slot>) -> Self {
+        Self {
+            copy: target.copy,
+            slot,
+            is_current: target.is_current,
+            failures: 0,
+            written: None,
+        }
+    }
+
+    async fn run(mut self) {
+        loop {
+            let next = self.slot.waiting.lock().next.take();
+            match next {
+                None => self.slot.wake.notified().await,
+                Some(next) => {
+                    let pause = self.write_one(next).await;
+                    tokio::time::sleep(pause).await;
+                }
+            }
+        }
+    }
+
+    /// Writes, and says how long to rest.
+    async fn write_one(&mut self, next: Next) -> Duration {
+        if self.is_spared(&next) {
+            self.slot.done.send_replace(next.number);
+            return Duration::ZERO;
+        }
+        let began = Instant::now();
+        let written = self.write(&next).await;
+        self.is_current = written.is_ok();
+        match written {
+            Ok(()) => {
+                self.succeeded(next.number);
+                self.written = Some(next.position);
+                if self.copy.writes_whole() {
+                    (began.elapsed() * REST).clamp(REST_BOUNDS.0, REST_BOUNDS.1)
+                } else {
+                    Duration::ZERO
+                }
+            }
+            Err(error) => {
+                self.slot.put_back(next);
+                self.failed(&error)
+            }
+        }
+    }
+
+    /// Whether a copy that always writes everything is spared a write for the time alone, which moves on every few seconds.
+    fn is_spared(&self, next: &Next) -> bool {
+        let has_same = !next.have_notes_changed && next.keys.as_ref().is_some_and(BTreeSet::is_empty);
+        let is_young = |written: &Position| {
+            let age_ms = next
+                .position
+                .as_of
+                .as_millis()
+                .saturating_sub(written.as_of.as_millis());
+            let is_same = (&written.store_id, written.revision) == (&next.position.store_id, next.position.revision);
+            is_same && u128::from(age_ms.unsigned_abs()) < MAX_AGE.as_millis()
+        };
+        self.copy.writes_whole() && self.is_current && has_same && self.written.as_ref().is_some_and(is_young)
+    }
+
+    async fn write(&self, next: &Next) -> Result<(), CopyError> {
+        if let Some(keys) = next
+            .keys
+            .as_ref()
+            .filter(|_| self.is_current && !self.copy.writes_whole())
+        {
+            let document = |key: &Key| next.state.get(key).map(|held| Arc::clone(&held.document));
+            let puts: Vec<_> = keys.iter().filter_map(document).collect();
+            let is_gone = |key: &&Key| next.state.get(key).is_none();
+            let removes: Vec<Key> = keys.iter().filter(is_gone).cloned().collect();
+            let notes = next.have_notes_changed.then_some(&*next.notes);
+            match self.copy.advance(&next.position, &puts, &removes, notes).await {
+                // It has lost what it had, or never had it: no failure yet.
+                Err(CopyError::Behind { .. }) => {}
+                advanced => return advanced,
+            }
+        }
+        let whole = Loaded {
+            position: next.position.clone(),
+            documents: next.state.all().map(|(_, held)| Arc::clone(&held.document)).collect(),
+            notes: Arc::clone(&next.notes),
+        };
+        self.copy.replace(&whole).await
+    }
+
+    fn succeeded(&mut self, number: u64) {
+        let slot = &self.slot;
+        slot.written.fetch_add(1, Ordering::Relaxed);
+        if slot.error.lock().take().is_some() {
+            tracing::info!(copy = slot.place, failures = self.failures, "the copy is written again");
+        }
+        self.failures = 0;
+        slot.done.send_replace(number);
+    }
+
+    fn failed(&mut self, error: &CopyError) -> Duration {
+        let slot = &self.slot;
+        slot.failed.fetch_add(1, Ordering::Relaxed);
+        let text = error.to_string();
+        let told = slot.error.lock().replace(text.clone());
+        if told.is_none() {
+            tracing::warn!(
+                error = text,
+                "a copy of the configuration is not written; it is tried again"
+            );
+        }
+        let bound = PAUSE.0.saturating_mul(1 << self.failures.min(16)).min(PAUSE.1);
+        self.failures = self.failures.saturating_add(1);
+        rand::random_range(Duration::ZERO..=bound)
+    }
+}
+
+#[cfg(test)]
+#[path = "copies_tests.rs"]
+mod tests;
