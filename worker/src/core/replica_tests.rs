@@ -1,3 +1,4 @@
+use blaze_domain::config::canonical;
 use serde_json::json;
 
 use super::super::testing::{document, keys};
