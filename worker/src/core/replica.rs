@@ -26,7 +26,7 @@ pub enum Applied {
     /// Nothing to the documents; the known revision may be a higher one.
     Nothing,
     /// The documents are others. After a snapshot that holds what was there, no key has changed.
-    Changed(Change),
+    Changed(Box<Change>),
     /// The stream is about to end; come again after this time.
     GoAway {
         /// When to come again.
@@ -355,11 +355,11 @@ impl Replica {
     fn changed(&mut self, keys: Vec<Key>, new: State) -> Applied {
         let old = std::mem::replace(&mut self.state, new);
         self.digest = None;
-        Applied::Changed(Change {
+        Applied::Changed(Box::new(Change {
             keys,
             old,
             new: self.state.clone(),
-        })
+        }))
     }
 
     fn bookmark(&mut self, revision: u64, theirs: String) -> Result<(), SyncFault> {

@@ -71,7 +71,7 @@ fn resumed(revision: u64) -> Replica {
 
 fn change(applied: Result<Applied, SyncFault>) -> Change {
     match applied {
-        Ok(Applied::Changed(change)) => change,
+        Ok(Applied::Changed(change)) => *change,
         other => panic!("{other:?} instead of a change"),
     }
 }
