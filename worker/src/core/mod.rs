@@ -20,8 +20,10 @@ mod place;
 mod reach;
 mod replica;
 mod served;
+mod stream;
 #[cfg(test)]
 mod testing;
+mod told;
 mod world;
 
 pub use answer::{Freshness, Reply, answer};
@@ -31,4 +33,5 @@ pub use incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, Op, PROTOCOL, SyncFault, 
 pub use notice::{Config, Notice, Scope, Standing};
 pub use place::{Place, Site, Source};
 pub use replica::{Applied, Replica, ResumePoint};
-pub use served::{Flushed, MAX_FAILED, Served, Told, WeakerSource};
+pub use served::{MAX_FAILED, Served};
+pub use told::{Flushed, Told, WeakerSource};

@@ -244,10 +244,11 @@ impl Run {
                 assert_eq!(&notice.previous_hash, known, "{}", notice.place);
             }
             assert_eq!(notice.hash.is_none(), notice.config.is_none());
-            assert_eq!(
-                notice.hash.is_none(),
-                notice.paths.is_empty() && notice.scopes.is_empty()
-            );
+            if notice.hash.is_none() {
+                assert!(notice.paths.is_empty() && notice.scopes.is_empty());
+            } else if notice.previous_hash.is_some() {
+                assert!(!notice.paths.is_empty() && !notice.scopes.is_empty());
+            }
             self.known.insert(notice.place.clone(), notice.hash.clone());
         }
         for place in flushed.tracked {

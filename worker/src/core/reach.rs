@@ -18,7 +18,7 @@ use serde_json::Value;
 
 use super::notice::said;
 use super::place::{Place, Site};
-use super::served::Told;
+use super::told::Told;
 
 /// The places that are told of changes, with what each was told last.
 #[derive(Default)]
@@ -160,7 +160,13 @@ impl<'s> Search<'s> {
         if key.name().as_str() != self.site.layer.as_str() {
             return;
         }
-        match affected(document(self.old, key), document(self.new, key)) {
+        let (old, new) = (document(self.old, key), document(self.new, key));
+        // A roll-out may have waited for what it changes, or lose it.
+        let affected = match old.is_some() == new.is_some() {
+            true => affected(old, new),
+            false => Affected::All,
+        };
+        match affected {
             Affected::All => self.found.extend(self.places.all().map(|(place, _)| place.clone())),
             Affected::Some(services) => {
                 for service in &services {

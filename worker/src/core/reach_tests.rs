@@ -69,6 +69,8 @@ fn a_layer_concerns_all_or_those_whose_overrides_differ() {
     assert_eq!(found(&plain, &overrides, ["Layer/edge"]), ["blur", "blur/0@a"]);
     assert!(found(&plain, &layer(json!({"kind": "edge"})), ["Layer/edge"]).is_empty());
     assert!(found(&plain, &config, ["Layer/fog"]).is_empty());
+    // A roll-out of the layer may have waited for it.
+    assert_eq!(found(&State::default(), &plain, ["Layer/edge"]).len(), TRACKED.len());
 }
 
 #[test]

@@ -9,16 +9,16 @@
 //! Whatever goes wrong, the documents stay as they were: those that have been served go on being served.
 
 use std::fmt;
-use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_domain::LayerName;
 use blaze_domain::config::state::State;
-use blaze_domain::config::{Document, Key, MAX_DOCUMENTS, Timestamp, canonical};
+use blaze_domain::config::{Document, Key, MAX_DOCUMENTS, Timestamp};
 
 use super::change::{Change, difference};
 use super::incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, Op, PROTOCOL, SyncFault, TooLarge};
+use super::stream::{Phase, Stream, digest_of, spec_bytes};
 
 /// What a message did.
 #[derive(Debug)]
@@ -26,7 +26,7 @@ pub enum Applied {
     /// Nothing to the documents; the known revision may be a higher one.
     Nothing,
     /// The documents are others. After a snapshot that holds what was there, no key has changed.
-    Changed(Change),
+    Changed(Box<Change>),
     /// The stream is about to end; come again after this time.
     GoAway {
         /// When to come again.
@@ -45,49 +45,6 @@ pub struct ResumePoint {
     pub revision: u64,
     /// Digest of the copy; empty: no copy.
     pub digest: String,
-}
-
-/// Where a stream stands.
-enum Stream {
-    /// There is none, or it has not begun.
-    Closed,
-    /// The parts of a snapshot come.
-    Snapshot {
-        store_id: String,
-        /// Of the first part, once it is there.
-        revision: Option<u64>,
-        documents: Vec<Document>,
-        bytes: usize,
-    },
-    /// Commits come.
-    Live {
-        /// The commit that was told last, or where the stream began.
-        told: u64,
-        /// Until the first commit that is new, older ones may come again; the revision from which the stream was resumed.
-        resumed: Option<u64>,
-    },
-    /// Nothing sensible comes any more.
-    Over,
-}
-
-/// The same without what belongs to it.
-#[derive(Clone, Copy)]
-enum Phase {
-    Closed,
-    Snapshot,
-    Live,
-    Over,
-}
-
-impl Stream {
-    fn phase(&self) -> Phase {
-        match self {
-            Self::Closed => Phase::Closed,
-            Self::Snapshot { .. } => Phase::Snapshot,
-            Self::Live { .. } => Phase::Live,
-            Self::Over => Phase::Over,
-        }
-    }
 }
 
 /// The layer's view at a revision.
@@ -398,11 +355,11 @@ impl Replica {
     fn changed(&mut self, keys: Vec<Key>, new: State) -> Applied {
         let old = std::mem::replace(&mut self.state, new);
         self.digest = None;
-        Applied::Changed(Change {
+        Applied::Changed(Box::new(Change {
             keys,
             old,
             new: self.state.clone(),
-        })
+        }))
     }
 
     fn bookmark(&mut self, revision: u64, theirs: String) -> Result<(), SyncFault> {
@@ -418,32 +375,6 @@ impl Replica {
         }
         self.state.advance(revision, []);
         Ok(())
-    }
-}
-
-fn digest_of(state: &State) -> String {
-    canonical::digest(state.all().map(|(key, held)| {
-        let service = key.service_name().map(blaze_domain::ServiceName::as_str);
-        (key.kind(), service, key.name().as_str(), held.document.revision)
-    }))
-}
-
-/// Bytes of a spec as compact JSON, without writing it anywhere.
-fn spec_bytes(document: &Document) -> usize {
-    struct Count(usize);
-    impl io::Write for Count {
-        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-            self.0 += bytes.len();
-            Ok(bytes.len())
-        }
-        fn flush(&mut self) -> io::Result<()> {
-            Ok(())
-        }
-    }
-    let mut count = Count(0);
-    // Nothing can fail: the names of objects are texts and the counter takes everything.
-    match serde_json::to_writer(&mut count, &*document.spec) {
-        Ok(()) | Err(_) => count.0,
     }
 }
 

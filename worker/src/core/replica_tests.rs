@@ -1,3 +1,4 @@
+use blaze_domain::config::canonical;
 use serde_json::json;
 
 use super::super::testing::{document, keys};
@@ -70,7 +71,7 @@ fn resumed(revision: u64) -> Replica {
 
 fn change(applied: Result<Applied, SyncFault>) -> Change {
     match applied {
-        Ok(Applied::Changed(change)) => change,
+        Ok(Applied::Changed(change)) => *change,
         other => panic!("{other:?} instead of a change"),
     }
 }

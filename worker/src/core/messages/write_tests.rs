@@ -14,7 +14,7 @@ fn freshness() -> Freshness {
 }
 
 /// The configuration of `slam/0` at `robot-1`, made of these members.
-fn standing(config: Value) -> Standing {
+fn standing(config: &Value) -> Standing {
     let state = state(431, [document("Service/slam", 431, json!({"config": config}))]);
     let at = At {
         service: Some("slam".parse().unwrap()),
@@ -33,7 +33,7 @@ fn standing(config: Value) -> Standing {
     }
 }
 
-fn a_notice(config: Option<Value>) -> Notice {
+fn a_notice(config: Option<&Value>) -> Notice {
     let standing = config.map(standing);
     Notice {
         place: place("slam/0@robot-1"),
@@ -51,7 +51,7 @@ fn a_notice(config: Option<Value>) -> Notice {
 
 #[test]
 fn an_answer_has_the_members_of_the_contract_in_their_order() {
-    let standing = standing(json!({"a": 1}));
+    let standing = standing(&json!({"a": 1}));
     let hash = standing.hash.clone();
     let full = reply(
         &Reply::Standing(Box::new(standing.clone())),
@@ -89,7 +89,7 @@ fn an_answer_has_the_members_of_the_contract_in_their_order() {
 
 #[test]
 fn a_notice_has_the_members_of_the_contract_in_their_order() {
-    let changed = a_notice(Some(json!({"a": 1})));
+    let changed = a_notice(Some(&json!({"a": 1})));
     let hash = changed.hash.clone().unwrap();
     let time = Timestamp::from_millis(NOW);
     assert_eq!(
@@ -133,7 +133,7 @@ fn a_secret_is_a_plain_text_or_redacted() {
 
 #[test]
 fn the_hash_is_the_same_in_both_forms_of_delivery() {
-    let standing = standing(json!({"pw": {"$secret": {"text": "canary", "version": 7}}}));
+    let standing = standing(&json!({"pw": {"$secret": {"text": "canary", "version": 7}}}));
     for delivery in [Delivery::Text, Delivery::Redacted] {
         let text = state_value(&standing, delivery, freshness()).unwrap();
         let value: Value = serde_json::from_str(&text).unwrap();
@@ -148,10 +148,10 @@ fn what_is_too_large_is_refused() {
     let fitting = "x".repeat(MAX_EFFECTIVE_BYTES - r#"{"a":""}"#.len());
     for (text, fits) in [(fitting.clone(), true), (format!("{fitting}x"), false)] {
         let config = json!({ "a": text });
-        let standing = standing(config.clone());
+        let standing = standing(&config);
         assert_eq!(state_value(&standing, Delivery::Text, freshness()).is_ok(), fits);
         let time = Timestamp::from_millis(NOW);
-        assert_eq!(notice(&a_notice(Some(config)), Delivery::Text, time).is_ok(), fits);
+        assert_eq!(notice(&a_notice(Some(&config)), Delivery::Text, time).is_ok(), fits);
         let answer = reply(
             &Reply::Standing(Box::new(standing)),
             Some("7f1c"),
