@@ -59,7 +59,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
 const OUTSIDE: &[(&str, &[&str])] = &[
     // The tests have a plain DDS program, which knows nothing of BlazeAIoT.
     ("rustdds", &["blaze-brokers", "blaze-tests"]),
-    ("axum", &["blaze-runtime", "blaze-flow", "blaze-config"]),
+    ("axum", &["blaze-runtime", "blaze-flow", "blaze-config", "blaze-worker"]),
     (
         "anyhow",
         &["blaze-runtime", "blaze-flow", "blaze-config", "blaze-worker", "blaze", "blaze-tests"],

@@ -8,10 +8,12 @@
 //!                          copy::Copies
 //! ```
 
+pub mod admin;
 pub mod copy;
 pub mod core;
 pub mod engine;
 pub mod lease;
+pub mod running;
 pub mod serve;
 pub mod settings;
 pub mod sync;

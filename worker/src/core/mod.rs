@@ -22,7 +22,7 @@ mod replica;
 mod served;
 mod stream;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod told;
 mod world;
 

@@ -196,6 +196,8 @@ impl Engine {
             tracing::error!(%error, "the copy is not used");
         }
         self.flush_at = Some(now);
+        // The one of the copies that is behind the other catches up.
+        self.keep(Changed::Keys(Vec::new()));
     }
 
     /// Works until `stop`.

@@ -1,5 +1,6 @@
 //! From a change to what services are told.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -70,23 +71,27 @@ impl Engine {
         } = self.served.flush(instant.into_std());
         self.counts.notices += notices.len() as u64;
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
-        for notice in &notices {
-            told.extend(self.of_notice(notice));
-            self.note(&notice.place, notice.revision, notice.hash.as_deref());
+        // First what goes: an instance that moves has the same key there.
+        for place in &untracked {
+            self.notes.forget(&at(place, &self.identity.site));
+            if self.keyed.remove(place) {
+                told.push(self.without_key(place));
+            }
         }
+        let is_gone = |notice: &&Notice| notice.hash.is_none();
+        for notice in notices.iter().filter(is_gone).chain(notices.iter().filter(|notice| !is_gone(notice))) {
+            told.extend(self.of_notice(notice));
+            if !untracked.contains(&notice.place) {
+                self.note(&notice.place, notice.revision, notice.hash.as_deref());
+            }
+        }
+        let noticed: BTreeSet<&Place> = notices.iter().map(|notice| &notice.place).collect();
         for place in &tracked {
             if let Some(standing) = self.served.standing_of(place) {
                 self.note(place, standing.revision, Some(&standing.hash));
-                if !notices.iter().any(|notice| notice.place == *place) {
+                if !noticed.contains(place) {
                     told.extend(self.of_standing(place, &standing));
                 }
-            }
-        }
-        for place in &untracked {
-            self.notes.forget(&at(place, &self.identity.site));
-            // With its notice, if there is one, its key goes already.
-            if self.keyed.remove(place) && !notices.iter().any(|notice| notice.place == *place) {
-                told.push(self.without_key(place));
             }
         }
         if !notices.is_empty() || !tracked.is_empty() || !untracked.is_empty() {

@@ -1,7 +1,7 @@
 //! Tells services what has changed, one after the other, and never twice what is old already: of what waits, only the newest
 //! of each place counts. A broker that is away holds up nobody; what waits then is bounded by the places that there are.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -45,72 +45,97 @@ pub struct SpeakerCounts {
     pub waiting: u64,
 }
 
+/// A notice that waits.
+struct Waiting {
+    /// The key that must be written no later.
+    key: Option<String>,
+    notice: (ChannelName, Bytes),
+}
+
 #[derive(Default)]
 struct State {
     /// All keys as they should be, to be written again when the server has lost them.
     wanted: BTreeMap<String, Bytes>,
+    /// Keys that are not as they should be; those that are not wanted are to go.
+    dirty: BTreeSet<String>,
     /// Places in the order in which they are told of; each stands here once.
     order: VecDeque<String>,
-    waiting: BTreeMap<String, Told>,
+    waiting: BTreeMap<String, Waiting>,
+}
+
+/// What is told at once.
+struct Batch {
+    keys: BTreeSet<String>,
+    waiting: Vec<(String, Waiting)>,
+}
+
+impl Batch {
+    fn is_empty(&self) -> bool {
+        self.keys.is_empty() && self.waiting.is_empty()
+    }
 }
 
 impl State {
     /// Takes in what is newer than what waits of the same place. Returns whether a notice gave way.
     fn put(&mut self, told: Told) -> bool {
-        if let Some((key, value)) = &told.key {
+        let Told { place, key, notice } = told;
+        let name = key.map(|(name, value)| {
             match value {
-                Some(value) => self.wanted.insert(key.clone(), value.clone()),
-                None => self.wanted.remove(key),
+                Some(value) => self.wanted.insert(name.clone(), value),
+                None => self.wanted.remove(&name),
             };
+            self.dirty.insert(name.clone());
+            name
+        });
+        let Some(notice) = notice else { return false };
+        let old = self.waiting.insert(place.clone(), Waiting { key: name, notice });
+        if old.is_none() {
+            self.order.push_back(place);
         }
-        let place = told.place.clone();
-        match self.waiting.insert(place.clone(), told) {
-            None => {
-                self.order.push_back(place);
-                false
-            }
-            Some(old) => {
-                let now = self.waiting.get_mut(&place);
-                let is_replaced = now.as_ref().is_some_and(|now| now.notice.is_some()) && old.notice.is_some();
-                if let Some(now) = now {
-                    now.notice = now.notice.take().or(old.notice);
-                    now.key = now.key.take().or(old.key);
-                }
-                is_replaced
-            }
-        }
+        old.is_some()
     }
 
-    fn take(&mut self) -> Vec<Told> {
+    fn take(&mut self) -> Batch {
         let count = self.order.len().min(BATCH);
         let places: Vec<String> = self.order.drain(..count).collect();
-        places.iter().filter_map(|place| self.waiting.remove(place)).collect()
+        let waiting = places.into_iter().filter_map(|place| self.waiting.remove_entry(&place));
+        let waiting: Vec<(String, Waiting)> = waiting.collect();
+        let of_places = waiting.iter().filter_map(|(_, waiting)| waiting.key.as_ref());
+        let mut keys: BTreeSet<String> = of_places.filter_map(|key| self.dirty.take(key)).collect();
+        while keys.len() < 2 * BATCH
+            && let Some(key) = self.dirty.pop_first()
+        {
+            keys.insert(key);
+        }
+        Batch { keys, waiting }
+    }
+
+    /// Keys as they should be now.
+    fn changes(&self, keys: &BTreeSet<String>) -> Vec<KeyChange> {
+        let change = |key: &String| match self.wanted.get(key) {
+            Some(value) => KeyChange::Put {
+                key: key.clone(),
+                value: value.clone(),
+            },
+            None => KeyChange::Delete { key: key.clone() },
+        };
+        keys.iter().map(change).collect()
     }
 
     /// What could not be told goes back to the front; what has come meanwhile is newer.
-    fn put_back(&mut self, batch: Vec<Told>) {
-        for told in batch.into_iter().rev() {
-            if let Some(now) = self.waiting.get_mut(&told.place) {
-                now.notice = now.notice.take().or(told.notice);
-                now.key = now.key.take().or(told.key);
-                continue;
+    fn put_back(&mut self, batch: Batch) {
+        self.dirty.extend(batch.keys);
+        for (place, waiting) in batch.waiting.into_iter().rev() {
+            if !self.waiting.contains_key(&place) {
+                self.order.push_front(place.clone());
+                self.waiting.insert(place, waiting);
             }
-            self.order.push_front(told.place.clone());
-            self.waiting.insert(told.place.clone(), told);
         }
     }
 
     /// All keys are to be written again.
     fn write_all(&mut self) {
-        let all: Vec<_> = self.wanted.iter().map(|(key, value)| (key.clone(), value.clone())).collect();
-        for (key, value) in all {
-            // A name of its own: it takes nothing from what waits of the place, and the value is the same.
-            self.put(Told {
-                place: format!("key {key}"),
-                key: Some((key, Some(value))),
-                notice: None,
-            });
-        }
+        self.dirty.extend(self.wanted.keys().cloned());
     }
 }
 
@@ -189,16 +214,20 @@ impl Speaker {
     async fn speak(&self, outlet: &dyn Outlet) {
         let mut pause = PAUSE.0;
         loop {
-            let batch = self.shared.state.lock().take();
+            let (batch, changes) = {
+                let mut state = self.shared.state.lock();
+                let batch = state.take();
+                let changes = match outlet.has_keys() {
+                    true => state.changes(&batch.keys),
+                    false => Vec::new(),
+                };
+                (batch, changes)
+            };
             if batch.is_empty() {
                 self.shared.more.notified().await;
                 continue;
             }
-            let changes: Vec<KeyChange> = match outlet.has_keys() {
-                true => batch.iter().filter_map(|told| told.key.as_ref().map(change)).collect(),
-                false => Vec::new(),
-            };
-            let messages: Vec<_> = batch.iter().filter_map(|told| told.notice.clone()).collect();
+            let messages: Vec<_> = batch.waiting.iter().map(|(_, waiting)| waiting.notice.clone()).collect();
             match outlet.deliver(&changes, &messages).await {
                 Ok(()) => {
                     pause = PAUSE.0;
@@ -214,16 +243,6 @@ impl Speaker {
                 }
             }
         }
-    }
-}
-
-fn change((key, value): &(String, Option<Bytes>)) -> KeyChange {
-    match value {
-        Some(value) => KeyChange::Put {
-            key: key.clone(),
-            value: value.clone(),
-        },
-        None => KeyChange::Delete { key: key.clone() },
     }
 }
 
@@ -350,7 +369,28 @@ mod tests {
         state.put(told("slam", "2"));
         state.put_back(batch);
         let left = state.take();
-        assert_eq!(left, [told("slam", "2")]);
+        let texts: Vec<_> = left.waiting.iter().map(|(_, waiting)| waiting.notice.1.clone()).collect();
+        assert_eq!(texts, ["2"]);
+        assert_eq!(state.changes(&left.keys).len(), 1);
         assert!(state.take().is_empty());
+    }
+
+    #[test]
+    fn of_two_places_with_one_key_the_last_word_counts() {
+        let mut state = State::default();
+        let moved = |place: &str, value: Option<&'static str>| Told {
+            key: Some(("blaze:config:slam:0".to_owned(), value.map(Bytes::from))),
+            ..told(place, "moved")
+        };
+        // The new place waits already when the old one goes and the new one changes again.
+        state.put(moved("slam-at-b", Some("1")));
+        state.put(moved("slam-at-a", None));
+        state.put(moved("slam-at-b", Some("2")));
+        let batch = state.take();
+        let put = KeyChange::Put {
+            key: "blaze:config:slam:0".to_owned(),
+            value: Bytes::from("2"),
+        };
+        assert_eq!(state.changes(&batch.keys), [put]);
     }
 }

@@ -37,7 +37,7 @@ const MAX_TOKEN_BYTES: u64 = 8192;
 const MAX_CA_BYTES: u64 = 1024 * 1024;
 
 /// Where the main service is and how it knows this worker. Files are read anew for each connection.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct MainService {
     /// `https://HOST:PORT`, or `http://` on this machine.
     pub server: String,

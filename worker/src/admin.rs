@@ -1,0 +1,189 @@
+//! What the admin port shows of a worker.
+
+use std::fmt::Write as _;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::http::StatusCode;
+use axum::response::{IntoResponse as _, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use blaze_runtime::{CheckStatus, Gate, Readiness};
+use parking_lot::Mutex;
+use serde_json::json;
+
+use crate::engine::Status;
+use crate::running::RunningWorker;
+
+/// Between two looks at the worker, for readiness and metrics.
+const LOOK: Duration = Duration::from_millis(500);
+/// Where configurations can come from.
+const SOURCES: [&str; 3] = ["main", "copy", "file"];
+
+/// The worker once it runs, and how it was at the last look.
+#[derive(Clone, Default)]
+pub struct Shown {
+    inner: Arc<Mutex<Inner>>,
+}
+
+#[derive(Default)]
+struct Inner {
+    worker: Option<Arc<RunningWorker>>,
+    status: Option<Status>,
+}
+
+impl Shown {
+    /// The worker runs.
+    pub fn set(&self, worker: Arc<RunningWorker>) {
+        self.inner.lock().worker = Some(worker);
+    }
+
+    fn worker(&self) -> Option<Arc<RunningWorker>> {
+        self.inner.lock().worker.clone()
+    }
+
+    /// The routes below `/v1`.
+    pub fn router(&self) -> Router {
+        Router::new().route("/v1/status", get(status)).with_state(self.clone())
+    }
+
+    /// Looks at the worker again and again, for readiness and metrics.
+    pub async fn look(self, readiness: Readiness) {
+        readiness.add("configuration", Gate::Decides, CheckStatus::Failed, "nothing is loaded yet");
+        readiness.add("main service", Gate::Shows, CheckStatus::Failed, "not connected yet");
+        readiness.add("mounted file", Gate::Shows, CheckStatus::Ok, "");
+        loop {
+            if let Some(worker) = self.worker()
+                && let Some(status) = worker.status().await
+            {
+                tell(&readiness, &status);
+                self.inner.lock().status = Some(status);
+            }
+            tokio::time::sleep(LOOK).await;
+        }
+    }
+
+    /// The numbers, as text.
+    #[must_use]
+    pub fn metrics(&self) -> String {
+        let (worker, status) = {
+            let inner = self.inner.lock();
+            (inner.worker.clone(), inner.status.clone())
+        };
+        let mut out = String::new();
+        if let (Some(worker), Some(status)) = (worker, status) {
+            write(&mut out, &worker, &status);
+        }
+        out
+    }
+}
+
+fn tell(readiness: &Readiness, status: &Status) {
+    let revision = format!("revision {}", status.revision);
+    match status.is_ready {
+        true => readiness.set("configuration", CheckStatus::Ok, revision.clone()),
+        false => readiness.set("configuration", CheckStatus::Failed, "nothing is loaded yet"),
+    }
+    match (status.in_sync, &status.reason) {
+        (true, _) => readiness.set("main service", CheckStatus::Ok, revision),
+        (false, Some(reason)) => readiness.set("main service", CheckStatus::Failed, reason.clone()),
+        (false, None) => readiness.set("main service", CheckStatus::Failed, "not in sync yet"),
+    }
+    match &status.defaults_problem {
+        Some(problem) => readiness.set("mounted file", CheckStatus::Failed, problem.clone()),
+        None => readiness.set("mounted file", CheckStatus::Ok, ""),
+    }
+}
+
+/// In the text format of Prometheus.
+fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
+    let mut one = |name: &str, kind: &str, help: &str, lines: &[(String, f64)]| {
+        // Writing to a text cannot fail.
+        let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} {kind}");
+        for (labels, value) in lines {
+            let _ = writeln!(out, "{name}{labels} {value}");
+        }
+    };
+    let plain = |value: f64| vec![(String::new(), value)];
+    let (json, speaker) = (&status.json, worker.speaker());
+    let connected = json["connected"].as_bool().unwrap_or_default();
+    one(
+        "blaze_worker_connected",
+        "gauge",
+        "1 while there is a stream from the main service.",
+        &plain(f64::from(u8::from(connected))),
+    );
+    one(
+        "blaze_worker_revision",
+        "gauge",
+        "Revision of what services get.",
+        &plain(status.revision as f64),
+    );
+    let age = json["age_s"].as_f64().unwrap_or(f64::NAN);
+    one(
+        "blaze_worker_age_seconds",
+        "gauge",
+        "Since the worker last knew itself in sync with the main service.",
+        &plain(age),
+    );
+    let source = json["source"].as_str();
+    let sources = SOURCES.map(|word| {
+        let is_it = f64::from(u8::from(source == Some(word)));
+        (format!("{{source=\"{word}\"}}"), is_it)
+    });
+    one("blaze_worker_source", "gauge", "1 for where configurations come from.", &sources);
+    one(
+        "blaze_worker_notices_total",
+        "counter",
+        "Notices that the broker has taken.",
+        &plain(speaker.notices as f64),
+    );
+    one(
+        "blaze_worker_notices_replaced_total",
+        "counter",
+        "Notices that gave way to newer ones of the same place before the broker took them.",
+        &plain(speaker.replaced as f64),
+    );
+    one(
+        "blaze_worker_notices_waiting",
+        "gauge",
+        "Places with a notice that the broker has not taken yet.",
+        &plain(speaker.waiting as f64),
+    );
+    let counts = status.counts;
+    let requests = [
+        ("answered", counts.answered),
+        ("refused", counts.refused),
+        ("left_to_others", counts.left_to_others),
+    ]
+    .map(|(result, count)| (format!("{{result=\"{result}\"}}"), count as f64));
+    one("blaze_worker_requests_total", "counter", "Requests for configurations by result.", &requests);
+    one(
+        "blaze_worker_sync_faults_total",
+        "counter",
+        "Streams that were begun anew because something was missing or different.",
+        &plain(counts.faults as f64),
+    );
+    let copies = worker.copies();
+    let of = |count: fn(&crate::copy::Counts) -> u64| -> Vec<(String, f64)> {
+        let label = |place: &str| format!("{{copy=\"{}\"}}", place.replace(['"', '\\', '\n'], "_"));
+        copies.iter().map(|copy| (label(&copy.place), count(copy) as f64)).collect()
+    };
+    one("blaze_worker_copy_writes_total", "counter", "Writes of a copy that were done.", &of(|copy| copy.written));
+    one("blaze_worker_copy_failures_total", "counter", "Writes of a copy that failed.", &of(|copy| copy.failed));
+}
+
+async fn status(State(shown): State<Shown>) -> Response {
+    let status = match shown.worker() {
+        Some(worker) => worker.status().await,
+        None => None,
+    };
+    match status {
+        Some(status) => Json(status.json).into_response(),
+        None => {
+            let body = json!({ "error": { "code": "not_ready", "detail": "the worker is starting or ending" } });
+            (StatusCode::SERVICE_UNAVAILABLE, Json(body)).into_response()
+        }
+    }
+}

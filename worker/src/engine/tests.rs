@@ -1,0 +1,421 @@
+//! The engine between a main service, a broker and a lease that the test plays.
+
+use async_trait::async_trait;
+use blaze_brokers::redis::KeyChange;
+use blaze_domain::config::Document;
+use serde_json::{Value, json};
+use tokio::task::JoinSet;
+
+use super::*;
+use crate::core::testing::document;
+use crate::core::{Edit, Incoming, Op};
+use crate::serve::{Outlet, OutletError};
+
+/// What services see.
+#[derive(Debug, Clone, PartialEq)]
+enum Seen {
+    Key(String, Option<Value>),
+    Notice(String, Value),
+}
+
+struct Board {
+    seen: mpsc::Sender<Seen>,
+}
+
+#[async_trait]
+impl Outlet for Board {
+    async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+        for change in changes {
+            let seen = match change {
+                KeyChange::Put { key, value } => Seen::Key(key.clone(), Some(parse(value))),
+                KeyChange::Delete { key } => Seen::Key(key.clone(), None),
+                KeyChange::PutRecord { .. } => panic!("the worker writes no records"),
+            };
+            self.seen.send(seen).await.unwrap();
+        }
+        for (channel, text) in messages {
+            self.seen.send(Seen::Notice(channel.to_string(), parse(text))).await.unwrap();
+        }
+        Ok(())
+    }
+
+    fn has_keys(&self) -> bool {
+        true
+    }
+
+    async fn keys_lost(&self) {
+        std::future::pending().await
+    }
+}
+
+struct Answers(mpsc::Sender<(String, Value)>);
+
+impl Replies for Answers {
+    fn reply(&self, to: &ChannelName, payload: Bytes) -> Result<(), String> {
+        self.0.try_send((to.to_string(), parse(&payload))).map_err(|error| error.to_string())
+    }
+
+    fn shared(&self) -> Option<ChannelName> {
+        None
+    }
+}
+
+fn parse(bytes: &[u8]) -> Value {
+    serde_json::from_slice(bytes).unwrap()
+}
+
+struct World {
+    sync: mpsc::Sender<SyncEvent>,
+    gets: mpsc::Sender<Bytes>,
+    leader: watch::Sender<bool>,
+    defaults: watch::Sender<defaults::Status>,
+    queries: mpsc::Sender<Query>,
+    answers: mpsc::Receiver<(String, Value)>,
+    seen: mpsc::Receiver<Seen>,
+    acks: watch::Receiver<Option<v1::Ack>>,
+    _tasks: JoinSet<()>,
+}
+
+fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
+    let (sync, sync_in) = mpsc::channel(64);
+    let (gets, gets_in) = mpsc::channel(64);
+    let (queries, queries_in) = mpsc::channel(64);
+    let (leader, leader_in) = watch::channel(is_leader);
+    let (defaults, defaults_in) = watch::channel(defaults::Status::default());
+    let (answer, answers) = mpsc::channel(64);
+    let (see, seen) = mpsc::channel(64);
+    let (acks_out, acks) = watch::channel(None);
+    let identity = Identity {
+        site: Site {
+            layer: "edge".parse().unwrap(),
+            node: Some("robot-1".parse().unwrap()),
+        },
+        node: None,
+        worker_id: "w-1".to_owned(),
+        delivery: Delivery::Text,
+    };
+    let speaker = Speaker::default();
+    let outputs = Outputs {
+        replies: Arc::new(Answers(answer)),
+        speaker: speaker.clone(),
+        copies: None,
+        acks: acks_out,
+    };
+    let inputs = Inputs {
+        sync: sync_in,
+        gets: gets_in,
+        defaults: defaults_in,
+        leader: leader_in,
+        queries: queries_in,
+    };
+    let mut tasks = JoinSet::new();
+    tasks.spawn(speaker.run(Arc::new(Board { seen: see })));
+    tasks.spawn(Engine::new(identity, outputs, start).run(inputs, CancellationToken::new()));
+    World {
+        sync,
+        gets,
+        leader,
+        defaults,
+        queries,
+        answers,
+        seen,
+        acks,
+        _tasks: tasks,
+    }
+}
+
+fn world() -> World {
+    world_from(None, true)
+}
+
+fn documents(rate: u64) -> Vec<Document> {
+    vec![
+        document("Layer/edge", 1, json!({ "kind": "edge", "config": { "log": "info" } })),
+        document("Node/robot-1", 1, json!({ "layer": "edge" })),
+        document("Service/nav", 1, json!({ "config": { "speed": 1 } })),
+        document("Service/slam", 2, json!({ "config": { "rate_hz": rate } })),
+    ]
+}
+
+fn commit(revision: u64, previous: u64, edits: Vec<(Op, Document)>) -> Incoming {
+    let edits = edits.into_iter().map(|(op, document)| Edit { op, document });
+    Incoming::Commit {
+        revision,
+        previous,
+        time: Timestamp::default(),
+        subject: "ops".to_owned(),
+        edits: edits.collect(),
+    }
+}
+
+impl World {
+    async fn says(&self, incoming: Incoming) {
+        self.sync.send(SyncEvent::Said(incoming)).await.unwrap();
+    }
+
+    /// The main service accepts the worker and tells all it has.
+    async fn opens(&self, documents: Vec<Document>, revision: u64) -> CancellationToken {
+        let stream = CancellationToken::new();
+        self.sync.send(SyncEvent::Opened(stream.clone())).await.unwrap();
+        self.says(Incoming::Welcome {
+            protocol: 1,
+            store_id: "s".to_owned(),
+            revision,
+            resumed: false,
+        })
+        .await;
+        self.says(Incoming::Snapshot {
+            revision,
+            documents,
+            last: true,
+        })
+        .await;
+        stream
+    }
+
+    async fn hello(&self) -> v1::Hello {
+        let (send, hello) = oneshot::channel();
+        self.sync.send(SyncEvent::Greeting(send)).await.unwrap();
+        hello.await.unwrap()
+    }
+
+    async fn asks(&mut self, request: Value) -> Value {
+        self.gets.send(Bytes::from(request.to_string())).await.unwrap();
+        let answer = tokio::time::timeout(Duration::from_secs(10), self.answers.recv()).await;
+        let (to, answer) = answer.expect("an answer within 10 s").unwrap();
+        assert_eq!(to, "blaze/reply/t");
+        answer
+    }
+
+    async fn slam(&mut self) -> Value {
+        self.asks(json!({ "id": "1", "service": "slam", "instance": "0", "reply_to": "blaze/reply/t" }))
+            .await
+    }
+
+    async fn notice(&mut self) -> (String, Value) {
+        let wait = async {
+            loop {
+                if let Some(Seen::Notice(channel, text)) = self.seen.recv().await {
+                    return (channel, text);
+                }
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(10), wait).await.expect("a notice within 10 s")
+    }
+
+    /// Everything that has been told by now, and by then.
+    async fn rest(&mut self) -> Vec<Seen> {
+        tokio::time::sleep(Duration::from_secs(5)).await;
+        let mut out = Vec::new();
+        while let Ok(seen) = self.seen.try_recv() {
+            out.push(seen);
+        }
+        out
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
+    let mut w = world();
+    assert_eq!(w.slam().await["error"]["code"], "not_ready");
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    let answer = w.slam().await;
+    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(30), &json!("main")));
+    assert_eq!((&answer["node"], &answer["revision"]), (&json!("robot-1"), &json!(2)));
+    w.rest().await;
+
+    let changed = document("Service/slam", 3, json!({ "config": { "rate_hz": 10 } }));
+    w.says(commit(3, 2, vec![(Op::Update, changed)])).await;
+    let told = w.rest().await;
+    let notices: Vec<_> = told.iter().filter(|seen| matches!(seen, Seen::Notice(..))).collect();
+    assert_eq!(notices.len(), 2, "the instance that asked, and the service without one: {told:?}");
+    for seen in notices {
+        let Seen::Notice(channel, notice) = seen else { unreachable!() };
+        assert_eq!(channel, "blaze/config/changed/slam");
+        assert_eq!((&notice["paths"], &notice["scopes"]), (&json!(["/rate_hz"]), &json!(["service"])));
+        assert_eq!((&notice["config"]["rate_hz"], &notice["revision"]), (&json!(10), &json!(3)));
+        assert_eq!(notice["config"]["log"], "info");
+    }
+    let keys: Vec<&str> = told
+        .iter()
+        .filter_map(|seen| match seen {
+            Seen::Key(key, Some(value)) => {
+                assert_eq!(value["config"]["rate_hz"], 10);
+                Some(key.as_str())
+            }
+            Seen::Key(_, None) | Seen::Notice(..) => None,
+        })
+        .collect();
+    assert_eq!(keys, ["blaze:config:slam", "blaze:config:slam:0"]);
+
+    // A new revision that says the same is told to nobody.
+    let same = document("Service/slam", 4, json!({ "config": { "rate_hz": 10 }, "description": "new" }));
+    w.says(commit(4, 3, vec![(Op::Update, same)])).await;
+    assert_eq!(w.rest().await, []);
+    assert_eq!(w.slam().await["revision"], 3);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_comes_together_is_told_once_and_the_last_state_always() {
+    let mut w = world();
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    for revision in 3..53 {
+        let changed = document("Service/slam", revision, json!({ "config": { "rate_hz": revision } }));
+        w.says(commit(revision, revision - 1, vec![(Op::Update, changed)])).await;
+    }
+    let told = w.rest().await;
+    let rates: Vec<u64> = told
+        .iter()
+        .filter_map(|seen| match seen {
+            Seen::Notice(_, notice) => notice["config"]["rate_hz"].as_u64(),
+            Seen::Key(..) => None,
+        })
+        .collect();
+    assert_eq!(rates.last(), Some(&52));
+    assert!(rates.len() < 50 && rates.is_sorted(), "{rates:?}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_is_missing_is_asked_for_anew_and_services_keep_what_they_have() {
+    let mut w = world();
+    let stream = w.opens(documents(30), 2).await;
+    w.rest().await;
+    let later = document("Service/slam", 9, json!({ "config": { "rate_hz": 1 } }));
+    w.says(commit(9, 7, vec![(Op::Update, later)])).await;
+    tokio::time::timeout(Duration::from_secs(10), stream.cancelled()).await.unwrap();
+    assert_eq!(w.slam().await["config"]["rate_hz"], 30);
+    let closed = SyncEvent::Closed {
+        reason: "begins anew".to_owned(),
+    };
+    w.sync.send(closed).await.unwrap();
+    let hello = w.hello().await;
+    assert_eq!((hello.revision, hello.store_id.as_str()), (0, ""));
+    assert_eq!((hello.layer.as_str(), hello.node.as_str()), ("edge", "robot-1"));
+    assert_eq!(w.slam().await["source"], "copy");
+    // What nothing is missing of is gone on from.
+    w.opens(documents(5), 9).await;
+    w.rest().await;
+    assert_eq!(w.slam().await["config"]["rate_hz"], 5);
+    let hello = w.hello().await;
+    assert_eq!((hello.revision, hello.store_id.as_str()), (9, "s"));
+    assert!(hello.digest.starts_with("sha256:"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_main_service_is_told_what_is_here() {
+    let mut w = world();
+    w.opens(documents(30), 2).await;
+    let ack = w.acks.wait_for(Option::is_some).await.unwrap().clone().unwrap();
+    assert_eq!(ack.revision, 2);
+    let (send, status) = oneshot::channel();
+    w.queries.send(Query::Status(send)).await.unwrap();
+    let status = status.await.unwrap();
+    assert_eq!(status.json["digest"], ack.digest);
+    assert_eq!((&status.json["connected"], &status.json["leader"]), (&json!(true), &json!(true)));
+    assert!(status.is_ready && status.in_sync);
+}
+
+#[tokio::test(start_paused = true)]
+async fn only_the_leader_answers_and_a_new_one_tells_what_the_last_may_have_left() {
+    let mut w = world_from(None, false);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    let changed = document("Service/slam", 3, json!({ "config": { "rate_hz": 10 } }));
+    w.says(commit(3, 2, vec![(Op::Update, changed)])).await;
+    let request = json!({ "id": "1", "service": "slam", "reply_to": "blaze/reply/t" });
+    w.gets.send(Bytes::from(request.to_string())).await.unwrap();
+    assert_eq!(w.rest().await, []);
+    assert!(w.answers.try_recv().is_err());
+    w.leader.send_replace(true);
+    let (channel, notice) = loop {
+        let (channel, notice) = w.notice().await;
+        if notice["revision"] == 3 {
+            break (channel, notice);
+        }
+    };
+    assert_eq!(channel, "blaze/config/changed/slam");
+    assert_eq!(notice["config"]["rate_hz"], 10);
+    assert_eq!(w.slam().await["config"]["rate_hz"], 10);
+}
+
+#[tokio::test(start_paused = true)]
+async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
+    let mut w = world();
+    let file = |rate| {
+        let documents = documents(rate).into_iter().map(|document| Arc::new(Document { revision: 0, ..document }));
+        defaults::Status {
+            current: Some(Arc::new(defaults::Defaults {
+                documents: documents.collect(),
+                as_of: Timestamp::default(),
+                left_out: 0,
+                rollouts: 0,
+            })),
+            problem: None,
+        }
+    };
+    w.defaults.send_replace(file(1));
+    w.rest().await;
+    let answer = w.slam().await;
+    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(1), &json!("file")));
+    w.defaults.send_replace(file(2));
+    w.rest().await;
+    assert_eq!(w.slam().await["config"]["rate_hz"], 2);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.defaults.send_replace(file(3));
+    w.rest().await;
+    let closed = SyncEvent::Closed {
+        reason: "away".to_owned(),
+    };
+    w.sync.send(closed).await.unwrap();
+    let answer = w.slam().await;
+    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(30), &json!("copy")));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_new_life_serves_what_the_last_one_had_and_tells_only_what_differs() {
+    let mut notes = Notes::default();
+    let (told, mut w) = {
+        let mut w = world();
+        w.opens(documents(30), 2).await;
+        w.rest().await;
+        (w.slam().await, w)
+    };
+    w.rest().await;
+    drop(w);
+    notes.tell(
+        blaze_domain::config::effective::At {
+            service: Some("slam".parse().unwrap()),
+            instance: Some("0".parse().unwrap()),
+            layer: Some("edge".parse().unwrap()),
+            node: Some("robot-1".parse().unwrap()),
+        },
+        crate::copy::Told {
+            revision: told["revision"].as_u64().unwrap(),
+            hash: told["hash"].as_str().map(Arc::from),
+        },
+    );
+    let loaded = Loaded {
+        position: Position {
+            store_id: "s".to_owned(),
+            layer: "edge".parse().unwrap(),
+            revision: 2,
+            as_of: Timestamp::from_millis(1_000),
+        },
+        documents: documents(30).into_iter().map(Arc::new).collect(),
+        notes: Arc::new(notes),
+    };
+    let mut w = world_from(Some(loaded), true);
+    let answer = w.slam().await;
+    assert_eq!((&answer["config"], &answer["source"]), (&told["config"], &json!("copy")));
+    assert_eq!(answer["as_of"], "1970-01-01T00:00:01.000Z");
+    let hello = w.hello().await;
+    assert_eq!((hello.revision, hello.store_id.as_str()), (2, "s"));
+    let of_slam_0 = |seen: &Seen| matches!(seen, Seen::Notice(_, notice) if notice["instance"] == "0");
+    assert!(!w.rest().await.iter().any(of_slam_0), "it was told already");
+    w.opens(documents(10), 5).await;
+    let told = w.rest().await;
+    assert_eq!(told.iter().filter(|seen| of_slam_0(seen)).count(), 1, "{told:?}");
+}

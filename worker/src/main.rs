@@ -1,0 +1,247 @@
+//! The BlazeConfig worker's process: parse, build, run.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use blaze_brokers::memory::MemoryHub;
+use blaze_brokers::redis::RedisKeys;
+use blaze_brokers::{Broker, OpenError, Role, check_layer, open_layer, open_node};
+use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
+use blaze_runtime::admin::{AdminServer, CheckStatus, Readiness};
+use blaze_runtime::config::{Current, Loaded, Schema, Sources, WatchSettings, load_typed, parse_override, watch};
+use blaze_runtime::logs::{LogFormat, LogHandle};
+use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
+use blaze_runtime::{logs, ready_line, say, state};
+use blaze_worker::admin::Shown;
+use blaze_worker::lease::{Lease, RedisLease};
+use blaze_worker::running::{RunningWorker, WorkerOptions};
+use blaze_worker::settings::{LocalBroker, WorkerSettings};
+use clap::Parser;
+
+/// A shutdown takes at most this long.
+const SHUTDOWN: Duration = Duration::from_secs(5);
+
+/// BlazeConfig's worker: every service of a node or layer has its configuration, also when the main service is gone.
+#[derive(Parser)]
+#[command(name = "blaze-worker", version)]
+struct Arguments {
+    /// The node file; else BLAZE_CONFIG, ./blaze.yaml, /etc/blaze/blaze.yaml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Only check the configuration: every fault on stderr, exit code 0 or 64.
+    #[arg(long)]
+    check: bool,
+    /// text or json; else as the node file says.
+    #[arg(long, value_name = "FORMAT", value_parser = ["text", "json"])]
+    log_format: Option<String>,
+    /// Overrides one key, as worker.lease_ms=2000; may be repeated.
+    #[arg(long, value_name = "KEY=VALUE", value_parser = parse_override)]
+    set: Vec<(String, String)>,
+}
+
+fn main() -> ExitCode {
+    let mut arguments = Arguments::parse();
+    let mut overrides = std::mem::take(&mut arguments.set);
+    if let Some(format) = &arguments.log_format {
+        overrides.push(("log.format".to_owned(), format.clone()));
+    }
+    let sources = Sources::of_process(arguments.config, overrides);
+    let loaded = match load_typed(&sources, &schema()) {
+        Ok(loaded) => loaded,
+        Err(faults) => {
+            faults.iter().for_each(|fault| say(format_args!("{fault}")));
+            return ExitCode::from(exit_code::CONFIGURATION);
+        }
+    };
+    for warning in &loaded.warnings {
+        say(format_args!("warning: {warning}"));
+    }
+    if arguments.check {
+        return ExitCode::SUCCESS;
+    }
+    match block_on(run(sources.pinned(), loaded)) {
+        Ok(code) => code,
+        Err(error) => {
+            say(format_args!("blaze-worker failed: {error}"));
+            ExitCode::from(exit_code::FAILED)
+        }
+    }
+}
+
+/// The node file as this program reads it.
+fn schema() -> Schema<NodeFile> {
+    let remark = |fault: Fault| (fault.path, fault.detail);
+    Arc::new(move |value| match NodeFile::read(value) {
+        Ok((file, warnings)) => {
+            let mut faults = WorkerSettings::of(&file).err().unwrap_or_default();
+            faults.extend(broker_fault(&file));
+            if faults.is_empty() {
+                Ok((file, warnings.into_iter().map(remark).collect()))
+            } else {
+                Err(faults.into_iter().map(remark).collect())
+            }
+        }
+        Err(faults) => Err(faults.into_iter().map(remark).collect()),
+    })
+}
+
+/// What the adapter has against the section of the layer scope. What was not built in is told at the start.
+fn broker_fault(file: &NodeFile) -> Option<Fault> {
+    match check_layer(file.brokers.layer.as_ref()?) {
+        Err(OpenError::Setting { key, reason }) => Some(Fault {
+            path: format!("brokers.layer.{key}"),
+            detail: reason,
+        }),
+        Ok(()) | Err(OpenError::NotBuilt { .. } | OpenError::InProcess) => None,
+    }
+}
+
+async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
+    let supervisor = Supervisor::new("blaze-worker");
+    match start(&supervisor, sources, loaded).await {
+        Ok((worker, readiness)) => {
+            let steps = ShutdownSteps::new(SHUTDOWN)
+                .on(ShutdownPhase::NotReady, "readiness", async move { readiness.stop() })
+                .on(ShutdownPhase::Drain, "worker", async move { worker.drain().await });
+            supervisor.run(steps).await
+        }
+        Err(error) => {
+            say(format_args!("blaze-worker failed: {error:#}"));
+            ExitCode::from(exit_code::FAILED)
+        }
+    }
+}
+
+async fn start(
+    supervisor: &Supervisor,
+    sources: Sources,
+    loaded: Loaded<NodeFile>,
+) -> anyhow::Result<(Arc<RunningWorker>, Readiness)> {
+    let file = &loaded.value;
+    let format = if file.log.format.as_str() == "json" {
+        LogFormat::Json
+    } else {
+        LogFormat::Text
+    };
+    let log = logs::init(file.log.level.as_str(), format)?;
+    let settings = WorkerSettings::of(file).map_err(|faults| {
+        let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
+        anyhow::anyhow!(lines.join("; "))
+    })?;
+    let (readiness, shown) = (Readiness::new(), Shown::default());
+    let numbers = shown.clone();
+    let metrics = Arc::new(move || numbers.metrics());
+    let admin = AdminServer::bind(file.admin.worker, shown.router(), readiness.clone(), metrics).await?;
+    let address = admin.address();
+    admin.serve(supervisor);
+    spawn(supervisor, "look", shown.clone().look(readiness.clone()));
+    let worker = Arc::new(begin(settings, file, supervisor).await?);
+    shown.set(Arc::clone(&worker));
+    let started = file.clone();
+    let reloads = watch(supervisor, sources, schema(), loaded, WatchSettings::default());
+    let (reloaded, ready) = (Arc::clone(&worker), readiness.clone());
+    let follow = follow(reloaded, started, reloads, log, readiness.clone());
+    supervisor.spawn("reload", TaskPolicy::Essential, follow);
+    spawn(supervisor, "ready line", async move {
+        ready.ready().await;
+        // Without a reader of stdout there is nobody to tell.
+        let _ = ready_line(&[("admin", address)]);
+    });
+    Ok((worker, readiness))
+}
+
+fn spawn(supervisor: &Supervisor, name: &str, task: impl Future<Output = ()> + Send + 'static) {
+    let stop = supervisor.stopping_token();
+    supervisor.spawn(name, TaskPolicy::MayEnd, async move {
+        tokio::select! {
+            () = task => {}
+            () = stop.cancelled() => {}
+        }
+    });
+}
+
+async fn begin(settings: WorkerSettings, file: &NodeFile, supervisor: &Supervisor) -> anyhow::Result<RunningWorker> {
+    let broker: Arc<dyn Broker> = match &settings.broker {
+        LocalBroker::Node(NodeBroker::Memory) | LocalBroker::Layer(LayerBroker::Memory) => {
+            Arc::new(MemoryHub::new(settings.site.layer.to_string()).broker())
+        }
+        LocalBroker::Node(section) => open_node(section, &Role::Service).context("brokers.node")?,
+        LocalBroker::Layer(section) => open_layer(section, &Role::Service).context("brokers.layer")?,
+    };
+    let keys = settings.keys.as_ref().map(RedisKeys::open).transpose();
+    let keys = keys.context("cache")?.map(Arc::new);
+    let directory = state::state_directory(file.state_dir.as_deref())?;
+    let life: u32 = rand::random();
+    let worker_id = format!("{}-{life:08x}", settings.node);
+    // On the broker of a node there is one worker; on that of a layer there may be several.
+    let lease = match (&settings.site.node, &keys) {
+        (None, Some(keys)) => {
+            let lease: Arc<dyn Lease> =
+                Arc::new(RedisLease::new(Arc::clone(keys), &settings.site.layer, worker_id.clone()));
+            Some(lease)
+        }
+        (Some(_), _) | (None, None) => None,
+    };
+    let options = WorkerOptions {
+        folder: Some(settings.copy_folder(&directory.path)),
+        settings,
+        broker,
+        keys,
+        lease,
+        worker_id,
+    };
+    RunningWorker::start(options, supervisor).await
+}
+
+/// What is said of a file that was reloaded in part.
+const WAITS: &str = "the node file has changes that need a restart";
+
+/// Takes over what may change while the process runs; a faulty file changes nothing and shows on `/readyz`.
+async fn follow(
+    worker: Arc<RunningWorker>,
+    started: NodeFile,
+    mut reloads: tokio::sync::watch::Receiver<Current<NodeFile>>,
+    log: LogHandle,
+    readiness: Readiness,
+) {
+    while reloads.changed().await.is_ok() {
+        let current = reloads.borrow_and_update().clone();
+        match &current.faults {
+            Some(faults) => {
+                for fault in faults.iter() {
+                    tracing::error!("{fault}");
+                }
+                let first = faults.first().map(ToString::to_string).unwrap_or_default();
+                readiness.set("config", CheckStatus::Failed, first);
+            }
+            None => {
+                let file = &current.loaded.value;
+                if let Ok(WorkerSettings { main: Some(main), .. }) = WorkerSettings::of(file) {
+                    worker.set_main(main);
+                }
+                if let Err(error) = log.set_level(file.log.level.as_str()) {
+                    tracing::error!(%error, "log.level");
+                }
+                let waits = needs_restart(&started, file);
+                if waits {
+                    tracing::warn!("{WAITS}");
+                }
+                readiness.set("config", CheckStatus::Ok, if waits { WAITS } else { "" });
+            }
+        }
+    }
+}
+
+/// Whether a file differs from the one of the start in more than what changes while the process runs.
+fn needs_restart(started: &NodeFile, file: &NodeFile) -> bool {
+    let (Ok(mut before), Ok(mut after)) = (WorkerSettings::of(started), WorkerSettings::of(file)) else {
+        return true;
+    };
+    if before.main.is_some() && after.main.is_some() {
+        (before.main, after.main) = (None, None);
+    }
+    before != after || started.admin.worker != file.admin.worker || started.state_dir != file.state_dir
+}

@@ -1,0 +1,340 @@
+//! A worker put together: what it starts, in which order, and how it ends.
+//!
+//! ```text
+//! key ─▶ copies (database, file) ─▶ what to serve first ─▶ engine ─▶ stream, broker, lease, mounted file
+//! end: copies hold what was stored ─▶ lease given up
+//! ```
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use blaze_brokers::redis::RedisKeys;
+use blaze_brokers::{Broker, BrokerKind, Content, SubscribeOptions};
+use blaze_domain::names::ChannelName;
+use blaze_domain::node_file::DatabaseSection;
+use blaze_runtime::{Supervisor, TaskPolicy};
+use bytes::Bytes;
+use tokio::sync::{mpsc, oneshot, watch};
+
+use crate::copy::{
+    Copies, Counts as CopyCounts, DATABASE_LIMIT, DATABASE_NAME, FileCopy, LocalCopy, Notes, SqliteCopy, Start, Target,
+    Vault, choose, defaults,
+};
+use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Status};
+use crate::lease::{self, Lease};
+use crate::serve::{BrokerOutlet, Speaker, SpeakerCounts};
+use crate::settings::WorkerSettings;
+use crate::sync::{MainService, follow};
+
+/// Where services ask.
+const GET: &str = "blaze/config/get";
+/// Requests that wait for the engine.
+const REQUESTS: SubscribeOptions = SubscribeOptions {
+    max_messages: 4096,
+    max_bytes: 16 * 1024 * 1024,
+    large: false,
+    with_kept: false,
+};
+/// Between two tries to listen on a broker that is away.
+const LISTEN_AGAIN: Duration = Duration::from_millis(200);
+/// Between two looks at the mounted file.
+const LOOK_AT_FILE: Duration = Duration::from_millis(500);
+/// How long the end waits for the copies.
+const KEEP_WITHIN: Duration = Duration::from_secs(2);
+
+/// What a worker is made of.
+pub struct WorkerOptions {
+    /// What it does.
+    pub settings: WorkerSettings,
+    /// The broker that services are on.
+    pub broker: Arc<dyn Broker>,
+    /// Where keys go.
+    pub keys: Option<Arc<RedisKeys>>,
+    /// Folder of the copies; it is made if it is not there. `None`: nothing is kept.
+    pub folder: Option<PathBuf>,
+    /// The lease of its layer; `None`: it is alone.
+    pub lease: Option<Arc<dyn Lease>>,
+    /// Its name among the workers of the layer.
+    pub worker_id: String,
+}
+
+/// A worker that runs until its supervisor ends.
+pub struct RunningWorker {
+    queries: mpsc::Sender<Query>,
+    speaker: Speaker,
+    copies: Option<Copies>,
+    lease: Option<Arc<dyn Lease>>,
+    main: watch::Sender<MainService>,
+}
+
+impl RunningWorker {
+    /// Starts it. It waits for nobody but, shortly, for its own copies.
+    ///
+    /// # Errors
+    /// A file or folder that it cannot work with.
+    pub async fn start(options: WorkerOptions, supervisor: &Supervisor) -> anyhow::Result<Self> {
+        let WorkerOptions {
+            settings,
+            broker,
+            keys,
+            folder,
+            lease,
+            worker_id,
+        } = options;
+        let vault = Vault::load(settings.key_file.as_deref()).context("worker.key_file")?;
+        let kept = Kept::open(&settings, folder, &vault, supervisor).await?;
+        let (copies, start) = kept.begin(supervisor).await;
+        if let Some(from) = &start.from {
+            tracing::info!(from, "services get their last configuration");
+        }
+        let speaker = Speaker::default();
+        let mut outlet = BrokerOutlet::new(Arc::clone(&broker));
+        if let Some(keys) = keys {
+            outlet = outlet.with_keys(keys, settings.keys_on_broker());
+        }
+        let outlet = Arc::new(outlet);
+        let (acks, acked) = watch::channel(None);
+        let (queries, asked) = mpsc::channel(QUEUE);
+        let (events, sync) = mpsc::channel(QUEUE);
+        let (requests, gets) = mpsc::channel(QUEUE);
+        let (lead, leader) = watch::channel(lease.is_none());
+        let defaults = match &settings.defaults_file {
+            Some(path) => {
+                defaults::watch_file(supervisor, path.clone(), settings.site.layer.clone(), LOOK_AT_FILE)
+            }
+            None => watch::channel(defaults::Status::default()).1,
+        };
+        let identity = Identity {
+            site: settings.site.clone(),
+            node: Some(settings.node.clone()),
+            worker_id,
+            delivery: settings.delivery,
+        };
+        let outputs = Outputs {
+            replies: Arc::new(BrokerReplies::new(Arc::clone(&outlet), broker.kind())),
+            speaker: speaker.clone(),
+            copies: copies.clone(),
+            acks,
+        };
+        let inputs = Inputs {
+            sync,
+            gets,
+            defaults,
+            leader,
+            queries: asked,
+        };
+        let stop = supervisor.shutdown_token();
+        let spawn = |name: &str, task: futures::future::BoxFuture<'static, ()>| {
+            let stop = stop.clone();
+            supervisor.spawn(name, TaskPolicy::Essential, async move {
+                tokio::select! {
+                    () = task => {}
+                    () = stop.cancelled() => {}
+                }
+            });
+        };
+        let engine = Engine::new(identity, outputs, start.loaded);
+        spawn("engine", Box::pin(engine.run(inputs, stop.clone())));
+        spawn("notices", Box::pin(speaker.clone().run(outlet)));
+        spawn("requests", Box::pin(listen(broker, requests)));
+        if let Some(lease) = &lease {
+            spawn("lease", Box::pin(lease::keep(Arc::clone(lease), settings.lease, lead)));
+        }
+        let main = settings.main.clone();
+        let (main_sender, main_receiver) = watch::channel(main.clone().unwrap_or_default());
+        if main.is_some() {
+            spawn("stream", Box::pin(follow(main_receiver, events, acked, stop.clone())));
+        }
+        Ok(Self {
+            queries,
+            speaker,
+            copies,
+            lease,
+            main: main_sender,
+        })
+    }
+
+    /// How it is; `None` if it has ended.
+    pub async fn status(&self) -> Option<Status> {
+        let (send, answer) = oneshot::channel();
+        self.queries.send(Query::Status(send)).await.ok()?;
+        answer.await.ok()
+    }
+
+    /// What became of notices and keys.
+    #[must_use]
+    pub fn speaker(&self) -> SpeakerCounts {
+        self.speaker.counts()
+    }
+
+    /// What became of the copies.
+    #[must_use]
+    pub fn copies(&self) -> Vec<CopyCounts> {
+        self.copies.as_ref().map(Copies::counts).unwrap_or_default()
+    }
+
+    /// The main service is elsewhere from now on.
+    pub fn set_main(&self, main: MainService) {
+        self.main.send_if_modified(|now| std::mem::replace(now, main.clone()) != main);
+    }
+
+    /// Leaves everything as the next life wants to find it: copies that are up to date, no lease.
+    pub async fn drain(&self) {
+        if let Some(copies) = &self.copies
+            && !copies.flush(KEEP_WITHIN).await
+        {
+            tracing::warn!("a copy is behind; the next start gets the rest from the other one or the main service");
+        }
+        if let Some(lease) = &self.lease {
+            lease.release().await;
+        }
+    }
+}
+
+/// Where copies are kept.
+struct Kept {
+    database: Option<Arc<dyn LocalCopy>>,
+    file: Option<Arc<dyn LocalCopy>>,
+}
+
+impl Kept {
+    async fn open(
+        settings: &WorkerSettings,
+        folder: Option<PathBuf>,
+        vault: &Vault,
+        supervisor: &Supervisor,
+    ) -> anyhow::Result<Self> {
+        let layer = &settings.site.layer;
+        if let Some(folder) = &folder {
+            make_folder(folder).await?;
+        }
+        let sqlite = |path: PathBuf| -> anyhow::Result<Arc<dyn LocalCopy>> {
+            let copy = SqliteCopy::new(path, layer.clone(), vault.clone(), supervisor)?;
+            Ok(Arc::new(copy))
+        };
+        let database = match (&settings.database, &folder) {
+            (Some(DatabaseSection::Embedded { path }), _) => {
+                make_folder(path).await?;
+                Some(sqlite(path.join(DATABASE_NAME)).context("database.embedded")?)
+            }
+            (Some(DatabaseSection::MongoDb { uri, database }), _) => {
+                Some(mongodb(uri.clone(), database, settings, vault).context("database.mongodb")?)
+            }
+            (None, Some(folder)) => Some(sqlite(folder.join(DATABASE_NAME)).context("the copy")?),
+            (None, None) => None,
+        };
+        let file = folder.map(|folder| -> Arc<dyn LocalCopy> {
+            Arc::new(FileCopy::new(&folder, layer.clone(), vault.clone()))
+        });
+        Ok(Self { database, file })
+    }
+
+    /// Reads what is there and keeps it up to date from now on.
+    async fn begin(self, supervisor: &Supervisor) -> (Option<Copies>, Start) {
+        let start = choose(self.database.as_ref(), self.file.as_ref(), DATABASE_LIMIT).await;
+        let notes = start.loaded.as_ref().map(|loaded| Arc::clone(&loaded.notes));
+        let current = [start.is_database_current, start.is_file_current];
+        let targets = [self.database, self.file].into_iter().zip(current);
+        let targets: Vec<Target> = targets
+            .filter_map(|(copy, is_current)| Some(Target { copy: copy?, is_current }))
+            .collect();
+        if targets.is_empty() {
+            return (None, start);
+        }
+        let notes = notes.unwrap_or_else(|| Arc::new(Notes::default()));
+        (Some(Copies::start(supervisor, targets, &notes)), start)
+    }
+}
+
+#[cfg(feature = "mongodb")]
+fn mongodb(
+    uri: blaze_domain::node_file::SecretText,
+    database: &str,
+    settings: &WorkerSettings,
+    vault: &Vault,
+) -> anyhow::Result<Arc<dyn LocalCopy>> {
+    let (layer, node) = (settings.site.layer.clone(), settings.site.node.as_ref());
+    let copy = crate::copy::MongoCopy::new(uri, database, layer, node, vault.clone())?;
+    Ok(Arc::new(copy))
+}
+
+#[cfg(not(feature = "mongodb"))]
+fn mongodb(
+    _uri: blaze_domain::node_file::SecretText,
+    _database: &str,
+    _settings: &WorkerSettings,
+    _vault: &Vault,
+) -> anyhow::Result<Arc<dyn LocalCopy>> {
+    anyhow::bail!("this program was built without MongoDB (cargo feature `mongodb`)")
+}
+
+/// For its owner alone: what is in it says how the whole layer is configured.
+async fn make_folder(path: &std::path::Path) -> anyhow::Result<()> {
+    tokio::fs::DirBuilder::new()
+        .recursive(true)
+        .mode(0o700)
+        .create(path)
+        .await
+        .with_context(|| format!("{}", path.display()))
+}
+
+/// Hands on what services ask, for ever.
+async fn listen(broker: Arc<dyn Broker>, requests: mpsc::Sender<Bytes>) {
+    // It is a good name.
+    let Ok(channel) = GET.parse::<ChannelName>() else { return };
+    loop {
+        let mut subscription = match broker.subscribe(&channel, REQUESTS).await {
+            Ok(subscription) => subscription,
+            Err(error) => {
+                tracing::debug!(%error, "nobody can ask yet");
+                tokio::time::sleep(LISTEN_AGAIN).await;
+                continue;
+            }
+        };
+        let mut batch = Vec::new();
+        while subscription.receive(&mut batch, 64).await > 0 {
+            for received in batch.drain(..) {
+                let request = match received.content {
+                    Content::Bare { payload, .. } => payload,
+                    // Requests are never framed.
+                    Content::Frame(_) | Content::Malformed { .. } => continue,
+                };
+                if requests.send(request).await.is_err() {
+                    return;
+                }
+            }
+            let dropped = subscription.take_dropped();
+            if dropped > 0 {
+                tracing::warn!(dropped, "more requests than can be answered; who asked asks again");
+            }
+        }
+    }
+}
+
+/// Answers over the broker.
+struct BrokerReplies {
+    outlet: Arc<BrokerOutlet>,
+    shared: Option<ChannelName>,
+}
+
+impl BrokerReplies {
+    fn new(outlet: Arc<BrokerOutlet>, kind: BrokerKind) -> Self {
+        let shared = match kind {
+            BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => Some(ChannelName::shared_reply()),
+            BrokerKind::Memory | BrokerKind::Redis => None,
+        };
+        Self { outlet, shared }
+    }
+}
+
+impl Replies for BrokerReplies {
+    fn reply(&self, to: &ChannelName, payload: Bytes) -> Result<(), String> {
+        self.outlet.publish(to, &payload).map_err(|error| error.to_string())
+    }
+
+    fn shared(&self) -> Option<ChannelName> {
+        self.shared.clone()
+    }
+}
