@@ -9,7 +9,7 @@ use serde_json::Value;
 use super::place::{Place, Site};
 
 /// A document of a key such as `Instance/slam/0`; its uid is its key.
-pub(super) fn document(key: &str, revision: u64, spec: Value) -> Document {
+pub(crate) fn document(key: &str, revision: u64, spec: Value) -> Document {
     Document {
         key: key.parse().unwrap(),
         uid: key.to_owned(),
@@ -25,24 +25,24 @@ pub(super) fn document(key: &str, revision: u64, spec: Value) -> Document {
 }
 
 /// The same with a label.
-pub(super) fn labelled(key: &str, revision: u64, spec: Value, label: (&str, &str)) -> Document {
+pub(crate) fn labelled(key: &str, revision: u64, spec: Value, label: (&str, &str)) -> Document {
     let mut out = document(key, revision, spec);
     out.labels.insert(label.0.to_owned(), label.1.to_owned());
     out
 }
 
-pub(super) fn state(revision: u64, documents: impl IntoIterator<Item = Document>) -> State {
+pub(crate) fn state(revision: u64, documents: impl IntoIterator<Item = Document>) -> State {
     State::new(revision, documents)
 }
 
-pub(super) fn keys<const N: usize>(texts: [&str; N]) -> Vec<Key> {
+pub(crate) fn keys<const N: usize>(texts: [&str; N]) -> Vec<Key> {
     let mut out: Vec<Key> = texts.iter().map(|text| text.parse().unwrap()).collect();
     out.sort();
     out
 }
 
 /// `slam`, `slam/0`, each with `@node` behind it or not.
-pub(super) fn place(text: &str) -> Place {
+pub(crate) fn place(text: &str) -> Place {
     let (name, node) = match text.split_once('@') {
         Some((name, node)) => (name, Some(node.parse().unwrap())),
         None => (text, None),
@@ -59,7 +59,7 @@ pub(super) fn place(text: &str) -> Place {
 }
 
 /// Layer `edge`, on the broker of a node or of the layer.
-pub(super) fn site(node: Option<&str>) -> Site {
+pub(crate) fn site(node: Option<&str>) -> Site {
     Site {
         layer: "edge".parse().unwrap(),
         node: node.map(|node| node.parse().unwrap()),

@@ -1,0 +1,20 @@
+//! The worker as services and operators have it: real `blaze-config`, `blaze-worker` and Redis, killed and started again.
+//!
+//! Needs `cargo build --workspace` and `scripts/services install`.
+//!
+//! ```text
+//! stage    a main service, a Redis and workers of one layer
+//! serving  what services are told, and whether only those it concerns
+//! outages  the main service, the broker and the worker away, in turns and together
+//! ```
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    reason = "the helpers of a test fail like the test"
+)]
+
+mod outages;
+mod serving;
+mod stage;

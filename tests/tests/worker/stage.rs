@@ -1,0 +1,323 @@
+//! A main service without tokens, a Redis, and workers of layer `edge`.
+
+use std::collections::BTreeMap;
+use std::net::{SocketAddr, TcpListener};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use blaze_brokers::redis::{RedisBroker, RedisKeys};
+use blaze_brokers::{Broker as _, Content, Health, PublisherOptions, Role, SubscribeOptions, Subscription};
+use blaze_domain::node_file::{NodeBroker, NodeFile};
+use blaze_tests::process::Process;
+use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
+use blaze_tests::wait;
+use bytes::Bytes;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+/// A start on a machine that does much else.
+const START: Duration = Duration::from_secs(60);
+/// What is waited for, at most.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
+
+/// What the processes of one test have in common.
+pub(crate) struct Stage {
+    folder: TempDir,
+    pub(crate) redis: RedisServer,
+    rest: SocketAddr,
+    grpc: SocketAddr,
+    http: reqwest::Client,
+}
+
+/// A running worker and where it is asked.
+pub(crate) struct Worker {
+    process: Process,
+    pub(crate) admin: SocketAddr,
+}
+
+fn free() -> SocketAddr {
+    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
+}
+
+fn launch(program: &str, node_file: &str) -> anyhow::Result<(Process, BTreeMap<String, SocketAddr>)> {
+    let process = Process::start(program, &["--config", node_file], None)?;
+    let line = wait::until_some(
+        &format!("the ready line of {program}"),
+        START,
+        || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
+        || process.tail(),
+    )?;
+    let words = line.split(' ').filter_map(|word| word.split_once('='));
+    let addresses = words.filter_map(|(name, address)| Some((name.to_owned(), address.parse().ok()?)));
+    Ok((process, addresses.collect()))
+}
+
+impl Stage {
+    pub(crate) fn new() -> Self {
+        Self {
+            folder: TempDir::new().unwrap(),
+            redis: RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap(),
+            rest: free(),
+            grpc: free(),
+            http: reqwest::Client::new(),
+        }
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn write(&self, name: &str, file: &Value) -> String {
+        let path = self.path(name);
+        // JSON is YAML.
+        std::fs::write(&path, file.to_string()).unwrap();
+        path.to_str().unwrap().to_owned()
+    }
+
+    /// The main service, ready; after a start on the same store as before.
+    pub(crate) fn main(&self) -> Process {
+        let file = self.write(
+            "main.yaml",
+            &json!({
+                "log": { "level": "warn" },
+                "control_plane": {
+                    "rest": { "listen": self.rest }, "grpc": { "listen": self.grpc }, "admin": { "listen": "127.0.0.1:0" },
+                    "store": { "sqlite": { "path": self.path("main.db") } },
+                },
+            }),
+        );
+        let process = Process::start("blaze-config", &["--dev", "--config", &file], None).unwrap();
+        wait::until_some(
+            "the ready line of blaze-config",
+            START,
+            || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
+            || process.tail(),
+        )
+        .unwrap();
+        process
+    }
+
+    /// The worker of a node, ready; after a start on the same copies as before.
+    pub(crate) fn worker(&self, node: &str) -> Worker {
+        self.worker_with(node, json!({}))
+    }
+
+    /// The same with further members of the section `worker`.
+    pub(crate) fn worker_with(&self, node: &str, section: Value) -> Worker {
+        let mut section = section;
+        section["state_dir"] = json!(self.path(node));
+        let file = self.write(
+            &format!("{node}.yaml"),
+            &json!({
+                "log": { "level": "info" },
+                "layer": { "name": "edge", "kind": "edge" },
+                "node": { "name": node },
+                "brokers": { "node": { "redis": { "url": self.redis.url() } } },
+                "admin": { "worker": "127.0.0.1:0" },
+                "config": { "server": format!("http://{}", self.grpc) },
+                "worker": section,
+            }),
+        );
+        let (process, addresses) = launch("blaze-worker", &file).unwrap();
+        let admin = *addresses.get("admin").context("no admin").unwrap();
+        Worker { process, admin }
+    }
+
+    /// A request to the main service that must succeed.
+    pub(crate) async fn send(&self, method: reqwest::Method, path: &str, body: Option<&Value>) -> Value {
+        let mut request = self.http.request(method, format!("http://{}/api/v1{path}", self.rest));
+        request = request.header("if-match", "*");
+        if let Some(body) = body {
+            request = request.json(body);
+        }
+        let response = request.send().await.unwrap();
+        let (status, text) = (response.status(), response.text().await.unwrap());
+        assert!(status.is_success(), "{path}: {status} {text}");
+        serde_json::from_str(&text).unwrap_or_default()
+    }
+
+    /// Applies documents: kind, name (of an instance `service/name`), spec.
+    pub(crate) async fn apply(&self, documents: &[(&str, &str, Value)]) -> u64 {
+        let documents = documents.iter().map(|(kind, name, spec)| match name.split_once('/') {
+            Some((service, name)) => json!({ "kind": kind, "service": service, "name": name, "spec": spec }),
+            None => json!({ "kind": kind, "name": name, "spec": spec }),
+        });
+        let body = Value::Array(documents.collect());
+        let answer = self.send(reqwest::Method::POST, "/apply", Some(&body)).await;
+        answer["revision"].as_u64().unwrap()
+    }
+
+    pub(crate) async fn put(&self, path: &str, spec: Value) -> u64 {
+        let answer = self.send(reqwest::Method::PUT, path, Some(&json!({ "spec": spec }))).await;
+        answer["revision"].as_u64().unwrap()
+    }
+
+    pub(crate) async fn get(&self, path: &str) -> Value {
+        self.send(reqwest::Method::GET, path, None).await
+    }
+
+    /// A robot with two services, of which one has an instance.
+    pub(crate) async fn robot(&self) -> u64 {
+        self.apply(&[
+            ("Layer", "edge", json!({ "kind": "edge", "config": { "log": "info" } })),
+            ("Node", "robot-1", json!({ "layer": "edge" })),
+            ("Service", "slam", json!({ "config": { "camera": { "rate_hz": 30 } } })),
+            ("Service", "nav", json!({ "config": { "speed": 1 } })),
+            ("Instance", "slam/0", json!({ "node": "robot-1" })),
+        ])
+        .await
+    }
+
+    fn section(&self) -> blaze_domain::node_file::RedisBroker {
+        let file = json!({ "brokers": { "node": { "redis": { "url": self.redis.url() } } } });
+        match NodeFile::read(&file).unwrap().0.brokers.node {
+            Some(NodeBroker::Redis(section)) => section,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    pub(crate) fn keys(&self) -> RedisKeys {
+        RedisKeys::open(&self.section()).unwrap()
+    }
+
+    /// A service that knows only the broker.
+    pub(crate) async fn service(&self) -> Service {
+        let broker = RedisBroker::open(&self.section(), &Role::Service).unwrap();
+        let mut status = broker.status();
+        let up = status.wait_for(|status| status.health == Health::Up);
+        tokio::time::timeout(PATIENCE, up).await.expect("Redis answers").unwrap();
+        let subscription = broker
+            .subscribe(&"blaze/reply/test".parse().unwrap(), SubscribeOptions::default())
+            .await
+            .unwrap();
+        Service {
+            broker: Arc::new(broker),
+            replies: subscription,
+            asked: 0,
+        }
+    }
+
+    /// Waits until the worker has what the main service has; gives the digest.
+    pub(crate) async fn equal(&self, worker: &Worker, limit: Duration) -> String {
+        let start = tokio::time::Instant::now();
+        loop {
+            let (main, here) = (self.get("/digest?layer=edge").await, worker.status().await);
+            let is_equal = main["digest"] == here["digest"] && here["connected"] == true && here["source"] == "main";
+            if is_equal {
+                return main["digest"].as_str().unwrap().to_owned();
+            }
+            assert!(start.elapsed() < limit, "not equal within {limit:?}: {main} and {here}; {}", worker.tail());
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+}
+
+impl Worker {
+    pub(crate) async fn status(&self) -> Value {
+        let url = format!("http://{}/v1/status", self.admin);
+        let text = reqwest::get(url).await.unwrap().text().await.unwrap();
+        serde_json::from_str(&text).unwrap()
+    }
+
+    /// Waits until the status satisfies.
+    pub(crate) async fn until(&self, what: &str, is_good: impl Fn(&Value) -> bool) -> Value {
+        let start = tokio::time::Instant::now();
+        loop {
+            let status = self.status().await;
+            if is_good(&status) {
+                return status;
+            }
+            assert!(start.elapsed() < PATIENCE, "{what}: {status}; {}", self.tail());
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    }
+
+    pub(crate) async fn text(&self, path: &str) -> String {
+        let url = format!("http://{}{path}", self.admin);
+        reqwest::get(url).await.unwrap().text().await.unwrap()
+    }
+
+    pub(crate) fn kill(mut self) {
+        self.process.kill().unwrap();
+    }
+
+    pub(crate) fn stop(mut self) {
+        assert_eq!(self.process.terminate(PATIENCE).unwrap(), Some(0), "{}", self.tail());
+    }
+
+    pub(crate) fn tail(&self) -> String {
+        self.process.tail()
+    }
+}
+
+/// A service that knows only the broker.
+pub(crate) struct Service {
+    broker: Arc<RedisBroker>,
+    replies: Subscription,
+    asked: u64,
+}
+
+impl Service {
+    /// Hears of changes of a service from now on.
+    pub(crate) async fn listen(&self, service: &str) -> Subscription {
+        let channel = format!("blaze/config/changed/{service}").parse().unwrap();
+        self.broker.subscribe(&channel, SubscribeOptions::default()).await.unwrap()
+    }
+
+    /// Asks until it is answered, as often as a service may: each second.
+    pub(crate) async fn ask(&mut self, mut request: Value, limit: Duration) -> Value {
+        let options = PublisherOptions::default();
+        let publisher = self.broker.publisher(&"blaze/config/get".parse().unwrap(), options).unwrap();
+        let start = tokio::time::Instant::now();
+        loop {
+            self.asked += 1;
+            let id = self.asked.to_string();
+            request["id"] = json!(id);
+            request["reply_to"] = json!("blaze/reply/test");
+            publisher.publish_bare(&Bytes::from(request.to_string()), None);
+            let mut batch = Vec::new();
+            let answer = async {
+                loop {
+                    batch.clear();
+                    if self.replies.receive(&mut batch, 1).await == 0 {
+                        std::future::pending::<()>().await;
+                    }
+                    let answer = text(&batch[0].content);
+                    if answer["id"] == id.as_str() {
+                        return answer;
+                    }
+                }
+            };
+            if let Ok(answer) = tokio::time::timeout(Duration::from_millis(200), answer).await {
+                return answer;
+            }
+            assert!(start.elapsed() < limit, "no answer within {limit:?}");
+        }
+    }
+}
+
+fn text(content: &Content) -> Value {
+    match content {
+        Content::Bare { payload, .. } => serde_json::from_slice(payload).unwrap(),
+        other => panic!("{other:?}"),
+    }
+}
+
+/// The next notice.
+pub(crate) async fn next(notices: &mut Subscription) -> Value {
+    let mut batch = Vec::new();
+    let received = notices.receive(&mut batch, 1);
+    let count = tokio::time::timeout(PATIENCE, received).await.expect("a notice in time");
+    assert_eq!(count, 1);
+    text(&batch[0].content)
+}
+
+/// Whatever has come by now.
+pub(crate) async fn rest(notices: &mut Subscription) -> Vec<Value> {
+    let mut batch = Vec::new();
+    // What is there is taken at once.
+    let _ = tokio::time::timeout(Duration::from_millis(1), notices.receive(&mut batch, 10_000)).await;
+    batch.iter().map(|received| text(&received.content)).collect()
+}
