@@ -59,10 +59,7 @@ fn the_documented_example_has_no_fault_and_a_warning_for_each_section_without_ef
         found,
         [
             (7, "brokers.plugins", NOT_YET),
-            (9, "admin", &keys("worker, monitor")),
-            (10, "config", NOT_YET),
-            (11, "cache", NOT_YET),
-            (12, "database", NOT_YET),
+            (9, "admin", &keys("monitor")),
             (21, "monitor", NOT_YET),
         ]
     );

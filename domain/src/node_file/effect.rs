@@ -7,10 +7,10 @@ use super::walk::Node;
 const NOT_YET: &str = "not in effect in this version";
 
 /// Sections without effect, each worth one warning.
-const SECTIONS: &[&str] = &["brokers.plugins", "config", "cache", "database", "monitor", "worker"];
+const SECTIONS: &[&str] = &["brokers.plugins", "monitor"];
 
 /// Keys without effect in sections that have one: one warning per section.
-const KEYS: &[(&str, &[&str])] = &[("admin", &["worker", "monitor"])];
+const KEYS: &[(&str, &[&str])] = &[("admin", &["monitor"])];
 
 pub(super) fn warn_of_what_is_not_in_effect(tree: &Value, root: &Node<'_>) {
     let at = |path: String| root.at(path);

@@ -123,7 +123,8 @@ async fn a_server_that_was_away_is_used_again_and_known_to_be_another() {
     let error = keys.apply(&[put("a", "2")], &[]).await.unwrap_err();
     assert!(matches!(error, KeyError::Away { .. }), "{error}");
     server.server.restart().unwrap();
-    until(async || keys.apply(&[put("a", "3")], &[]).await, Result::is_ok).await;
+    let done = until(async || keys.apply(&[put("a", "3")], &[]).await, Result::is_ok).await;
+    assert_eq!(done, Ok(()));
     assert_eq!(keys.get("a").await.unwrap(), Some(Bytes::from("3")));
     tokio::time::timeout(Duration::from_secs(20), keys.restarted())
         .await
