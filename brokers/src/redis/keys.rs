@@ -183,6 +183,27 @@ impl RedisKeys {
         Ok((!members.is_empty()).then_some(members))
     }
 
+    /// All values whose key begins so, at most so many; keys are given without the prefix of the section.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn values(&self, beginning: &str, most: usize) -> Result<Vec<(String, Bytes)>, KeyError> {
+        let prefix = self.settings.names.key("");
+        let pattern = format!("{}*", escaped(&self.settings.names.key(beginning)));
+        let keys = self.keys(&pattern, most).await?;
+        let mut out = Vec::with_capacity(keys.len());
+        for key in &keys {
+            let value = self
+                .call(|mut connection| async move {
+                    redis::cmd("GET").arg(key).query_async::<Option<Vec<u8>>>(&mut connection).await
+                })
+                .await?;
+            let name = key.strip_prefix(&prefix).unwrap_or(key).to_owned();
+            out.extend(value.map(|value| (name, Bytes::from(value))));
+        }
+        Ok(out)
+    }
+
     /// All records whose key begins so, at most so many; keys are given without the prefix of the section.
     ///
     /// # Errors
@@ -301,8 +322,9 @@ impl RedisKeys {
 
     fn failed(&self, error: &RedisError) -> KeyError {
         let (place, reason) = (self.settings.place.clone(), error.to_string());
+        // Also after a refusal: a server that became a replica, or wants another password, is another one behind the same name.
+        *self.connection.lock() = None;
         if error.is_io_error() || error.is_timeout() || error.is_connection_dropped() || error.is_connection_refusal() {
-            *self.connection.lock() = None;
             KeyError::Away { place, reason }
         } else {
             KeyError::Refused { place, reason }

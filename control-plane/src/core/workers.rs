@@ -147,6 +147,10 @@ impl Workers {
         if known.workers.len() >= MAX_WORKERS && !known.workers.contains_key(&name) {
             known.forget_one()?;
         }
+        // Each life of a worker has another name: of those that have gone on this node, this is the next life.
+        known
+            .workers
+            .retain(|other, worker| worker.is_connected() || (&other.layer, &other.node) != (&name.layer, &name.node));
         known.connections += 1;
         let connection = known.connections;
         let worker = Worker {
@@ -252,11 +256,27 @@ mod tests {
     }
 
     #[test]
+    fn the_next_life_of_a_worker_takes_the_place_of_the_last() {
+        let workers = Arc::new(Workers::default());
+        let enter = |id| workers.enter(name(id), String::new(), Acknowledged::default(), at(1)).unwrap();
+        let (first, beside) = (enter("a"), enter("b"));
+        drop(first);
+        let _next = enter("c");
+        let ids: Vec<_> = workers.list(|_| true).into_iter().map(|(name, _)| name.id).collect();
+        assert_eq!(ids, ["b", "c"], "who is connected stays");
+        drop(beside);
+    }
+
+    #[test]
     fn who_has_gone_gives_way_and_who_is_here_stays() {
         let workers = Arc::new(Workers::default());
         let enter = |index: usize| {
             let second = i64::try_from(index).unwrap();
-            workers.enter(name(&format!("w{index}")), String::new(), Acknowledged::default(), at(second))
+            let name = WorkerName {
+                node: Some(format!("robot-{index}").parse().unwrap()),
+                ..name(&format!("w{index}"))
+            };
+            workers.enter(name, String::new(), Acknowledged::default(), at(second))
         };
         let mut sessions: Vec<_> = (0..MAX_WORKERS).map(|index| enter(index).unwrap()).collect();
         assert_eq!(enter(MAX_WORKERS).unwrap_err(), TooMany);

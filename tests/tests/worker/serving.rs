@@ -15,7 +15,7 @@ async fn a_change_reaches_whom_it_concerns_and_nobody_else() {
     let (mut slam, mut nav) = (service.listen("slam").await, service.listen("nav").await);
 
     let answer = service.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
-    assert_eq!(answer["config"], json!({ "camera": { "rate_hz": 30 }, "log": "info" }));
+    assert_eq!(answer["config"], json!({ "camera": { "rate_hz": 30 }, "verbosity": "info" }));
     assert_eq!((&answer["source"], &answer["node"]), (&json!("main"), &json!("robot-1")));
     let effective = stage.get("/effective?service=slam&instance=0").await;
     assert_eq!((&answer["hash"], &answer["config"]), (&effective["hash"], &effective["config"]));
@@ -40,9 +40,9 @@ async fn a_change_reaches_whom_it_concerns_and_nobody_else() {
     assert_eq!((&key["hash"], &key["config"]), (&notice["hash"], &notice["config"]));
 
     // A change of the layer that says nothing new to anybody, then one that does; in between nobody hears.
-    stage.put("/layers/edge", json!({ "kind": "edge", "config": { "log": "info" }, "overrides": { "other": { "x": 1 } } }))
+    stage.put("/layers/edge", json!({ "kind": "edge", "config": { "verbosity": "info" }, "overrides": { "other": { "x": 1 } } }))
         .await;
-    let revision = stage.put("/layers/edge", json!({ "kind": "edge", "config": { "log": "debug" } })).await;
+    let revision = stage.put("/layers/edge", json!({ "kind": "edge", "config": { "verbosity": "debug" } })).await;
     let mut heard = Vec::new();
     for notices in [&mut slam, &mut nav] {
         let notice = next(notices).await;

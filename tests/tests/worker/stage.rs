@@ -161,7 +161,7 @@ impl Stage {
     /// A robot with two services, of which one has an instance.
     pub(crate) async fn robot(&self) -> u64 {
         self.apply(&[
-            ("Layer", "edge", json!({ "kind": "edge", "config": { "log": "info" } })),
+            ("Layer", "edge", json!({ "kind": "edge", "config": { "verbosity": "info" } })),
             ("Node", "robot-1", json!({ "layer": "edge" })),
             ("Service", "slam", json!({ "config": { "camera": { "rate_hz": 30 } } })),
             ("Service", "nav", json!({ "config": { "speed": 1 } })),

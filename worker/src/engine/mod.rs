@@ -14,23 +14,25 @@ mod tell;
 #[cfg(test)]
 mod tests;
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::config::Timestamp;
+use blaze_domain::config::secret::{self, Secret};
 use blaze_domain::config::state::State;
+use blaze_domain::config::Timestamp;
 use blaze_domain::names::ChannelName;
 use blaze_domain::{LayerName, NodeName};
 use blaze_proto::v1;
 use bytes::Bytes;
+use serde_json::Value;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use crate::copy::{Changed, Copies, Loaded, Notes, Position, Update, defaults};
 use crate::core::messages::{self, Delivery, GetRequest, RefusedRequest};
-use crate::core::{Applied, Freshness, PROTOCOL, Place, Replica, Served, Site, Source, answer};
+use crate::core::{Applied, Freshness, PROTOCOL, Place, Replica, Reply, Served, Site, Source, answer};
 use crate::serve::{Speaker, Told};
 use crate::sync::SyncEvent;
 
@@ -38,6 +40,8 @@ pub use status::Status;
 
 /// Within this time several changes may become one notice.
 const TOGETHER: Duration = Duration::from_millis(20);
+/// Between two looks whether the broker has taken what places are told.
+const SETTLE: Duration = Duration::from_millis(200);
 /// What the worker has is said this long after it became so, and with it what came meanwhile.
 const ACK_AFTER: Duration = Duration::from_millis(50);
 /// It is said again after this time without news.
@@ -127,17 +131,25 @@ pub struct Engine {
     replica: Replica,
     served: Served,
     notes: Notes,
-    /// The copy has no texts of secrets: everything is to be asked for.
-    lacks_secrets: bool,
+    /// What came could not be read, and would come again: everything is to be asked for.
+    wants_all: bool,
+    /// Until then whoever has secrets gets everything, also if the hash is the same: the texts have come just now.
+    texts_until: Option<Instant>,
     stream: Option<CancellationToken>,
     /// Why there is no stream.
     reason: Option<String>,
     is_leader: bool,
     flushed: Option<Instant>,
     flush_at: Option<Instant>,
+    /// When to look whether the broker has taken what places are told.
+    settle_at: Option<Instant>,
     ack_at: Instant,
     /// Places whose key is kept.
-    keyed: BTreeSet<Place>,
+    keyed: BTreeMap<String, Place>,
+    /// Keys of an earlier life were looked for.
+    has_swept: bool,
+    /// What places are being told, until the broker has taken it.
+    unnoted: BTreeMap<Place, (u64, Option<String>)>,
     /// What was told, or would have been if this worker were the leader, a short while ago.
     recent: VecDeque<(Instant, Told)>,
     defaults_problem: Option<String>,
@@ -154,14 +166,18 @@ impl Engine {
             served: Served::new(identity.site.clone()),
             replica: Replica::new(layer.clone()),
             notes: Notes::default(),
-            lacks_secrets: false,
+            wants_all: false,
+            texts_until: None,
             stream: None,
             reason: None,
             is_leader: false,
             flushed: None,
             flush_at: None,
+            settle_at: None,
             ack_at: now + ACK_AGAIN,
-            keyed: BTreeSet::new(),
+            keyed: BTreeMap::new(),
+            has_swept: false,
+            unnoted: BTreeMap::new(),
             recent: VecDeque::new(),
             defaults_problem: None,
             counts: Counts::default(),
@@ -175,7 +191,6 @@ impl Engine {
     }
 
     fn begin_with(&mut self, layer: LayerName, loaded: Loaded, now: Instant) {
-        self.lacks_secrets = loaded.lacks_secrets();
         let Position {
             store_id,
             revision,
@@ -206,6 +221,7 @@ impl Engine {
         self.take_defaults(&inputs.defaults.borrow_and_update().clone());
         loop {
             let flush_at = self.flush_at;
+            let settle_at = self.settle_at;
             tokio::select! {
                 biased;
                 () = stop.cancelled() => return,
@@ -221,6 +237,7 @@ impl Engine {
                     let status = inputs.defaults.borrow_and_update().clone();
                     self.take_defaults(&status);
                 }
+                () = sleep_until(settle_at.unwrap_or_else(Instant::now)), if settle_at.is_some() => self.settle(),
                 () = sleep_until(self.ack_at) => self.acknowledge(),
             }
         }
@@ -228,9 +245,9 @@ impl Engine {
 
     fn on_sync(&mut self, event: SyncEvent) {
         match event {
-            SyncEvent::Greeting(asked) => {
+            SyncEvent::Greeting { is_safe, answer } => {
                 // Whoever asked may have gone.
-                let _ = asked.send(self.hello());
+                let _ = answer.send(self.hello(is_safe));
             }
             SyncEvent::Opened(stream) => {
                 self.stream = Some(stream);
@@ -239,11 +256,14 @@ impl Engine {
             SyncEvent::Said(incoming) => {
                 let now = now();
                 match self.replica.apply(incoming, now) {
+                    // It is known to be the newest by now, which the copies are to know too.
+                    Ok(Applied::Nothing) if self.replica.is_in_sync() => self.keep(Changed::Keys(Vec::new())),
                     Ok(Applied::Nothing) => {}
                     Ok(Applied::Changed(change)) => {
                         self.counts.changes += 1;
-                        self.lacks_secrets = false;
+                        self.wants_all = false;
                         self.served.apply(&change);
+                        self.note_texts(&change);
                         self.keep(Changed::Keys(change.keys));
                         self.flush_soon();
                     }
@@ -260,7 +280,8 @@ impl Engine {
                 }
                 self.note_sync();
             }
-            SyncEvent::Closed { reason } => {
+            SyncEvent::Closed { reason, is_unreadable } => {
+                self.wants_all |= is_unreadable;
                 if self.stream.take().is_some() {
                     tracing::warn!(reason, "the main service is away; services get what is here");
                 }
@@ -271,7 +292,7 @@ impl Engine {
         }
     }
 
-    fn hello(&mut self) -> v1::Hello {
+    fn hello(&mut self, is_safe: bool) -> v1::Hello {
         self.replica.disconnected();
         let resume = self.replica.resume_point();
         let site = &self.identity.site;
@@ -286,7 +307,8 @@ impl Engine {
             revision: resume.revision,
             digest: resume.digest,
         };
-        if self.lacks_secrets {
+        // Texts come over a safe connection alone, and with a snapshot: what is here has the newest revision already.
+        if self.wants_all || (is_safe && lacks_texts(self.replica.state())) {
             (hello.store_id, hello.revision, hello.digest) = Default::default();
         }
         hello
@@ -307,6 +329,8 @@ impl Engine {
     /// Says what is here, if somebody listens.
     fn acknowledge(&mut self) {
         self.ack_at = Instant::now() + ACK_AGAIN;
+        // Also those who have not asked for long are to be forgotten when nothing else happens.
+        self.flush_soon();
         if self.stream.is_none() {
             return;
         }
@@ -359,10 +383,13 @@ impl Engine {
                     self.counts.left_to_others += 1;
                     return;
                 }
-                let reply = answer(&mut self.served, &request, Instant::now().into_std());
+                let reply = self.reply(&request);
                 let id = request.id.as_deref();
                 let text = messages::reply(&reply, id, self.identity.delivery, self.freshness());
                 self.key_of_asker(&request);
+                if self.served.has_pending() {
+                    self.flush_soon();
+                }
                 (Some((request.reply_to, request.id)), text)
             }
             Err(RefusedRequest { id, reply_to, error }) => {
@@ -393,6 +420,26 @@ impl Engine {
         }
     }
 
+    /// What a request gets. Who was given a configuration without the texts of its secrets has the right hash, and yet not
+    /// what it needs.
+    fn reply(&mut self, request: &GetRequest) -> Reply {
+        let now = Instant::now();
+        let reply = answer(&mut self.served, request, now.into_std());
+        if matches!(reply, Reply::Unchanged { .. }) && self.texts_until.is_some_and(|until| now < until) {
+            let anew = GetRequest {
+                hash: None,
+                ..request.clone()
+            };
+            let whole = answer(&mut self.served, &anew, now.into_std());
+            if let Reply::Standing(standing) = &whole
+                && secret::contains(standing.config.value())
+            {
+                return whole;
+            }
+        }
+        reply
+    }
+
     fn freshness(&self) -> Freshness {
         Freshness {
             as_of: self.replica.as_of(),
@@ -409,6 +456,19 @@ impl Engine {
             }
         }
     }
+}
+
+/// Whether the text of a secret is not here: it came over a connection that others could read, or from a copy without a key.
+fn lacks_texts(state: &State) -> bool {
+    state.all().any(|(_, held)| lacks_text(&held.document.spec))
+}
+
+fn lacks_text(spec: &Value) -> bool {
+    let mut lacks = false;
+    secret::walk(spec, &mut |_, found| {
+        lacks |= matches!(Secret::of(found), Some(Ok(Secret::Redacted { .. })));
+    });
+    lacks
 }
 
 /// The time, for people.

@@ -14,18 +14,42 @@ use parking_lot::Mutex;
 /// Publishers that are kept; the one that was used longest ago goes first.
 const PUBLISHERS: NonZeroUsize = NonZeroUsize::MIN.saturating_add(1023);
 
+/// Keys of before that are looked at.
+const MAX_KEYS: usize = 20_000;
+
 /// Why nothing was delivered, or nobody knows whether it was.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum OutletError {
     /// The broker does not answer.
     #[error("the broker is away: {0}")]
     Away(String),
+    /// It is more than the broker carries.
+    #[error("{bytes} bytes are more than the broker carries")]
+    TooLarge {
+        /// Of the message.
+        bytes: usize,
+    },
     /// The broker cannot have such a channel.
     #[error(transparent)]
     Broker(#[from] BrokerError),
     /// The server of the keys does not do it.
     #[error(transparent)]
     Keys(#[from] KeyError),
+}
+
+impl OutletError {
+    /// Whether the same would be refused again, for what it is.
+    #[must_use]
+    pub fn is_refusal(&self) -> bool {
+        match self {
+            Self::TooLarge { .. } | Self::Keys(KeyError::Refused { .. }) => true,
+            Self::Broker(error) => match error {
+                BrokerError::Name { .. } | BrokerError::Collision { .. } => true,
+                BrokerError::Closed | BrokerError::Away(_) | BrokerError::TooManyChannels(_) => false,
+            },
+            Self::Away(_) | Self::Keys(KeyError::Away { .. }) => false,
+        }
+    }
 }
 
 /// Where keys and notices go.
@@ -40,6 +64,12 @@ pub trait Outlet: Send + Sync + 'static {
     /// Whether keys are kept at all.
     fn has_keys(&self) -> bool;
 
+    /// Keys that an earlier life of this worker may have written.
+    ///
+    /// # Errors
+    /// [`OutletError`].
+    async fn own_keys(&self) -> Result<Vec<String>, OutletError>;
+
     /// Waits until the server of the keys may have lost them: it was away and is back.
     async fn keys_lost(&self);
 }
@@ -49,6 +79,8 @@ pub struct BrokerOutlet {
     broker: Arc<dyn Broker>,
     keys: Option<Keys>,
     publishers: Mutex<LruCache<ChannelName, Arc<dyn Publisher>>>,
+    /// Whether a value is one that a worker of this place writes.
+    is_own: Box<dyn Fn(&[u8]) -> bool + Send + Sync>,
 }
 
 struct Keys {
@@ -65,13 +97,21 @@ impl BrokerOutlet {
             broker,
             keys: None,
             publishers: Mutex::new(LruCache::new(PUBLISHERS)),
+            is_own: Box::new(|_| false),
         }
     }
 
-    /// The same with keys on a Redis; `is_broker`: it is the broker's own server.
+    /// The same with keys on a Redis; `is_broker`: it is the broker's own server; `is_own`: whether a value is one that a
+    /// worker of this place writes, which others on the same server are not to lose.
     #[must_use]
-    pub fn with_keys(mut self, client: Arc<RedisKeys>, is_broker: bool) -> Self {
+    pub fn with_keys(
+        mut self,
+        client: Arc<RedisKeys>,
+        is_broker: bool,
+        is_own: impl Fn(&[u8]) -> bool + Send + Sync + 'static,
+    ) -> Self {
         self.keys = Some(Keys { client, is_broker });
+        self.is_own = Box::new(is_own);
         self
     }
 
@@ -84,10 +124,7 @@ impl BrokerOutlet {
         match publisher.publish_bare(payload, None) {
             PublishOutcome::Taken => Ok(()),
             PublishOutcome::Dropped => Err(OutletError::Away(self.broker.status().borrow().detail.clone())),
-            PublishOutcome::TooLarge => Err(OutletError::Away(format!(
-                "{} bytes are more than it carries",
-                payload.len()
-            ))),
+            PublishOutcome::TooLarge => Err(OutletError::TooLarge { bytes: payload.len() }),
         }
     }
 
@@ -137,6 +174,13 @@ impl Outlet for BrokerOutlet {
 
     fn has_keys(&self) -> bool {
         self.keys.is_some()
+    }
+
+    async fn own_keys(&self) -> Result<Vec<String>, OutletError> {
+        let Some(keys) = &self.keys else { return Ok(Vec::new()) };
+        let found = keys.client.values("blaze:config:", MAX_KEYS).await?;
+        let own = found.into_iter().filter(|(_, value)| (self.is_own)(value));
+        Ok(own.map(|(key, _)| key).collect())
     }
 
     async fn keys_lost(&self) {

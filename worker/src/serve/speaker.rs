@@ -1,7 +1,7 @@
 //! Tells services what has changed, one after the other, and never twice what is old already: of what waits, only the newest
 //! of each place counts. A broker that is away holds up nobody; what waits then is bounded by the places that there are.
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -16,6 +16,9 @@ use super::outlet::Outlet;
 
 /// Places that are told of in one transaction.
 const BATCH: usize = 256;
+/// Bytes of one transaction, unless one place alone has more (1 MiB): a large one over a slow connection would not be done in
+/// the time that a call may take, and be tried again for ever.
+const BATCH_BYTES: usize = 1024 * 1024;
 /// Upper bounds of the pause after a failure, which doubles; full jitter.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
 
@@ -41,6 +44,8 @@ pub struct SpeakerCounts {
     pub keys: u64,
     /// Transactions that failed and were tried again.
     pub failures: u64,
+    /// Places that were not told, because the broker refuses them.
+    pub dropped: u64,
     /// Places that wait.
     pub waiting: u64,
 }
@@ -59,8 +64,12 @@ struct State {
     /// Keys that are not as they should be; those that are not wanted are to go.
     dirty: BTreeSet<String>,
     /// Places in the order in which they are told of; each stands here once.
-    order: VecDeque<String>,
-    waiting: BTreeMap<String, Waiting>,
+    order: BTreeMap<i64, String>,
+    waiting: BTreeMap<String, (i64, Waiting)>,
+    /// Of the last that was put at the end, and of the first.
+    ends: (i64, i64),
+    /// Keys of before are to be looked for: those of this worker that are not wanted are to go.
+    sweep: bool,
 }
 
 /// What is told at once.
@@ -73,10 +82,15 @@ impl Batch {
     fn is_empty(&self) -> bool {
         self.keys.is_empty() && self.waiting.is_empty()
     }
+
+    fn len(&self) -> usize {
+        self.keys.len() + self.waiting.len()
+    }
 }
 
 impl State {
-    /// Takes in what is newer than what waits of the same place. Returns whether a notice gave way.
+    /// Takes in what is newer than what waits of the same place; it is told at the end, so that the notices of a service come
+    /// in the order of their revisions. Returns whether a notice gave way.
     fn put(&mut self, told: Told) -> bool {
         let Told { place, key, notice } = told;
         let name = key.map(|(name, value)| {
@@ -88,26 +102,43 @@ impl State {
             name
         });
         let Some(notice) = notice else { return false };
-        let old = self.waiting.insert(place.clone(), Waiting { key: name, notice });
-        if old.is_none() {
-            self.order.push_back(place);
+        let old = self.waiting.remove(&place);
+        if let Some((at, _)) = &old {
+            self.order.remove(at);
         }
+        self.ends.1 += 1;
+        self.order.insert(self.ends.1, place.clone());
+        self.waiting.insert(place, (self.ends.1, Waiting { key: name, notice }));
         old.is_some()
     }
 
-    fn take(&mut self) -> Batch {
-        let count = self.order.len().min(BATCH);
-        let places: Vec<String> = self.order.drain(..count).collect();
-        let waiting = places.into_iter().filter_map(|place| self.waiting.remove_entry(&place));
-        let waiting: Vec<(String, Waiting)> = waiting.collect();
-        let of_places = waiting.iter().filter_map(|(_, waiting)| waiting.key.as_ref());
-        let mut keys: BTreeSet<String> = of_places.filter_map(|key| self.dirty.take(key)).collect();
-        while keys.len() < 2 * BATCH
+    /// The first that wait, at most so many and, but for the first, so many bytes.
+    fn take(&mut self, most: usize) -> Batch {
+        let mut batch = Batch {
+            keys: BTreeSet::new(),
+            waiting: Vec::new(),
+        };
+        let mut bytes = 0;
+        while batch.waiting.len() < most
+            && (bytes < BATCH_BYTES || batch.is_empty())
+            && let Some((_, place)) = self.order.pop_first()
+        {
+            let Some((_, waiting)) = self.waiting.remove(&place) else { continue };
+            bytes += waiting.notice.1.len();
+            if let Some(key) = waiting.key.as_ref().and_then(|key| self.dirty.take(key)) {
+                bytes += self.wanted.get(&key).map_or(0, Bytes::len);
+                batch.keys.insert(key);
+            }
+            batch.waiting.push((place, waiting));
+        }
+        while batch.len() < most
+            && (bytes < BATCH_BYTES || batch.is_empty())
             && let Some(key) = self.dirty.pop_first()
         {
-            keys.insert(key);
+            bytes += self.wanted.get(&key).map_or(0, Bytes::len);
+            batch.keys.insert(key);
         }
-        Batch { keys, waiting }
+        batch
     }
 
     /// Keys as they should be now.
@@ -127,15 +158,23 @@ impl State {
         self.dirty.extend(batch.keys);
         for (place, waiting) in batch.waiting.into_iter().rev() {
             if !self.waiting.contains_key(&place) {
-                self.order.push_front(place.clone());
-                self.waiting.insert(place, waiting);
+                self.ends.0 -= 1;
+                self.order.insert(self.ends.0, place.clone());
+                self.waiting.insert(place, (self.ends.0, waiting));
             }
         }
     }
 
-    /// All keys are to be written again.
+    /// All keys are to be written again, and those that came back are to go.
     fn write_all(&mut self) {
         self.dirty.extend(self.wanted.keys().cloned());
+        self.sweep = true;
+    }
+
+    /// Of the keys that are there, those that should not be.
+    fn drop_unwanted(&mut self, found: Vec<String>) {
+        let unwanted = found.into_iter().filter(|key| !self.wanted.contains_key(key));
+        self.dirty.extend(unwanted);
     }
 }
 
@@ -146,6 +185,7 @@ struct Shared {
     replaced: AtomicU64,
     keys: AtomicU64,
     failures: AtomicU64,
+    dropped: AtomicU64,
 }
 
 /// Clones share it. [`Speaker::run`] must run once.
@@ -164,6 +204,7 @@ impl Default for Speaker {
                 replaced: AtomicU64::new(0),
                 keys: AtomicU64::new(0),
                 failures: AtomicU64::new(0),
+                dropped: AtomicU64::new(0),
             }),
         }
     }
@@ -183,6 +224,23 @@ impl Speaker {
         self.shared.more.notify_one();
     }
 
+    /// Whether the newest notice of a place still waits.
+    #[must_use]
+    pub fn is_waiting(&self, place: &str) -> bool {
+        self.shared.state.lock().waiting.contains_key(place)
+    }
+
+    /// Has keys of before, which nobody wants any more, looked for and deleted. All that are wanted must have been told.
+    pub fn sweep_keys(&self) {
+        self.shared.state.lock().sweep = true;
+        self.shared.more.notify_one();
+    }
+
+    /// Forgets everything: somebody else tells it from now on.
+    pub fn clear(&self) {
+        *self.shared.state.lock() = State::default();
+    }
+
     /// What has happened so far.
     #[must_use]
     pub fn counts(&self) -> SpeakerCounts {
@@ -192,6 +250,7 @@ impl Speaker {
             replaced: count(&self.shared.replaced),
             keys: count(&self.shared.keys),
             failures: count(&self.shared.failures),
+            dropped: count(&self.shared.dropped),
             waiting: self.shared.state.lock().order.len() as u64,
         }
     }
@@ -212,11 +271,12 @@ impl Speaker {
     }
 
     async fn speak(&self, outlet: &dyn Outlet) {
-        let mut pause = PAUSE.0;
+        let (mut pause, mut most) = (PAUSE.0, BATCH);
         loop {
+            self.sweep(outlet).await;
             let (batch, changes) = {
                 let mut state = self.shared.state.lock();
-                let batch = state.take();
+                let batch = state.take(most);
                 let changes = match outlet.has_keys() {
                     true => state.changes(&batch.keys),
                     false => Vec::new(),
@@ -230,17 +290,43 @@ impl Speaker {
             let messages: Vec<_> = batch.waiting.iter().map(|(_, waiting)| waiting.notice.clone()).collect();
             match outlet.deliver(&changes, &messages).await {
                 Ok(()) => {
-                    pause = PAUSE.0;
+                    (pause, most) = (PAUSE.0, BATCH);
                     self.shared.keys.fetch_add(changes.len() as u64, Ordering::Relaxed);
                     self.shared.notices.fetch_add(messages.len() as u64, Ordering::Relaxed);
+                }
+                // Whoever is refused alone would be refused again, and must not hold up the others.
+                Err(error) if error.is_refusal() && batch.len() <= 2 && batch.waiting.len() <= 1 => {
+                    let place = batch.waiting.first().map(|(place, _)| place.as_str());
+                    tracing::error!(%error, place, keys = ?batch.keys, "a service is not told of its configuration");
+                    self.shared.dropped.fetch_add(1, Ordering::Relaxed);
                 }
                 Err(error) => {
                     tracing::debug!(%error, "services could not be told");
                     self.shared.failures.fetch_add(1, Ordering::Relaxed);
                     self.shared.state.lock().put_back(batch);
+                    if error.is_refusal() {
+                        most = 1;
+                        continue;
+                    }
                     tokio::time::sleep(pause.mul_f64(rand::random())).await;
                     pause = (pause * 2).min(PAUSE.1);
                 }
+            }
+        }
+    }
+
+    /// Looks for keys of before, if that is due; one that cannot be looked for now is looked for later.
+    async fn sweep(&self, outlet: &dyn Outlet) {
+        if !std::mem::take(&mut self.shared.state.lock().sweep) {
+            return;
+        }
+        let found = outlet.own_keys().await;
+        let mut state = self.shared.state.lock();
+        match found {
+            Ok(found) => state.drop_unwanted(found),
+            Err(error) => {
+                tracing::debug!(%error, "keys of before were not looked for");
+                state.sweep = true;
             }
         }
     }
@@ -261,6 +347,9 @@ mod tests {
         is_up: watch::Receiver<bool>,
         lost: Arc<Notify>,
         delivered: mpsc::Sender<Delivered>,
+        own: Vec<String>,
+        /// A channel that it refuses.
+        refused: Option<&'static str>,
     }
 
     #[async_trait]
@@ -268,6 +357,9 @@ mod tests {
         async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
             if !*self.is_up.borrow() {
                 return Err(OutletError::Away("switched off".to_owned()));
+            }
+            if messages.iter().any(|(channel, _)| Some(channel.as_str()) == self.refused) {
+                return Err(OutletError::TooLarge { bytes: 1 });
             }
             self.delivered.send((changes.to_vec(), messages.to_vec())).await.unwrap();
             Ok(())
@@ -279,6 +371,10 @@ mod tests {
 
         async fn keys_lost(&self) {
             self.lost.notified().await;
+        }
+
+        async fn own_keys(&self) -> Result<Vec<String>, OutletError> {
+            Ok(self.own.clone())
         }
     }
 
@@ -298,6 +394,8 @@ mod tests {
             is_up: seen,
             lost: Arc::clone(&lost),
             delivered: send,
+            own: vec!["blaze:config:old".to_owned(), "blaze:config:slam".to_owned()],
+            refused: Some("blaze/config/changed/refused"),
         });
         let mut run = tokio::task::JoinSet::new();
         run.spawn(speaker.clone().run(outlet));
@@ -333,7 +431,7 @@ mod tests {
         w.speaker.tell([told("slam", "3")]);
         w.up.send_replace(true);
         let first = w.delivered.recv().await.unwrap();
-        assert_eq!(texts(&first), ["3", "1"]);
+        assert_eq!(texts(&first), ["1", "3"], "a newer one comes after what was told meanwhile");
         assert_eq!(first.0.len(), 2);
         tokio::time::sleep(Duration::from_secs(5)).await;
         assert!(w.delivered.is_empty());
@@ -354,25 +452,28 @@ mod tests {
         assert_eq!(gone.0, [KeyChange::Delete { key: "blaze:config:nav".to_owned() }]);
         w.lost.notify_one();
         let again = w.delivered.recv().await.unwrap();
+        let old = KeyChange::Delete {
+            key: "blaze:config:old".to_owned(),
+        };
         let slam = KeyChange::Put {
             key: "blaze:config:slam".to_owned(),
             value: Bytes::from("1"),
         };
-        assert_eq!(again, (vec![slam], Vec::new()));
+        assert_eq!(again, (vec![old, slam], Vec::new()), "and one that nobody wants goes");
     }
 
     #[test]
     fn what_came_meanwhile_is_newer_than_what_goes_back() {
         let mut state = State::default();
         state.put(told("slam", "1"));
-        let batch = state.take();
+        let batch = state.take(BATCH);
         state.put(told("slam", "2"));
         state.put_back(batch);
-        let left = state.take();
+        let left = state.take(BATCH);
         let texts: Vec<_> = left.waiting.iter().map(|(_, waiting)| waiting.notice.1.clone()).collect();
         assert_eq!(texts, ["2"]);
         assert_eq!(state.changes(&left.keys).len(), 1);
-        assert!(state.take().is_empty());
+        assert!(state.take(BATCH).is_empty());
     }
 
     #[test]
@@ -386,11 +487,38 @@ mod tests {
         state.put(moved("slam-at-b", Some("1")));
         state.put(moved("slam-at-a", None));
         state.put(moved("slam-at-b", Some("2")));
-        let batch = state.take();
+        let batch = state.take(BATCH);
         let put = KeyChange::Put {
             key: "blaze:config:slam:0".to_owned(),
             value: Bytes::from("2"),
         };
         assert_eq!(state.changes(&batch.keys), [put]);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn whom_the_broker_refuses_holds_up_nobody_else() {
+        let mut w = world(true);
+        w.speaker.tell([told("nav", "1"), told("refused", "1"), told("slam", "1")]);
+        let mut heard = Vec::new();
+        while heard.len() < 2 {
+            heard.extend(texts(&w.delivered.recv().await.unwrap()));
+        }
+        while w.speaker.counts().waiting > 0 {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        let counts = w.speaker.counts();
+        assert_eq!((counts.notices, counts.dropped), (2, 1));
+    }
+
+    #[test]
+    fn a_batch_is_bounded_in_bytes_but_never_empty() {
+        let mut state = State::default();
+        let large: &'static str = Box::leak("x".repeat(BATCH_BYTES).into_boxed_str());
+        state.put(told("a", large));
+        state.put(told("b", large));
+        state.put(told("c", "small"));
+        let counts: Vec<usize> = (0..3).map(|_| state.take(BATCH).waiting.len()).collect();
+        assert_eq!(counts, [1, 1, 1]);
+        assert!(state.take(BATCH).is_empty());
     }
 }

@@ -24,6 +24,12 @@ use crate::core::Incoming;
 const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;
 /// Time for one connection to come about.
 const CONNECT: Duration = Duration::from_millis(1500);
+/// Time for files to be read, a connection to come about and TLS to be agreed upon.
+const REACH: Duration = Duration::from_secs(5);
+/// The main service says something every 15 s; one that is silent for so long is as good as away, whatever its host answers.
+const SILENCE: Duration = Duration::from_secs(45);
+/// A stream that ended sooner was none: the next one is not tried at once.
+const GOOD: Duration = Duration::from_secs(10);
 /// Time for the answer to Hello.
 const WELCOME: Duration = Duration::from_secs(10);
 /// Between two looks whether the other end is still there. A cut link loses packets without a word, and TCP sends again in
@@ -45,6 +51,24 @@ pub struct MainService {
     pub ca_file: Option<PathBuf>,
     /// File with the token.
     pub token_file: Option<PathBuf>,
+}
+
+impl MainService {
+    /// Whether nobody else can read what is said: over TLS, or within this machine.
+    #[must_use]
+    pub fn is_safe(&self) -> bool {
+        let Some(rest) = self.server.strip_prefix("http://") else {
+            return self.server.starts_with("https://");
+        };
+        let authority = rest.split(['/', '?', '#']).next().unwrap_or_default();
+        let host = authority.rsplit_once('@').map_or(authority, |(_, host)| host);
+        let host = match host.strip_prefix('[') {
+            Some(rest) => rest.split(']').next().unwrap_or_default(),
+            None => host.split(':').next().unwrap_or_default(),
+        };
+        let is_loopback = |address: std::net::IpAddr| address.to_canonical().is_loopback();
+        host.parse().map_or_else(|_| host.eq_ignore_ascii_case("localhost"), is_loopback)
+    }
 }
 
 /// Why there is no stream.
@@ -81,7 +105,12 @@ pub enum ConnectError {
 #[derive(Debug)]
 pub enum SyncEvent {
     /// A connection is being made: who asks, and what does it have?
-    Greeting(oneshot::Sender<v1::Hello>),
+    Greeting {
+        /// Secrets come as text over this connection.
+        is_safe: bool,
+        /// Where the answer goes.
+        answer: oneshot::Sender<v1::Hello>,
+    },
     /// The main service has accepted it. Cancelling the token ends this stream, and the next greeting is asked for.
     Opened(CancellationToken),
     /// It has said something.
@@ -90,6 +119,8 @@ pub enum SyncEvent {
     Closed {
         /// Why, for people.
         reason: String,
+        /// What came cannot be taken, and would come again: only everything anew helps.
+        is_unreadable: bool,
     },
 }
 
@@ -116,6 +147,9 @@ struct Client {
 /// How a stream ended.
 struct End {
     reason: String,
+    is_unreadable: bool,
+    /// It was a good one: whatever failed before counts no more.
+    was_good: bool,
     /// The main service says when to come again.
     again: Option<Duration>,
     contact: Option<Instant>,
@@ -123,7 +157,8 @@ struct End {
 
 impl Client {
     async fn run(mut self) {
-        let (mut backoff, mut contact) = (Backoff::default(), None);
+        // Whoever has just started is as impatient as whoever was in contact just now.
+        let (mut backoff, mut contact) = (Backoff::default(), Instant::now());
         loop {
             self.main.borrow_and_update();
             let end = match self.once().await {
@@ -131,20 +166,28 @@ impl Client {
                 Err(ConnectError::Ending) => return,
                 Err(error) => End {
                     reason: error.to_string(),
+                    is_unreadable: false,
+                    was_good: false,
                     again: None,
                     contact: None,
                 },
             };
-            if end.contact.is_some() {
-                contact = end.contact;
+            contact = end.contact.unwrap_or(contact);
+            if end.was_good {
                 backoff.reset();
             }
             tracing::debug!(reason = end.reason, "not connected with the main service");
-            if self.events.send(SyncEvent::Closed { reason: end.reason }).await.is_err() {
+            let closed = SyncEvent::Closed {
+                reason: end.reason,
+                is_unreadable: end.is_unreadable,
+            };
+            if self.events.send(closed).await.is_err() {
                 return;
             }
-            let since = contact.map(|at: Instant| at.elapsed());
-            let wait = end.again.unwrap_or_else(|| backoff.next(since, rand::random()));
+            let since = Some(contact.elapsed());
+            let pause = backoff.next(since, rand::random());
+            // The main service knows best; a wish of our own counts only if it is not the next of many.
+            let wait = end.again.filter(|again| end.was_good || !again.is_zero()).unwrap_or(pause);
             tokio::select! {
                 () = tokio::time::sleep(wait) => {}
                 // Another address is worth a try at once; without a sender there is none.
@@ -156,10 +199,14 @@ impl Client {
     /// One stream from its beginning to its end.
     async fn once(&mut self) -> Result<End, ConnectError> {
         let main = self.main.borrow().clone();
-        let token = token(&main).await?;
-        let channel = channel(&main).await?;
-        let (send, hello) = oneshot::channel();
-        let asked = self.events.send(SyncEvent::Greeting(send)).await;
+        let reached = tokio::time::timeout(REACH, async { Ok((token(&main).await?, channel(&main).await?)) }).await;
+        let (token, channel) = reached.unwrap_or_else(|_| {
+            let reason = format!("no connection within {} s", REACH.as_secs());
+            Err(ConnectError::Transport(reason))
+        })?;
+        let (answer, hello) = oneshot::channel();
+        let is_safe = main.is_safe();
+        let asked = self.events.send(SyncEvent::Greeting { is_safe, answer }).await;
         asked.map_err(|_| ConnectError::Ending)?;
         let hello = hello.await.map_err(|_| ConnectError::Ending)?;
         let stream = self.open(channel, token, hello).await?;
@@ -192,15 +239,19 @@ impl Client {
     /// Hands on what comes until the stream ends.
     async fn listen(&mut self, mut stream: Streaming<v1::SyncResponse>) -> End {
         let restart = CancellationToken::new();
-        let mut contact = Instant::now();
-        let mut again = None;
+        let began = Instant::now();
+        let mut contact = began;
+        let (mut again, mut is_unreadable) = (None, false);
         let mut open = self.events.send(SyncEvent::Opened(restart.clone())).await.is_ok();
         let reason = loop {
             if !open {
                 break "the worker is ending".to_owned();
             }
             let message = tokio::select! {
-                message = stream.message() => message,
+                message = tokio::time::timeout(SILENCE, stream.message()) => match message {
+                    Ok(message) => message,
+                    Err(_) => break format!("the main service has said nothing for {} s", SILENCE.as_secs()),
+                },
                 () = restart.cancelled() => {
                     again = Some(Duration::ZERO);
                     break "the copy is asked for anew".to_owned();
@@ -218,13 +269,24 @@ impl Client {
                     }
                     open = self.events.send(SyncEvent::Said(incoming)).await.is_ok();
                 }
-                Ok(Some(Err(fault))) => break fault.to_string(),
+                // A message of a newer protocol.
+                Ok(Some(Err(IncomingError::Unknown))) => {}
+                Ok(Some(Err(fault))) => {
+                    is_unreadable = true;
+                    break fault.to_string();
+                }
                 Ok(None) => break "the main service has ended the stream".to_owned(),
-                Err(status) => break ConnectError::Refused(status).to_string(),
+                Err(status) => {
+                    // The library's word for a message that is too large.
+                    is_unreadable = status.code() == tonic::Code::OutOfRange;
+                    break ConnectError::Refused(status).to_string();
+                }
             }
         };
         End {
             reason,
+            is_unreadable,
+            was_good: began.elapsed() >= GOOD,
             again,
             contact: Some(contact),
         }
@@ -258,7 +320,7 @@ async fn channel(main: &MainService) -> Result<Channel, ConnectError> {
     let endpoint = match main.server.starts_with("https://") {
         false => endpoint,
         true => {
-            let tls = ClientTlsConfig::new();
+            let tls = ClientTlsConfig::new().timeout(CONNECT);
             let tls = match &main.ca_file {
                 None => tls.with_native_roots(),
                 Some(path) => {
@@ -293,4 +355,29 @@ async fn read(path: &std::path::Path, most: u64) -> Result<Vec<u8>, String> {
         return Err(format!("it has {} bytes, at most {most} are read", bytes.len()));
     }
     Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_tls_and_this_machine_are_safe() {
+        for (server, is_safe) in [
+            ("https://config.example.org:50051", true),
+            ("http://127.0.0.1:50051", true),
+            ("http://[::1]:50051", true),
+            ("http://localhost", true),
+            ("http://10.0.3.1:50051", false),
+            ("http://localhost.example.org", false),
+            ("http://127.0.0.1@evil.example.org", false),
+            ("ftp://127.0.0.1", false),
+        ] {
+            let main = MainService {
+                server: server.to_owned(),
+                ..MainService::default()
+            };
+            assert_eq!(main.is_safe(), is_safe, "{server}");
+        }
+    }
 }

@@ -15,11 +15,12 @@ use blaze_domain::{LayerName, NodeName};
 use futures::stream::{self, BoxStream};
 use futures::StreamExt as _;
 use rand::RngExt as _;
+use serde_json::Value;
 use tokio::sync::OwnedSemaphorePermit;
 
 use super::super::committer::now;
 use super::super::secrets;
-use super::super::types::{Caller, ReadOptions, WatchCommit, WatchItem};
+use super::super::types::{Caller, ReadOptions, WatchCommit, WatchItem, WatchOp};
 use super::super::view::view;
 use super::super::workers::{Acknowledged, WorkerName, WorkerSession};
 use super::ConfigService;
@@ -139,6 +140,18 @@ impl Clear {
         Arc::new(clear)
     }
 
+    /// Of what is gone the name is enough: with everything that a layer lost at once the message could be too large.
+    fn changed(&self, op: WatchOp, held: &Arc<Document>) -> Arc<Document> {
+        match op {
+            WatchOp::Create | WatchOp::Update => self.document(held),
+            WatchOp::Delete | WatchOp::Leave => Arc::new(Document {
+                spec: Arc::new(Value::Object(serde_json::Map::new())),
+                status: None,
+                ..(**held).clone()
+            }),
+        }
+    }
+
     fn commit(&self, commit: &WatchCommit) -> Arc<WatchCommit> {
         let changes = commit.changes.iter();
         Arc::new(WatchCommit {
@@ -146,7 +159,7 @@ impl Clear {
             previous: commit.previous,
             time: commit.time,
             subject: commit.subject.clone(),
-            changes: changes.map(|(op, held)| (*op, self.document(held))).collect(),
+            changes: changes.map(|(op, held)| (*op, self.changed(*op, held))).collect(),
             json: OnceLock::new(),
             wire: OnceLock::new(),
         })
