@@ -159,6 +159,26 @@ fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
     ]
     .map(|(result, count)| (format!("{{result=\"{result}\"}}"), count as f64));
     one("blaze_worker_requests_total", "counter", "Requests for configurations by result.", &requests);
+    let signs = [("understood", counts.signs), ("misunderstood", counts.misunderstood), ("left_out", counts.left_out)]
+        .map(|(result, count)| (format!("{{result=\"{result}\"}}"), count as f64));
+    one(
+        "blaze_worker_signs_total",
+        "counter",
+        "Acknowledgements and signs of life of services by result.",
+        &signs,
+    );
+    one(
+        "blaze_worker_rollouts_failed_total",
+        "counter",
+        "Roll-outs that failed here and were undone.",
+        &plain(counts.failed_rollouts as f64),
+    );
+    one(
+        "blaze_worker_canaries_unwatched",
+        "gauge",
+        "Canaries that are not judged, because there are too many.",
+        &plain(status.unwatched as f64),
+    );
     one(
         "blaze_worker_sync_faults_total",
         "counter",

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_brokers::redis::RedisKeys;
-use blaze_brokers::{Broker, BrokerKind, Content, SubscribeOptions};
+use blaze_brokers::{Broker, BrokerKind};
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::DatabaseSection;
 use blaze_runtime::{Supervisor, TaskPolicy};
@@ -22,23 +22,13 @@ use crate::copy::{
     Copies, Counts as CopyCounts, DATABASE_LIMIT, DATABASE_NAME, FileCopy, LocalCopy, Notes, SqliteCopy, Start, Target,
     Vault, choose, defaults,
 };
-use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Status};
+use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
+use crate::hearing::{ACK, GET, WATCHDOG, listen, notice_deafness, scan};
 use crate::lease::{self, Lease};
 use crate::serve::{BrokerOutlet, Speaker, SpeakerCounts};
 use crate::settings::WorkerSettings;
 use crate::sync::{MainService, follow};
 
-/// Where services ask.
-const GET: &str = "blaze/config/get";
-/// Requests that wait for the engine.
-const REQUESTS: SubscribeOptions = SubscribeOptions {
-    max_messages: 4096,
-    max_bytes: 16 * 1024 * 1024,
-    large: false,
-    with_kept: false,
-};
-/// Between two tries to listen on a broker that is away.
-const LISTEN_AGAIN: Duration = Duration::from_millis(200);
 /// Between two looks at the mounted file.
 const LOOK_AT_FILE: Duration = Duration::from_millis(500);
 /// How long the end waits for the copies.
@@ -91,6 +81,7 @@ impl RunningWorker {
         }
         let speaker = Speaker::default();
         let mut outlet = BrokerOutlet::new(Arc::clone(&broker));
+        let records = keys.clone();
         if let Some(keys) = keys {
             outlet = outlet.with_keys(keys, settings.keys_on_broker());
         }
@@ -99,6 +90,7 @@ impl RunningWorker {
         let (queries, asked) = mpsc::channel(QUEUE);
         let (events, sync) = mpsc::channel(QUEUE);
         let (requests, gets) = mpsc::channel(QUEUE);
+        let (said, signs) = mpsc::channel(QUEUE);
         let (lead, leader) = watch::channel(lease.is_none());
         let defaults = match &settings.defaults_file {
             Some(path) => {
@@ -121,6 +113,7 @@ impl RunningWorker {
         let inputs = Inputs {
             sync,
             gets,
+            signs,
             defaults,
             leader,
             queries: asked,
@@ -138,7 +131,13 @@ impl RunningWorker {
         let engine = Engine::new(identity, outputs, start.loaded);
         spawn("engine", Box::pin(engine.run(inputs, stop.clone())));
         spawn("notices", Box::pin(speaker.clone().run(outlet)));
-        spawn("requests", Box::pin(listen(broker, requests)));
+        spawn("requests", Box::pin(listen(Arc::clone(&broker), GET, requests, |payload| payload)));
+        spawn("acknowledgements", Box::pin(listen(Arc::clone(&broker), ACK, said.clone(), Sign::Ack)));
+        spawn("watchdogs", Box::pin(listen(Arc::clone(&broker), WATCHDOG, said.clone(), Sign::Beat)));
+        spawn("outages", Box::pin(notice_deafness(broker.status(), said.clone())));
+        if let Some(records) = records {
+            spawn("records of watchdogs", Box::pin(scan(records, said)));
+        }
         if let Some(lease) = &lease {
             spawn("lease", Box::pin(lease::keep(Arc::clone(lease), settings.lease, lead)));
         }
@@ -278,39 +277,6 @@ async fn make_folder(path: &std::path::Path) -> anyhow::Result<()> {
         .create(path)
         .await
         .with_context(|| format!("{}", path.display()))
-}
-
-/// Hands on what services ask, for ever.
-async fn listen(broker: Arc<dyn Broker>, requests: mpsc::Sender<Bytes>) {
-    // It is a good name.
-    let Ok(channel) = GET.parse::<ChannelName>() else { return };
-    loop {
-        let mut subscription = match broker.subscribe(&channel, REQUESTS).await {
-            Ok(subscription) => subscription,
-            Err(error) => {
-                tracing::debug!(%error, "nobody can ask yet");
-                tokio::time::sleep(LISTEN_AGAIN).await;
-                continue;
-            }
-        };
-        let mut batch = Vec::new();
-        while subscription.receive(&mut batch, 64).await > 0 {
-            for received in batch.drain(..) {
-                let request = match received.content {
-                    Content::Bare { payload, .. } => payload,
-                    // Requests are never framed.
-                    Content::Frame(_) | Content::Malformed { .. } => continue,
-                };
-                if requests.send(request).await.is_err() {
-                    return;
-                }
-            }
-            let dropped = subscription.take_dropped();
-            if dropped > 0 {
-                tracing::warn!(dropped, "more requests than can be answered; who asked asks again");
-            }
-        }
-    }
 }
 
 /// Answers over the broker.

@@ -263,7 +263,11 @@ impl RedisKeys {
         }
     }
 
-    async fn run_id(&self) -> Result<Option<String>, KeyError> {
+    /// Which start of the server this is: after another one, what it had may be lost. `None`: it does not say.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn run_id(&self) -> Result<Option<String>, KeyError> {
         let info = self
             .call(|mut connection| async move {
                 let mut info = redis::cmd("INFO");

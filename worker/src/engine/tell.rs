@@ -98,6 +98,8 @@ impl Engine {
             self.keep_notes();
         }
         self.tell(told, instant);
+        // After the notices: only what was told can go well or badly.
+        self.follow_rollouts();
         if self.served.has_pending() {
             self.flush_soon();
         }
@@ -213,7 +215,7 @@ impl Engine {
     }
 
     /// Has the notes kept beside the newest state.
-    fn keep_notes(&mut self) {
+    pub(super) fn keep_notes(&mut self) {
         let Some(copies) = &self.outputs.copies else { return };
         let (Some(store_id), Some(as_of)) = (self.replica.store_id(), self.replica.as_of()) else {
             return;

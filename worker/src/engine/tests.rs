@@ -1,5 +1,8 @@
 //! The engine between a main service, a broker and a lease that the test plays.
 
+#[path = "hear_tests.rs"]
+mod hear;
+
 use async_trait::async_trait;
 use blaze_brokers::redis::KeyChange;
 use blaze_domain::config::Document;
@@ -67,6 +70,7 @@ fn parse(bytes: &[u8]) -> Value {
 struct World {
     sync: mpsc::Sender<SyncEvent>,
     gets: mpsc::Sender<Bytes>,
+    signs: mpsc::Sender<Sign>,
     leader: watch::Sender<bool>,
     defaults: watch::Sender<defaults::Status>,
     queries: mpsc::Sender<Query>,
@@ -77,8 +81,13 @@ struct World {
 }
 
 fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
+    world_with(start, is_leader, None)
+}
+
+fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) -> World {
     let (sync, sync_in) = mpsc::channel(64);
     let (gets, gets_in) = mpsc::channel(64);
+    let (signs, signs_in) = mpsc::channel(64);
     let (queries, queries_in) = mpsc::channel(64);
     let (leader, leader_in) = watch::channel(is_leader);
     let (defaults, defaults_in) = watch::channel(defaults::Status::default());
@@ -98,12 +107,13 @@ fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
     let outputs = Outputs {
         replies: Arc::new(Answers(answer)),
         speaker: speaker.clone(),
-        copies: None,
+        copies,
         acks: acks_out,
     };
     let inputs = Inputs {
         sync: sync_in,
         gets: gets_in,
+        signs: signs_in,
         defaults: defaults_in,
         leader: leader_in,
         queries: queries_in,
@@ -114,6 +124,7 @@ fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
     World {
         sync,
         gets,
+        signs,
         leader,
         defaults,
         queries,
