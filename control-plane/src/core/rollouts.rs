@@ -72,6 +72,20 @@ fn nodes(after: &State, rollout: &Document) -> Vec<Value> {
         .collect()
 }
 
+/// Puts into a status how it goes on a canary; a node that became one after the beginning is added.
+pub(super) fn tell_canary(status: &mut Value, node: &str, phase: &str, revision: u64, reason: &str) {
+    let Some(lines) = status.get_mut("canaries").and_then(Value::as_array_mut) else {
+        return;
+    };
+    let line = json!({ "node": node, "phase": phase, "revision": revision, "reason": reason });
+    let is_of_node = |line: &&mut Value| line.get("node").and_then(Value::as_str) == Some(node);
+    match lines.iter_mut().find(is_of_node) {
+        Some(held) => *held = line,
+        None if lines.len() < MAX_CANARIES => lines.push(line),
+        None => {}
+    }
+}
+
 /// Refuses a roll-out whose target would have another size than a document may have.
 pub(super) fn too_large(target: &Document, changed: &Value) -> Result<(), Box<Problem>> {
     let bytes = spec::document_size(&target.labels, &target.annotations, changed);

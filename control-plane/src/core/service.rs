@@ -1,5 +1,6 @@
 //! The use cases, as REST and gRPC call them. Every right is checked here, whoever asks.
 
+mod canaries;
 mod history;
 mod read;
 mod sync;

@@ -158,7 +158,7 @@ impl ConfigService {
             true => self.shown(caller, &held.document, true).await?,
             false => Arc::clone(&held.shown),
         };
-        Ok(answer(&state, document))
+        Ok(answer(&state, self.with_canaries(&state, document)))
     }
 
     /// Documents by name, bytewise; all pages show the state of the first one.
@@ -229,6 +229,9 @@ impl ConfigService {
         drop(found);
         if read.reveal {
             items = self.reveal_all(caller, items).await?;
+        }
+        if read.at_revision.is_none() {
+            items = items.into_iter().map(|item| self.with_canaries(&state, item)).collect();
         }
         let next = items.last().filter(|_| more).map(|document| Position {
             revision: state.revision(),

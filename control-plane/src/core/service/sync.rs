@@ -166,7 +166,7 @@ impl ConfigService {
         let state = self.read_state(&ReadOptions::default()).await?;
         let resumed = self.can_resume(&hello, &state).await;
         let since = if resumed { hello.revision } else { state.revision() };
-        let session = self.enter(&hello)?;
+        let session = self.enter(&hello)?.from_address(caller.address);
         let clear = Clear {
             keyring: Arc::clone(&self.inner.evaluator.keyring),
             is_safe,
@@ -195,8 +195,9 @@ impl ConfigService {
         })
     }
 
-    /// Notes what a worker says it has.
+    /// Notes what a worker says it has. A roll-out that failed there ends everywhere.
     pub fn acknowledged(&self, session: &WorkerSession, has: Acknowledged) {
+        self.end_failed(session, &has);
         session.said(has, now());
     }
 
