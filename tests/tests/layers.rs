@@ -62,7 +62,14 @@ const OUTSIDE: &[(&str, &[&str])] = &[
     ("axum", &["blaze-runtime", "blaze-flow", "blaze-config", "blaze-worker"]),
     (
         "anyhow",
-        &["blaze-runtime", "blaze-flow", "blaze-config", "blaze-worker", "blaze", "blaze-tests"],
+        &[
+            "blaze-runtime",
+            "blaze-flow",
+            "blaze-config",
+            "blaze-worker",
+            "blaze",
+            "blaze-tests",
+        ],
     ),
     ("mongodb", &["blaze-config", "blaze-worker", "blaze-tests"]),
     ("rusqlite", &["blaze-config", "blaze-worker"]),

@@ -50,7 +50,12 @@ impl Shown {
 
     /// Looks at the worker again and again, for readiness and metrics.
     pub async fn look(self, readiness: Readiness) {
-        readiness.add("configuration", Gate::Decides, CheckStatus::Failed, "nothing is loaded yet");
+        readiness.add(
+            "configuration",
+            Gate::Decides,
+            CheckStatus::Failed,
+            "nothing is loaded yet",
+        );
         readiness.add("main service", Gate::Shows, CheckStatus::Failed, "not connected yet");
         readiness.add("mounted file", Gate::Shows, CheckStatus::Ok, "");
         loop {
@@ -132,7 +137,12 @@ fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
         let is_it = f64::from(u8::from(source == Some(word)));
         (format!("{{source=\"{word}\"}}"), is_it)
     });
-    one("blaze_worker_source", "gauge", "1 for where configurations come from.", &sources);
+    one(
+        "blaze_worker_source",
+        "gauge",
+        "1 for where configurations come from.",
+        &sources,
+    );
     one(
         "blaze_worker_notices_total",
         "counter",
@@ -158,7 +168,36 @@ fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
         ("left_to_others", counts.left_to_others),
     ]
     .map(|(result, count)| (format!("{{result=\"{result}\"}}"), count as f64));
-    one("blaze_worker_requests_total", "counter", "Requests for configurations by result.", &requests);
+    one(
+        "blaze_worker_requests_total",
+        "counter",
+        "Requests for configurations by result.",
+        &requests,
+    );
+    let signs = [
+        ("understood", counts.signs),
+        ("misunderstood", counts.misunderstood),
+        ("left_out", counts.left_out),
+    ]
+    .map(|(result, count)| (format!("{{result=\"{result}\"}}"), count as f64));
+    one(
+        "blaze_worker_signs_total",
+        "counter",
+        "Acknowledgements and signs of life of services by result.",
+        &signs,
+    );
+    one(
+        "blaze_worker_rollouts_failed_total",
+        "counter",
+        "Roll-outs that failed here and were undone.",
+        &plain(counts.failed_rollouts as f64),
+    );
+    one(
+        "blaze_worker_canaries_unwatched",
+        "gauge",
+        "Canaries that are not judged, because there are too many.",
+        &plain(status.unwatched as f64),
+    );
     one(
         "blaze_worker_sync_faults_total",
         "counter",
@@ -168,10 +207,23 @@ fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
     let copies = worker.copies();
     let of = |count: fn(&crate::copy::Counts) -> u64| -> Vec<(String, f64)> {
         let label = |place: &str| format!("{{copy=\"{}\"}}", place.replace(['"', '\\', '\n'], "_"));
-        copies.iter().map(|copy| (label(&copy.place), count(copy) as f64)).collect()
+        copies
+            .iter()
+            .map(|copy| (label(&copy.place), count(copy) as f64))
+            .collect()
     };
-    one("blaze_worker_copy_writes_total", "counter", "Writes of a copy that were done.", &of(|copy| copy.written));
-    one("blaze_worker_copy_failures_total", "counter", "Writes of a copy that failed.", &of(|copy| copy.failed));
+    one(
+        "blaze_worker_copy_writes_total",
+        "counter",
+        "Writes of a copy that were done.",
+        &of(|copy| copy.written),
+    );
+    one(
+        "blaze_worker_copy_failures_total",
+        "counter",
+        "Writes of a copy that failed.",
+        &of(|copy| copy.failed),
+    );
 }
 
 async fn status(State(shown): State<Shown>) -> Response {

@@ -124,7 +124,9 @@ mod tests {
             }
             let mut held = self.server.held.lock();
             let now = Instant::now();
-            let is_free = held.as_ref().is_none_or(|(owner, until)| owner == self.owner || *until <= now);
+            let is_free = held
+                .as_ref()
+                .is_none_or(|(owner, until)| owner == self.owner || *until <= now);
             if is_free {
                 *held = Some((self.owner.to_owned(), now + time));
             }

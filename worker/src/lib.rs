@@ -12,6 +12,7 @@ pub mod admin;
 pub mod copy;
 pub mod core;
 pub mod engine;
+mod hearing;
 pub mod lease;
 pub mod running;
 pub mod serve;

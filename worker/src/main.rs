@@ -179,8 +179,11 @@ async fn begin(settings: WorkerSettings, file: &NodeFile, supervisor: &Superviso
     // On the broker of a node there is one worker; on that of a layer there may be several.
     let lease = match (&settings.site.node, &keys) {
         (None, Some(keys)) => {
-            let lease: Arc<dyn Lease> =
-                Arc::new(RedisLease::new(Arc::clone(keys), &settings.site.layer, worker_id.clone()));
+            let lease: Arc<dyn Lease> = Arc::new(RedisLease::new(
+                Arc::clone(keys),
+                &settings.site.layer,
+                worker_id.clone(),
+            ));
             Some(lease)
         }
         (Some(_), _) | (None, None) => None,

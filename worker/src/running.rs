@@ -11,34 +11,26 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_brokers::redis::RedisKeys;
-use blaze_brokers::{Broker, BrokerKind, Content, SubscribeOptions};
+use blaze_brokers::{Broker, BrokerKind};
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::DatabaseSection;
 use blaze_runtime::{Supervisor, TaskPolicy};
 use bytes::Bytes;
 use tokio::sync::{mpsc, oneshot, watch};
+use tokio_util::sync::CancellationToken;
 
 use crate::copy::{
     Copies, Counts as CopyCounts, DATABASE_LIMIT, DATABASE_NAME, FileCopy, LocalCopy, Notes, SqliteCopy, Start, Target,
     Vault, choose, defaults,
 };
-use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Status};
+use crate::core::Site;
+use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
+use crate::hearing::{ACK, GET, WATCHDOG, listen, notice_deafness, scan};
 use crate::lease::{self, Lease};
 use crate::serve::{BrokerOutlet, Speaker, SpeakerCounts};
 use crate::settings::WorkerSettings;
 use crate::sync::{MainService, follow};
 
-/// Where services ask.
-const GET: &str = "blaze/config/get";
-/// Requests that wait for the engine.
-const REQUESTS: SubscribeOptions = SubscribeOptions {
-    max_messages: 4096,
-    max_bytes: 16 * 1024 * 1024,
-    large: false,
-    with_kept: false,
-};
-/// Between two tries to listen on a broker that is away.
-const LISTEN_AGAIN: Duration = Duration::from_millis(200);
 /// Between two looks at the mounted file.
 const LOOK_AT_FILE: Duration = Duration::from_millis(500);
 /// How long the end waits for the copies.
@@ -66,6 +58,7 @@ pub struct RunningWorker {
     speaker: Speaker,
     copies: Option<Copies>,
     lease: Option<Arc<dyn Lease>>,
+    lease_over: CancellationToken,
     main: watch::Sender<MainService>,
 }
 
@@ -91,19 +84,22 @@ impl RunningWorker {
         }
         let speaker = Speaker::default();
         let mut outlet = BrokerOutlet::new(Arc::clone(&broker));
+        let records = keys.clone();
         if let Some(keys) = keys {
-            outlet = outlet.with_keys(keys, settings.keys_on_broker());
+            let site = settings.site.clone();
+            let is_own = move |value: &[u8]| is_own(&site, value);
+            outlet = outlet.with_keys(keys, settings.keys_on_broker(), is_own);
         }
         let outlet = Arc::new(outlet);
         let (acks, acked) = watch::channel(None);
         let (queries, asked) = mpsc::channel(QUEUE);
         let (events, sync) = mpsc::channel(QUEUE);
         let (requests, gets) = mpsc::channel(QUEUE);
+        let (said, signs) = mpsc::channel(QUEUE);
         let (lead, leader) = watch::channel(lease.is_none());
+        let lease_over = CancellationToken::new();
         let defaults = match &settings.defaults_file {
-            Some(path) => {
-                defaults::watch_file(supervisor, path.clone(), settings.site.layer.clone(), LOOK_AT_FILE)
-            }
+            Some(path) => defaults::watch_file(supervisor, path.clone(), settings.site.layer.clone(), LOOK_AT_FILE),
             None => watch::channel(defaults::Status::default()).1,
         };
         let identity = Identity {
@@ -121,6 +117,7 @@ impl RunningWorker {
         let inputs = Inputs {
             sync,
             gets,
+            signs,
             defaults,
             leader,
             queries: asked,
@@ -138,9 +135,37 @@ impl RunningWorker {
         let engine = Engine::new(identity, outputs, start.loaded);
         spawn("engine", Box::pin(engine.run(inputs, stop.clone())));
         spawn("notices", Box::pin(speaker.clone().run(outlet)));
-        spawn("requests", Box::pin(listen(broker, requests)));
+        spawn(
+            "requests",
+            Box::pin(listen(Arc::clone(&broker), GET, requests, |payload| payload)),
+        );
+        spawn(
+            "acknowledgements",
+            Box::pin(listen(Arc::clone(&broker), ACK, said.clone(), Sign::Ack)),
+        );
+        spawn(
+            "watchdogs",
+            Box::pin(listen(Arc::clone(&broker), WATCHDOG, said.clone(), Sign::Beat)),
+        );
+        spawn("outages", Box::pin(notice_deafness(broker.status(), said.clone())));
+        if let Some(records) = records {
+            spawn("records of watchdogs", Box::pin(scan(records, said)));
+        }
         if let Some(lease) = &lease {
-            spawn("lease", Box::pin(lease::keep(Arc::clone(lease), settings.lease, lead)));
+            let (over, again) = (lease_over.clone(), lead.clone());
+            let keep = lease::keep(Arc::clone(lease), settings.lease, lead);
+            spawn(
+                "lease",
+                Box::pin(async move {
+                    tokio::select! {
+                        () = keep => {}
+                        () = over.cancelled() => {
+                            again.send_replace(false);
+                            std::future::pending::<()>().await;
+                        }
+                    }
+                }),
+            );
         }
         let main = settings.main.clone();
         let (main_sender, main_receiver) = watch::channel(main.clone().unwrap_or_default());
@@ -152,6 +177,7 @@ impl RunningWorker {
             speaker,
             copies,
             lease,
+            lease_over,
             main: main_sender,
         })
     }
@@ -177,7 +203,8 @@ impl RunningWorker {
 
     /// The main service is elsewhere from now on.
     pub fn set_main(&self, main: MainService) {
-        self.main.send_if_modified(|now| std::mem::replace(now, main.clone()) != main);
+        self.main
+            .send_if_modified(|now| std::mem::replace(now, main.clone()) != main);
     }
 
     /// Leaves everything as the next life wants to find it: copies that are up to date, no lease.
@@ -187,6 +214,8 @@ impl RunningWorker {
         {
             tracing::warn!("a copy is behind; the next start gets the rest from the other one or the main service");
         }
+        // From now on nothing is told, and the lease is not taken again.
+        self.lease_over.cancel();
         if let Some(lease) = &self.lease {
             lease.release().await;
         }
@@ -225,9 +254,8 @@ impl Kept {
             (None, Some(folder)) => Some(sqlite(folder.join(DATABASE_NAME)).context("the copy")?),
             (None, None) => None,
         };
-        let file = folder.map(|folder| -> Arc<dyn LocalCopy> {
-            Arc::new(FileCopy::new(&folder, layer.clone(), vault.clone()))
-        });
+        let file = folder
+            .map(|folder| -> Arc<dyn LocalCopy> { Arc::new(FileCopy::new(&folder, layer.clone(), vault.clone())) });
         Ok(Self { database, file })
     }
 
@@ -238,7 +266,12 @@ impl Kept {
         let current = [start.is_database_current, start.is_file_current];
         let targets = [self.database, self.file].into_iter().zip(current);
         let targets: Vec<Target> = targets
-            .filter_map(|(copy, is_current)| Some(Target { copy: copy?, is_current }))
+            .filter_map(|(copy, is_current)| {
+                Some(Target {
+                    copy: copy?,
+                    is_current,
+                })
+            })
             .collect();
         if targets.is_empty() {
             return (None, start);
@@ -280,37 +313,16 @@ async fn make_folder(path: &std::path::Path) -> anyhow::Result<()> {
         .with_context(|| format!("{}", path.display()))
 }
 
-/// Hands on what services ask, for ever.
-async fn listen(broker: Arc<dyn Broker>, requests: mpsc::Sender<Bytes>) {
-    // It is a good name.
-    let Ok(channel) = GET.parse::<ChannelName>() else { return };
-    loop {
-        let mut subscription = match broker.subscribe(&channel, REQUESTS).await {
-            Ok(subscription) => subscription,
-            Err(error) => {
-                tracing::debug!(%error, "nobody can ask yet");
-                tokio::time::sleep(LISTEN_AGAIN).await;
-                continue;
-            }
-        };
-        let mut batch = Vec::new();
-        while subscription.receive(&mut batch, 64).await > 0 {
-            for received in batch.drain(..) {
-                let request = match received.content {
-                    Content::Bare { payload, .. } => payload,
-                    // Requests are never framed.
-                    Content::Frame(_) | Content::Malformed { .. } => continue,
-                };
-                if requests.send(request).await.is_err() {
-                    return;
-                }
-            }
-            let dropped = subscription.take_dropped();
-            if dropped > 0 {
-                tracing::warn!(dropped, "more requests than can be answered; who asked asks again");
-            }
-        }
-    }
+/// Whether a value is one that a worker of this site writes: several may share a server.
+fn is_own(site: &Site, value: &[u8]) -> bool {
+    let Ok(value) = serde_json::from_slice::<serde_json::Value>(value) else {
+        return false;
+    };
+    let is_node = match &site.node {
+        Some(node) => value["node"] == node.as_str(),
+        None => true,
+    };
+    is_node && value["layer"] == site.layer.as_str() && value["hash"].is_string()
 }
 
 /// Answers over the broker.

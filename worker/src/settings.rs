@@ -65,7 +65,10 @@ impl WorkerSettings {
             (Some(node), _) => Some(LocalBroker::Node(node.clone())),
             (None, Some(layer)) => Some(LocalBroker::Layer(layer.clone())),
             (None, None) => {
-                missing("brokers", "blaze-worker needs node or layer: services ask for their configuration there");
+                missing(
+                    "brokers",
+                    "blaze-worker needs node or layer: services ask for their configuration there",
+                );
                 None
             }
         };
@@ -187,7 +190,8 @@ mod tests {
         assert!(on_node.keys_on_broker());
         let on_layer = settings(json!({ "brokers": { "layer": { "memory": {} } } })).unwrap();
         assert_eq!((on_layer.site.node, on_layer.keys), (None, None));
-        let elsewhere = json!({ "brokers": redis("redis://127.0.0.1"), "cache": { "redis": { "url": "redis://10.0.0.1" } } });
+        let elsewhere =
+            json!({ "brokers": redis("redis://127.0.0.1"), "cache": { "redis": { "url": "redis://10.0.0.1" } } });
         assert!(!settings(elsewhere).unwrap().keys_on_broker());
     }
 
@@ -210,9 +214,14 @@ mod tests {
             ("redis://127.0.0.1.example.org", Delivery::Redacted),
             ("redis://localhost@evil.example.org", Delivery::Redacted),
         ] {
-            assert_eq!(settings(json!({ "brokers": redis(url) })).unwrap().delivery, delivery, "{url}");
+            assert_eq!(
+                settings(json!({ "brokers": redis(url) })).unwrap().delivery,
+                delivery,
+                "{url}"
+            );
         }
-        let cache = json!({ "brokers": redis("redis://127.0.0.1"), "cache": { "redis": { "url": "redis://10.0.0.1" } } });
+        let cache =
+            json!({ "brokers": redis("redis://127.0.0.1"), "cache": { "redis": { "url": "redis://10.0.0.1" } } });
         assert_eq!(settings(cache).unwrap().delivery, Delivery::Redacted);
         let forced = json!({ "brokers": redis("redis://10.0.0.1"), "worker": { "deliver_secrets": true } });
         assert_eq!(settings(forced).unwrap().delivery, Delivery::Text);

@@ -163,7 +163,10 @@ impl RedisKeys {
         let key = self.settings.names.key(key);
         let value = self
             .call(|mut connection| async move {
-                redis::cmd("GET").arg(key).query_async::<Option<Vec<u8>>>(&mut connection).await
+                redis::cmd("GET")
+                    .arg(key)
+                    .query_async::<Option<Vec<u8>>>(&mut connection)
+                    .await
             })
             .await?;
         Ok(value.map(Bytes::from))
@@ -177,7 +180,10 @@ impl RedisKeys {
         let key = self.settings.names.key(key);
         let members = self
             .call(|mut connection| async move {
-                redis::cmd("HGETALL").arg(key).query_async::<Record>(&mut connection).await
+                redis::cmd("HGETALL")
+                    .arg(key)
+                    .query_async::<Record>(&mut connection)
+                    .await
             })
             .await?;
         Ok((!members.is_empty()).then_some(members))
@@ -195,7 +201,10 @@ impl RedisKeys {
         for key in &keys {
             let value = self
                 .call(|mut connection| async move {
-                    redis::cmd("GET").arg(key).query_async::<Option<Vec<u8>>>(&mut connection).await
+                    redis::cmd("GET")
+                        .arg(key)
+                        .query_async::<Option<Vec<u8>>>(&mut connection)
+                        .await
                 })
                 .await?;
             let name = key.strip_prefix(&prefix).unwrap_or(key).to_owned();
@@ -252,7 +261,8 @@ impl RedisKeys {
     /// [`KeyError`]: then it may run out, or be had.
     pub async fn hold(&self, key: &str, owner: &str, time: Duration) -> Result<bool, KeyError> {
         let mut call = self.hold.key(self.settings.names.key(key));
-        call.arg(owner).arg(u64::try_from(time.as_millis()).unwrap_or(u64::MAX).max(1));
+        call.arg(owner)
+            .arg(u64::try_from(time.as_millis()).unwrap_or(u64::MAX).max(1));
         self.call(|mut connection| async move { call.invoke_async::<bool>(&mut connection).await })
             .await
     }
@@ -284,7 +294,11 @@ impl RedisKeys {
         }
     }
 
-    async fn run_id(&self) -> Result<Option<String>, KeyError> {
+    /// Which start of the server this is: after another one, what it had may be lost. `None`: it does not say.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn run_id(&self) -> Result<Option<String>, KeyError> {
         let info = self
             .call(|mut connection| async move {
                 let mut info = redis::cmd("INFO");
@@ -312,7 +326,10 @@ impl RedisKeys {
         let config = AsyncConnectionConfig::new()
             .set_connection_timeout(Some(CONNECT))
             .set_response_timeout(Some(CALL));
-        let made = self.settings.client.get_multiplexed_async_connection_with_config(&config);
+        let made = self
+            .settings
+            .client
+            .get_multiplexed_async_connection_with_config(&config);
         let made = tokio::time::timeout(CONNECT, made).await;
         let made = made.unwrap_or_else(|_| Err(RedisError::from((redis::ErrorKind::Io, "no connection within 1 s"))));
         let connection = made.map_err(|error| self.failed(&error))?;

@@ -7,10 +7,10 @@ use blaze_domain::config::selector::LabelSelector;
 use blaze_domain::config::{Document, Key, Kind};
 use blaze_domain::{LayerName, NodeName, ServiceName};
 
+use super::view::View;
 use blaze_domain::config::effective::{At, Sources, canaries, is_canary};
 use blaze_domain::config::placement::rollout_target;
 use blaze_domain::config::state::State;
-use super::view::View;
 
 /// Places that are looked at for one request, at most: beyond it the answer would take longer than it is worth.
 pub(crate) const MAX_CANDIDATES: usize = 200_000;

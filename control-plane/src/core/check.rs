@@ -12,11 +12,11 @@ use serde_json::Value;
 
 use super::affected::{MAX_CANDIDATES, touched};
 use super::cost::{MAX_WORK, MAX_WORK_OF_COMMIT, MAX_WORK_OF_FAULTS, Size};
-use blaze_domain::config::effective::{At, Sources};
 use super::pattern::{self, Exhausted};
 use super::schema::{Compiled, Schemas, with_placeholders};
-use blaze_domain::config::state::State;
 use super::view::View;
+use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::state::State;
 
 /// Faults that are told, at most.
 const MAX_FAULTS: usize = 20;

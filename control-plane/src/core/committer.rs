@@ -25,9 +25,9 @@ use super::affected::{MAX_CANDIDATES, MAX_KEPT_CANDIDATES};
 use super::evaluate::{Evaluator, Request};
 use super::log::Log;
 use super::report::{AnswerKind, Done};
-use blaze_domain::config::state::State;
 use super::view::view;
 use crate::store::{AuditEntry, Change, Commit, CommitError, CommitRecord, IdempotencyRecord, Op, Store, StoreError};
+use blaze_domain::config::state::State;
 
 /// Requests that may wait, at most.
 pub(crate) const QUEUE: usize = 4096;

@@ -7,6 +7,7 @@ mod outcome;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
+use blaze_domain::NodeName;
 use blaze_domain::config::diff::{document_diff, paths};
 use blaze_domain::config::selector::LabelSelector;
 use blaze_domain::config::{Code, Document, FieldFault, Key, Kind, MAX_DOCUMENTS, Problem, Timestamp, secret};
@@ -18,16 +19,16 @@ use self::outcome::{Outcome, Target, cascade_into, outcome_of, prune_into, same_
 
 use super::check::too_many;
 use super::cost::{MAX_WORK_OF_COMMIT, STEPS_OF_REFUSED};
-use blaze_domain::config::placement::rollout_target;
 use super::refs;
 use super::rollouts::{begin, tried};
 use super::schema::Schemas;
 use super::secrets::Vault;
-use blaze_domain::config::state::{State, tries_schema};
 use super::types::{ApplyAction, Caller, DocumentInput, Precondition};
 use super::view::view;
 use crate::secrets::Keyring;
 use crate::store::{Change, Op};
+use blaze_domain::config::placement::rollout_target;
+use blaze_domain::config::state::{State, tries_schema};
 
 /// What one document is to become.
 #[derive(Debug, Clone)]
@@ -46,6 +47,21 @@ pub(crate) enum Content {
     Promote,
     /// The roll-out ends without effect, for a reason.
     Abort(String),
+    /// The roll-out has failed on a canary. Nothing happens if it has ended meanwhile.
+    Fail(Failed),
+}
+
+/// What a worker says of a roll-out that it has undone.
+#[derive(Debug, Clone)]
+pub(crate) struct Failed {
+    /// Of the roll-out: another one may have its name by now.
+    pub(crate) uid: String,
+    /// Where.
+    pub(crate) node: NodeName,
+    /// Revision of what the worker has.
+    pub(crate) revision: u64,
+    /// Why.
+    pub(crate) reason: String,
 }
 
 /// One document of a request.
@@ -115,6 +131,7 @@ impl Request {
                 | Content::Restore(_)
                 | Content::Delete
                 | Content::Abort(_)
+                | Content::Fail(_)
                 | Content::Leave,
                 _,
             ) => false,

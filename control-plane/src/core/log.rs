@@ -7,9 +7,9 @@ use blaze_domain::config::{Document, Key};
 use parking_lot::RwLock;
 use tokio::sync::watch;
 
-use blaze_domain::config::state::{Effect, State};
 use super::types::WatchCommit;
 use crate::store::{Change, Commit};
+use blaze_domain::config::state::{Effect, State};
 
 /// Commits that are kept in memory, at most.
 const MAX_COMMITS: usize = 8192;
@@ -94,8 +94,12 @@ impl Log {
         if commit.revision > next {
             return false;
         }
-        let originals = inner.state.originals(commit.changes.iter().map(|change| &change.document.key));
-        let effects = inner.state.apply(commit.revision, commit.changes.iter().map(Change::step));
+        let originals = inner
+            .state
+            .originals(commit.changes.iter().map(|change| &change.document.key));
+        let effects = inner
+            .state
+            .apply(commit.revision, commit.changes.iter().map(Change::step));
         let bytes = commit_bytes(&commit);
         inner.bytes += bytes;
         inner.commits.push_back(Arc::new(Applied {

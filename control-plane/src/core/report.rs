@@ -8,11 +8,11 @@ use blaze_domain::{InstanceName, LayerName, NodeName, ServiceName};
 use serde_json::{Value, json};
 
 use super::affected;
-use blaze_domain::config::effective::At;
 use super::evaluate::Evaluated;
-use blaze_domain::config::state::State;
 use super::types::{ApplyAction, ApplyReport, ApplyResult, Place, Written};
 use super::view::View;
+use blaze_domain::config::effective::At;
+use blaze_domain::config::state::State;
 
 /// Places that are named in an answer.
 const MAX_AFFECTED: usize = 1000;
@@ -57,7 +57,8 @@ impl Done {
     pub(crate) fn report(&self, dry_run: bool) -> ApplyReport {
         let results = self.evaluated.results.iter().map(|(key, action)| {
             let (was, is) = (self.before.get(key), self.after.get(key));
-            let shown = |held: Option<&Arc<blaze_domain::config::state::Held>>| held.map(|held| Arc::clone(&held.shown));
+            let shown =
+                |held: Option<&Arc<blaze_domain::config::state::Held>>| held.map(|held| Arc::clone(&held.shown));
             let (was, is) = (shown(was), shown(is));
             let revision = match (action, &is, &was) {
                 (ApplyAction::Unchanged, Some(document), _) => document.revision,

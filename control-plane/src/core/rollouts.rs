@@ -5,8 +5,8 @@ use std::sync::Arc;
 use blaze_domain::config::{Code, Document, Kind, MAX_DOCUMENT_BYTES, Problem, merge, spec};
 use serde_json::{Value, json};
 
-use blaze_domain::config::effective::{canaries, patched};
 use super::evaluate::invalid;
+use blaze_domain::config::effective::{canaries, patched};
 use blaze_domain::config::placement::{placement, rollout_target};
 use blaze_domain::config::state::State;
 
@@ -70,6 +70,20 @@ fn nodes(after: &State, rollout: &Document) -> Vec<Value> {
         .take(MAX_CANARIES + 1)
         .map(|(key, _)| json!({ "node": key.name().as_str(), "phase": "pending", "revision": null, "reason": "" }))
         .collect()
+}
+
+/// Puts into a status how it goes on a canary; a node that became one after the beginning is added.
+pub(super) fn tell_canary(status: &mut Value, node: &str, phase: &str, revision: u64, reason: &str) {
+    let Some(lines) = status.get_mut("canaries").and_then(Value::as_array_mut) else {
+        return;
+    };
+    let line = json!({ "node": node, "phase": phase, "revision": revision, "reason": reason });
+    let is_of_node = |line: &Value| line.get("node").and_then(Value::as_str) == Some(node);
+    match lines.iter().position(is_of_node) {
+        Some(index) => lines[index] = line,
+        None if lines.len() < MAX_CANARIES => lines.push(line),
+        None => {}
+    }
 }
 
 /// Refuses a roll-out whose target would have another size than a document may have.

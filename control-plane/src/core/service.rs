@@ -1,5 +1,6 @@
 //! The use cases, as REST and gRPC call them. Every right is checked here, whoever asks.
 
+mod canaries;
 mod history;
 mod read;
 mod sync;
@@ -29,13 +30,13 @@ use super::log::Log;
 use super::page::Pages;
 use super::schema::Schemas;
 use super::secrets;
-use blaze_domain::config::state::State;
 use super::view;
 use super::watch::Watches;
 use super::workers::Workers;
 use crate::auth::{Authenticator, Claims, Revocations, Right, dev};
 use crate::secrets::Keyring;
 use crate::store::{AuditEntry, Store, StoreError};
+use blaze_domain::config::state::State;
 
 pub use history::DiffReport;
 pub use sync::{SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream};

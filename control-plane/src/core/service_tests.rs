@@ -1,5 +1,6 @@
 //! The core from outside, on a store in memory.
 
+mod failed;
 mod once;
 mod pages;
 mod rollouts;

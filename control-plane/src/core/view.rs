@@ -3,10 +3,10 @@
 use blaze_domain::LayerName;
 use blaze_domain::config::{Code, Document, Key, Kind, Problem};
 
+use crate::auth::{Claims, Right, Role, allowed, unbound};
 use blaze_domain::config::effective::At;
 use blaze_domain::config::placement::{Placement, placement, rollout_target};
 use blaze_domain::config::state::State;
-use crate::auth::{Claims, Right, Role, allowed, unbound};
 
 /// What one token sees.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -23,12 +23,12 @@ use tokio_util::sync::CancellationToken;
 
 use super::committer::{now, unavailable};
 use super::log::{Applied, Log};
-use blaze_domain::config::placement::Placement;
-use blaze_domain::config::state::{Effect, Held, State};
 use super::types::{Caller, WatchCommit, WatchItem, WatchOp, WatchQuery};
 use super::view::{View, view};
 use crate::auth::Revocations;
 use crate::store::{Change, Commit, Store};
+use blaze_domain::config::placement::Placement;
+use blaze_domain::config::state::{Effect, Held, State};
 
 /// Between two bookmarks of a watch with nothing to tell.
 const BOOKMARK: Duration = Duration::from_secs(15);

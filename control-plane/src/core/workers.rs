@@ -2,6 +2,7 @@
 //! and is gone with the process; a worker says it anew when it comes back.
 
 use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
 
 use blaze_domain::config::Timestamp;
@@ -14,6 +15,10 @@ const MAX_WORKERS: usize = 10_000;
 const MAX_SERVICES: usize = 10_000;
 /// Roll-outs that one worker may tell of; what is beyond is not kept.
 const MAX_ROLLOUTS: usize = 1000;
+/// What is kept of the reason of a failure, in characters.
+const MAX_REASON: usize = 500;
+/// Longest uid of a roll-out and word for its phase that are kept, in bytes.
+const MAX_WORD_BYTES: usize = 64;
 
 /// Which worker: of one layer and node there may be several, of which one answers.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -61,6 +66,31 @@ pub struct RolloutReport {
     pub reason: String,
 }
 
+impl RolloutReport {
+    /// The same as long as it may be; `None`: it makes no sense.
+    fn bounded(self) -> Option<Self> {
+        if self.uid.is_empty() || self.uid.len().max(self.phase.len()) > MAX_WORD_BYTES {
+            return None;
+        }
+        let reason = self.reason.chars().filter(|letter| !letter.is_control());
+        Some(Self {
+            reason: reason.take(MAX_REASON).collect(),
+            ..self
+        })
+    }
+}
+
+/// What is known of a roll-out on one node.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Told {
+    /// `pending`, `applied` or `failed`.
+    pub(crate) phase: String,
+    /// Revision of what its worker has.
+    pub(crate) revision: u64,
+    /// Why it failed.
+    pub(crate) reason: String,
+}
+
 /// What a worker says it has.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Acknowledged {
@@ -87,7 +117,11 @@ impl Acknowledged {
             revision,
             digest,
             services: services.into_iter().take(MAX_SERVICES).collect(),
-            rollouts: rollouts.into_iter().take(MAX_ROLLOUTS).collect(),
+            rollouts: rollouts
+                .into_iter()
+                .take(MAX_ROLLOUTS)
+                .filter_map(RolloutReport::bounded)
+                .collect(),
         }
     }
 }
@@ -127,6 +161,8 @@ pub struct WorkerSession {
     workers: Arc<Workers>,
     name: WorkerName,
     connection: u64,
+    /// For the audit.
+    address: IpAddr,
 }
 
 /// There are more workers than one process keeps.
@@ -164,6 +200,7 @@ impl Workers {
             workers: Arc::clone(self),
             name,
             connection,
+            address: IpAddr::V4(Ipv4Addr::UNSPECIFIED),
         })
     }
 
@@ -172,6 +209,32 @@ impl Workers {
         let known = self.known.lock();
         let workers = known.workers.iter().filter(|(name, _)| wanted(name));
         workers.map(|(name, worker)| (name.clone(), worker.clone())).collect()
+    }
+
+    /// What is said of a roll-out, by node, with the layer of the worker that says it. The node's own worker knows best, then
+    /// one that is connected, then one for which it failed, then the one that was heard last.
+    pub(crate) fn of_rollout(&self, uid: &str) -> BTreeMap<NodeName, (LayerName, Told)> {
+        let known = self.known.lock();
+        let mut best: BTreeMap<NodeName, (_, LayerName, Told)> = BTreeMap::new();
+        for (name, worker) in &known.workers {
+            for report in worker.has.rollouts.iter().filter(|report| report.uid == uid) {
+                let Some(node) = &report.node else { continue };
+                let is_own = name.node.as_ref() == Some(node);
+                let has_failed = report.phase == "failed";
+                let weight = (is_own, worker.is_connected(), has_failed, worker.last_seen);
+                if best.get(node).is_none_or(|(held, ..)| *held <= weight) {
+                    let told = Told {
+                        phase: report.phase.clone(),
+                        revision: worker.has.revision,
+                        reason: report.reason.clone(),
+                    };
+                    best.insert(node.clone(), (weight, name.layer.clone(), told));
+                }
+            }
+        }
+        best.into_iter()
+            .map(|(node, (_, layer, told))| (node, (layer, told)))
+            .collect()
     }
 
     /// How many are connected.
@@ -184,13 +247,26 @@ impl Workers {
 impl Known {
     fn forget_one(&mut self) -> Result<(), TooMany> {
         let gone = self.workers.iter().filter(|(_, worker)| !worker.is_connected());
-        let oldest = gone.min_by_key(|(_, worker)| worker.last_seen).map(|(name, _)| name.clone());
+        let oldest = gone
+            .min_by_key(|(_, worker)| worker.last_seen)
+            .map(|(name, _)| name.clone());
         self.workers.remove(&oldest.ok_or(TooMany)?);
         Ok(())
     }
 }
 
 impl WorkerSession {
+    /// The same with the address of the worker.
+    pub(crate) fn from_address(mut self, address: IpAddr) -> Self {
+        self.address = address;
+        self
+    }
+
+    /// Where the worker is.
+    pub(crate) fn address(&self) -> IpAddr {
+        self.address
+    }
+
     /// Which worker.
     #[must_use]
     pub fn name(&self) -> &WorkerName {
@@ -239,7 +315,11 @@ mod tests {
     #[test]
     fn the_newest_connection_of_a_worker_counts() {
         let workers = Arc::new(Workers::default());
-        let enter = |second| workers.enter(name("w"), "1".into(), Acknowledged::default(), at(second)).unwrap();
+        let enter = |second| {
+            workers
+                .enter(name("w"), "1".into(), Acknowledged::default(), at(second))
+                .unwrap()
+        };
         let (old, new) = (enter(1), enter(2));
         old.said(Acknowledged::new(7, "old".into(), [], []), at(3));
         new.said(Acknowledged::new(9, "new".into(), [], []), at(4));
@@ -258,7 +338,11 @@ mod tests {
     #[test]
     fn the_next_life_of_a_worker_takes_the_place_of_the_last() {
         let workers = Arc::new(Workers::default());
-        let enter = |id| workers.enter(name(id), String::new(), Acknowledged::default(), at(1)).unwrap();
+        let enter = |id| {
+            workers
+                .enter(name(id), String::new(), Acknowledged::default(), at(1))
+                .unwrap()
+        };
         let (first, beside) = (enter("a"), enter("b"));
         drop(first);
         let _next = enter("c");

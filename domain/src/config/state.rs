@@ -184,10 +184,7 @@ impl State {
 
     /// Instances of a service.
     #[must_use]
-    pub fn instances<'a>(
-        &'a self,
-        service: &ServiceName,
-    ) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
+    pub fn instances<'a>(&'a self, service: &ServiceName) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
         let service = service.clone();
         let start = Key::instance(service.clone(), first_name());
         self.documents

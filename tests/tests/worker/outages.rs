@@ -23,9 +23,16 @@ async fn without_the_main_service_everything_is_answered_and_afterwards_all_is_m
     let mut service = stage.service().await;
     let (mut slam, mut nav) = (service.listen("slam").await, service.listen("nav").await);
     main.kill().unwrap();
-    worker.until("the outage is noticed", |status| status["connected"] == false).await;
-    let answer = service.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
-    assert_eq!((&answer["source"], &answer["config"]["camera"]["rate_hz"]), (&json!("copy"), &json!(30)));
+    worker
+        .until("the outage is noticed", |status| status["connected"] == false)
+        .await;
+    let answer = service
+        .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
+        .await;
+    assert_eq!(
+        (&answer["source"], &answer["config"]["camera"]["rate_hz"]),
+        (&json!("copy"), &json!(30))
+    );
     rest(&mut slam).await;
     rest(&mut nav).await;
 
@@ -58,7 +65,9 @@ async fn after_everything_was_killed_services_get_their_last_configuration_at_on
     let before = service.ask(asks.clone(), PATIENCE).await;
     // Both copies have it.
     let has_copies = |metrics: &str| {
-        let written = metrics.lines().filter(|line| line.starts_with("blaze_worker_copy_writes_total"));
+        let written = metrics
+            .lines()
+            .filter(|line| line.starts_with("blaze_worker_copy_writes_total"));
         written.filter(|line| !line.ends_with(" 0")).count() == 2
     };
     let start = tokio::time::Instant::now();
@@ -74,12 +83,23 @@ async fn after_everything_was_killed_services_get_their_last_configuration_at_on
     let worker = stage.worker("robot-1");
     let mut service = stage.service().await;
     let answer = service.ask(asks, Duration::from_secs(2)).await;
-    assert_eq!((&answer["hash"], &answer["config"]), (&before["hash"], &before["config"]));
-    assert_eq!((&answer["source"], &answer["revision"]), (&json!("copy"), &before["revision"]));
+    assert_eq!(
+        (&answer["hash"], &answer["config"]),
+        (&before["hash"], &before["config"])
+    );
+    assert_eq!(
+        (&answer["source"], &answer["revision"]),
+        (&json!("copy"), &before["revision"])
+    );
     let gone = service.ask(json!({ "service": "nav" }), PATIENCE).await;
     assert_eq!(gone["error"]["code"], "not_found", "what was deleted stays deleted");
     worker.until("the key is back", |_| true).await;
-    let key = stage.keys().get("blaze:config:slam:0").await.unwrap().expect("the key is there again");
+    let key = stage
+        .keys()
+        .get("blaze:config:slam:0")
+        .await
+        .unwrap()
+        .expect("the key is there again");
     assert!(String::from_utf8_lossy(&key).contains(before["hash"].as_str().unwrap()));
 
     let _main = stage.main();
@@ -100,7 +120,10 @@ async fn without_anything_the_mounted_file_serves_until_the_main_service_is_ther
     let mut service = stage.service().await;
     let asks = json!({ "service": "slam", "instance": "0" });
     let answer = service.ask(asks.clone(), PATIENCE).await;
-    assert_eq!((&answer["source"], &answer["config"]["camera"]["rate_hz"]), (&json!("file"), &json!(1)));
+    assert_eq!(
+        (&answer["source"], &answer["config"]["camera"]["rate_hz"]),
+        (&json!("file"), &json!(1))
+    );
     let mut slam = service.listen("slam").await;
     std::fs::write(&defaults, file(2)).unwrap();
     assert_eq!(next(&mut slam).await["config"]["camera"]["rate_hz"], 2);
@@ -110,11 +133,17 @@ async fn without_anything_the_mounted_file_serves_until_the_main_service_is_ther
         assert!(start.elapsed() < PATIENCE, "{}", worker.text("/readyz").await);
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
-    assert_eq!(service.ask(asks.clone(), PATIENCE).await["config"]["camera"]["rate_hz"], 2);
+    assert_eq!(
+        service.ask(asks.clone(), PATIENCE).await["config"]["camera"]["rate_hz"],
+        2
+    );
 
     let _main = stage.main();
     stage.robot().await;
     stage.equal(&worker, PATIENCE).await;
     let answer = service.ask(asks, PATIENCE).await;
-    assert_eq!((&answer["source"], &answer["config"]["camera"]["rate_hz"]), (&json!("main"), &json!(30)));
+    assert_eq!(
+        (&answer["source"], &answer["config"]["camera"]["rate_hz"]),
+        (&json!("main"), &json!(30))
+    );
 }

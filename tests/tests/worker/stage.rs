@@ -150,7 +150,9 @@ impl Stage {
     }
 
     pub(crate) async fn put(&self, path: &str, spec: Value) -> u64 {
-        let answer = self.send(reqwest::Method::PUT, path, Some(&json!({ "spec": spec }))).await;
+        let answer = self
+            .send(reqwest::Method::PUT, path, Some(&json!({ "spec": spec })))
+            .await;
         answer["revision"].as_u64().unwrap()
     }
 
@@ -161,7 +163,11 @@ impl Stage {
     /// A robot with two services, of which one has an instance.
     pub(crate) async fn robot(&self) -> u64 {
         self.apply(&[
-            ("Layer", "edge", json!({ "kind": "edge", "config": { "verbosity": "info" } })),
+            (
+                "Layer",
+                "edge",
+                json!({ "kind": "edge", "config": { "verbosity": "info" } }),
+            ),
             ("Node", "robot-1", json!({ "layer": "edge" })),
             ("Service", "slam", json!({ "config": { "camera": { "rate_hz": 30 } } })),
             ("Service", "nav", json!({ "config": { "speed": 1 } })),
@@ -187,7 +193,10 @@ impl Stage {
         let broker = RedisBroker::open(&self.section(), &Role::Service).unwrap();
         let mut status = broker.status();
         let up = status.wait_for(|status| status.health == Health::Up);
-        tokio::time::timeout(PATIENCE, up).await.expect("Redis answers").unwrap();
+        tokio::time::timeout(PATIENCE, up)
+            .await
+            .expect("Redis answers")
+            .unwrap();
         let subscription = broker
             .subscribe(&"blaze/reply/test".parse().unwrap(), SubscribeOptions::default())
             .await
@@ -208,7 +217,11 @@ impl Stage {
             if is_equal {
                 return main["digest"].as_str().unwrap().to_owned();
             }
-            assert!(start.elapsed() < limit, "not equal within {limit:?}: {main} and {here}; {}", worker.tail());
+            assert!(
+                start.elapsed() < limit,
+                "not equal within {limit:?}: {main} and {here}; {}",
+                worker.tail()
+            );
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     }
@@ -263,13 +276,19 @@ impl Service {
     /// Hears of changes of a service from now on.
     pub(crate) async fn listen(&self, service: &str) -> Subscription {
         let channel = format!("blaze/config/changed/{service}").parse().unwrap();
-        self.broker.subscribe(&channel, SubscribeOptions::default()).await.unwrap()
+        self.broker
+            .subscribe(&channel, SubscribeOptions::default())
+            .await
+            .unwrap()
     }
 
     /// Asks until it is answered, as often as a service may: each second.
     pub(crate) async fn ask(&mut self, mut request: Value, limit: Duration) -> Value {
         let options = PublisherOptions::default();
-        let publisher = self.broker.publisher(&"blaze/config/get".parse().unwrap(), options).unwrap();
+        let publisher = self
+            .broker
+            .publisher(&"blaze/config/get".parse().unwrap(), options)
+            .unwrap();
         let start = tokio::time::Instant::now();
         loop {
             self.asked += 1;
@@ -309,7 +328,9 @@ fn text(content: &Content) -> Value {
 pub(crate) async fn next(notices: &mut Subscription) -> Value {
     let mut batch = Vec::new();
     let received = notices.receive(&mut batch, 1);
-    let count = tokio::time::timeout(PATIENCE, received).await.expect("a notice in time");
+    let count = tokio::time::timeout(PATIENCE, received)
+        .await
+        .expect("a notice in time");
     assert_eq!(count, 1);
     text(&batch[0].content)
 }

@@ -10,7 +10,7 @@ use tokio::sync::{Notify, Semaphore};
 
 use super::{CopyError, Loaded, LocalCopy, Notes, Position, progress};
 
-pub(super) struct Fake {
+pub(crate) struct Fake {
     pub(super) name: &'static str,
     pub(super) held: Mutex<Option<Loaded>>,
     /// Every call fails.
@@ -25,7 +25,7 @@ pub(super) struct Fake {
 }
 
 impl Fake {
-    pub(super) fn new(name: &'static str) -> Self {
+    pub(crate) fn new(name: &'static str) -> Self {
         Self {
             name,
             held: Mutex::new(None),

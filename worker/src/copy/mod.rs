@@ -24,7 +24,7 @@ mod copies;
 pub mod defaults;
 mod error;
 #[cfg(test)]
-mod fake;
+pub(crate) mod fake;
 mod file;
 mod file_format;
 mod json;

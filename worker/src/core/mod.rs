@@ -5,14 +5,17 @@
 //!              (the layer's view)    │ ▲
 //!                                    ▼ └── GetRequest                                    [messages] reads it
 //!                                  Reply
+//! acks, watchdogs ──▶ Signs ──Complaint──▶ Gate ──Failure──▶ Served undoes the roll-out
 //! ```
 //!
 //! [`Replica`] checks what the main service tells and has the documents; [`Served`] knows who is served with what, and
-//! works out from a change who must be told.
+//! works out from a change who must be told. [`Signs`] knows how the services are, and [`Gate`] judges roll-outs by it.
 
 mod answer;
 mod asked;
 mod change;
+mod gate;
+mod health;
 mod incoming;
 pub mod messages;
 mod notice;
@@ -29,9 +32,11 @@ mod world;
 pub use answer::{Freshness, Reply, answer};
 pub use asked::{ASKED_FOR, MAX_ASKED};
 pub use change::Change;
+pub use gate::{Failure, Gate, MAX_WINDOWS, RolloutPhase, RolloutState};
+pub use health::{Complaint, MAX_SIGNS, Row, Signs, Trouble};
 pub use incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, Op, PROTOCOL, SyncFault, TooLarge};
 pub use notice::{Config, Notice, Scope, Standing};
 pub use place::{Place, Site, Source};
 pub use replica::{Applied, Replica, ResumePoint};
-pub use served::{MAX_FAILED, Served};
+pub use served::{MAX_FAILED, Served, Trial};
 pub use told::{Flushed, Told, WeakerSource};

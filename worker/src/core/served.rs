@@ -13,15 +13,17 @@
 //! Answers come from the documents of the last [`Served::flush`], as notices do: so what a place was told last is always
 //! what its configuration is in the shown documents, and no configuration has to be kept beside them.
 
+#[path = "served_trial.rs"]
+mod trial;
+
 use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
 use std::time::Instant;
 
+use blaze_domain::config::Key;
 use blaze_domain::config::effective::{At, Sources};
-use blaze_domain::config::placement::is_active;
 use blaze_domain::config::state::State;
-use blaze_domain::config::{Key, Kind};
 use serde_json::{Map, Value};
 
 use super::asked::Asked;
@@ -31,6 +33,8 @@ use super::place::{Place, Site, Source};
 use super::reach::{Places, concerned};
 use super::told::{Flushed, Told, WeakerSource};
 use super::world::World;
+
+pub use trial::Trial;
 
 /// Roll-outs that are remembered as failed here, at most.
 pub const MAX_FAILED: usize = 1_000;
@@ -190,45 +194,6 @@ impl Served {
         if in_sync && self.rank.is_some() {
             self.rank = Some(Source::Main);
         }
-    }
-
-    /// Undoes a roll-out here, before the main service knows. Of too many those go first that are over.
-    pub fn fail_rollout(&mut self, uid: &str) {
-        if self.next.failed.iter().any(|failed| failed == uid) {
-            return;
-        }
-        let state = &self.next.state;
-        let found = |uid: &str| {
-            let mut rollouts = state.of_kind(Kind::Rollout, None);
-            rollouts.find(|(_, held)| held.document.uid == uid)
-        };
-        self.pending.extend(found(uid).map(|(key, _)| key.clone()));
-        let failed = Arc::make_mut(&mut self.next.failed);
-        if failed.len() >= MAX_FAILED {
-            let is_over = |uid: &String| found(uid).is_none_or(|(_, held)| !is_active(&held.document));
-            let oldest = failed.iter().position(is_over).unwrap_or(0);
-            failed.remove(oldest);
-        }
-        failed.push(uid.to_owned());
-    }
-
-    /// Places on whose configuration a roll-out that is on its canaries has an effect, in the shown documents: those whose
-    /// health tells whether it goes well.
-    #[must_use]
-    pub fn changed_by(&self, uid: &str) -> Vec<Place> {
-        let is_changed = |place: &Place| {
-            let at = place.at(&self.site);
-            let without = Sources::at_where(&self.shown.state, &at, |rollout| {
-                rollout.uid != uid && !self.shown.failed.contains(&rollout.uid)
-            });
-            let with = self.shown.sources(&at);
-            with.rollout.is_some() && with.hash() != without.hash()
-        };
-        let places = self.places.all().map(|(place, _)| place);
-        places
-            .filter(|place| place.node.is_some() && is_changed(place))
-            .cloned()
-            .collect()
     }
 
     /// Whether a place has a key of its own in Redis: there, a place is service and instance alone. On the broker of a layer

@@ -4,11 +4,14 @@
 //! ```text
 //! sync::follow ──SyncEvent──▶┌────────┐──Ack (newest)──▶ sync::follow
 //! broker: get ──────────────▶│ Engine │──reply─────────▶ broker
+//! acks, watchdogs: Sign ────▶│        │
 //! mounted file ─────────────▶│        │──Told──────────▶ serve::Speaker ─▶ keys, notices
 //! lease: leader? ───────────▶│        │──Update────────▶ copy::Copies
 //! admin: Query ─────────────▶└────────┘
 //! ```
 
+mod ask;
+mod hear;
 mod status;
 mod tell;
 #[cfg(test)]
@@ -18,9 +21,9 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+use blaze_domain::config::Timestamp;
 use blaze_domain::config::secret::{self, Secret};
 use blaze_domain::config::state::State;
-use blaze_domain::config::Timestamp;
 use blaze_domain::names::ChannelName;
 use blaze_domain::{LayerName, NodeName};
 use blaze_proto::v1;
@@ -31,11 +34,12 @@ use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use crate::copy::{Changed, Copies, Loaded, Notes, Position, Update, defaults};
-use crate::core::messages::{self, Delivery, GetRequest, RefusedRequest};
-use crate::core::{Applied, Freshness, PROTOCOL, Place, Replica, Reply, Served, Site, Source, answer};
+use crate::core::messages::Delivery;
+use crate::core::{Applied, Gate, PROTOCOL, Place, Replica, Served, Signs, Site, Source};
 use crate::serve::{Speaker, Told};
 use crate::sync::SyncEvent;
 
+pub use hear::Sign;
 pub use status::Status;
 
 /// Within this time several changes may become one notice.
@@ -46,6 +50,8 @@ const SETTLE: Duration = Duration::from_millis(200);
 const ACK_AFTER: Duration = Duration::from_millis(50);
 /// It is said again after this time without news.
 const ACK_AGAIN: Duration = Duration::from_secs(15);
+/// Between two looks whether a sign of life has run out.
+const LOOK: Duration = Duration::from_secs(1);
 /// Events that wait for the engine.
 pub const QUEUE: usize = 256;
 
@@ -80,6 +86,8 @@ pub struct Inputs {
     pub sync: mpsc::Receiver<SyncEvent>,
     /// Requests for configurations, as they came.
     pub gets: mpsc::Receiver<Bytes>,
+    /// What services say about themselves.
+    pub signs: mpsc::Receiver<Sign>,
     /// The mounted file.
     pub defaults: watch::Receiver<defaults::Status>,
     /// Whether this worker answers and notifies.
@@ -122,6 +130,14 @@ pub struct Counts {
     pub faults: u64,
     /// Notices that followed from changes.
     pub notices: u64,
+    /// Acknowledgements and signs of life that were understood.
+    pub signs: u64,
+    /// Those that could not be read.
+    pub misunderstood: u64,
+    /// Those of instances beyond as many as are known at a time.
+    pub left_out: u64,
+    /// Roll-outs that failed here and were undone.
+    pub failed_rollouts: u64,
 }
 
 /// What the engine owns. Everything that it does happens in [`Engine::run`].
@@ -135,6 +151,9 @@ pub struct Engine {
     wants_all: bool,
     /// Until then whoever has secrets gets everything, also if the hash is the same: the texts have come just now.
     texts_until: Option<Instant>,
+    signs: Signs,
+    gate: Gate,
+    look_at: Instant,
     stream: Option<CancellationToken>,
     /// Why there is no stream.
     reason: Option<String>,
@@ -168,6 +187,9 @@ impl Engine {
             notes: Notes::default(),
             wants_all: false,
             texts_until: None,
+            signs: Signs::new(identity.site.clone()),
+            gate: Gate::default(),
+            look_at: now + LOOK,
             stream: None,
             reason: None,
             is_leader: false,
@@ -231,7 +253,9 @@ impl Engine {
                     let is_leader = *inputs.leader.borrow_and_update();
                     self.lead(is_leader);
                 }
+                () = sleep_until(self.look_at) => self.look_at_signs(),
                 Some(event) = inputs.sync.recv() => self.on_sync(event),
+                Some(sign) = inputs.signs.recv() => self.on_sign(sign),
                 Some(request) = inputs.gets.recv() => self.on_get(&request),
                 Ok(()) = inputs.defaults.changed() => {
                     let status = inputs.defaults.borrow_and_update().clone();
@@ -319,11 +343,13 @@ impl Engine {
         let was = self.served.source();
         self.served.set_in_sync(in_sync);
         if was != self.served.source() {
-            tracing::info!(in_sync, revision = self.replica.state().revision(), "source of configurations");
+            tracing::info!(
+                in_sync,
+                revision = self.replica.state().revision(),
+                "source of configurations"
+            );
         }
-        if self.stream.is_some() {
-            self.ack_at = self.ack_at.min(Instant::now() + ACK_AFTER);
-        }
+        self.acknowledge_soon();
     }
 
     /// Says what is here, if somebody listens.
@@ -337,8 +363,8 @@ impl Engine {
         let ack = v1::Ack {
             revision: self.replica.state().revision(),
             digest: self.replica.digest(),
-            services: Vec::new(),
-            rollouts: Vec::new(),
+            services: self.services_of_ack(),
+            rollouts: self.rollouts_of_ack(),
         };
         self.outputs.acks.send_replace(Some(ack));
     }
@@ -372,78 +398,6 @@ impl Engine {
         // What came from the main service or a copy of it is better.
         if self.served.load(state, Source::File).is_ok() {
             self.flush_soon();
-        }
-    }
-
-    fn on_get(&mut self, request: &[u8]) {
-        let shared = self.outputs.replies.shared();
-        let (to, text) = match GetRequest::parse(request) {
-            Ok(request) => {
-                if !self.is_leader {
-                    self.counts.left_to_others += 1;
-                    return;
-                }
-                let reply = self.reply(&request);
-                let id = request.id.as_deref();
-                let text = messages::reply(&reply, id, self.identity.delivery, self.freshness());
-                self.key_of_asker(&request);
-                if self.served.has_pending() {
-                    self.flush_soon();
-                }
-                (Some((request.reply_to, request.id)), text)
-            }
-            Err(RefusedRequest { id, reply_to, error }) => {
-                self.counts.refused += 1;
-                if !self.is_leader {
-                    return;
-                }
-                let text = messages::refusal(&error, id.as_deref());
-                (reply_to.map(|to| (to, id)), text)
-            }
-        };
-        let Some((to, id)) = to else { return };
-        let to = match shared {
-            // Nobody could tell whose answer it is.
-            Some(_) if id.is_none() => {
-                self.counts.refused += 1;
-                return;
-            }
-            Some(shared) => shared,
-            None => to,
-        };
-        match self.outputs.replies.reply(&to, Bytes::from(text)) {
-            Ok(()) => self.counts.answered += 1,
-            Err(error) => {
-                self.counts.refused += 1;
-                tracing::debug!(error, %to, "an answer was not sent");
-            }
-        }
-    }
-
-    /// What a request gets. Who was given a configuration without the texts of its secrets has the right hash, and yet not
-    /// what it needs.
-    fn reply(&mut self, request: &GetRequest) -> Reply {
-        let now = Instant::now();
-        let reply = answer(&mut self.served, request, now.into_std());
-        if matches!(reply, Reply::Unchanged { .. }) && self.texts_until.is_some_and(|until| now < until) {
-            let anew = GetRequest {
-                hash: None,
-                ..request.clone()
-            };
-            let whole = answer(&mut self.served, &anew, now.into_std());
-            if let Reply::Standing(standing) = &whole
-                && secret::contains(standing.config.value())
-            {
-                return whole;
-            }
-        }
-        reply
-    }
-
-    fn freshness(&self) -> Freshness {
-        Freshness {
-            as_of: self.replica.as_of(),
-            now: now(),
         }
     }
 

@@ -5,8 +5,7 @@ use blaze_domain::config::Timestamp;
 use serde_json::{Value, json};
 
 use super::{Counts, Engine, now};
-use crate::core::Source;
-use crate::core::Freshness;
+use crate::core::{Freshness, Place, Row, Source, Told};
 
 /// What the admin port shows.
 #[derive(Debug, Clone, PartialEq)]
@@ -23,6 +22,8 @@ pub struct Status {
     pub revision: u64,
     /// Documents.
     pub documents: usize,
+    /// Canaries that are not judged, because there are too many.
+    pub unwatched: usize,
     /// Why the mounted file is not used.
     pub defaults_problem: Option<String>,
     /// Why there is no stream.
@@ -38,16 +39,14 @@ impl Engine {
             now: now(),
         };
         let digest = self.replica.digest();
-        let services: Vec<Value> = self
-            .served
-            .told()
-            .map(|(place, told)| {
-                json!({
-                    "service": place.service.as_str(), "instance": place.instance.as_ref().map(|name| name.as_str()),
-                    "node": place.node.as_ref().map(NodeName::as_str), "revision": told.revision, "hash": told.hash,
-                })
+        let services = self.services();
+        let rollouts = self.rollouts().into_iter().map(|state| {
+            json!({
+                "uid": state.uid, "name": state.name.as_str(), "node": state.node.as_str(),
+                "phase": state.phase.as_str(), "reason": state.reason,
             })
-            .collect();
+        });
+        let rollouts: Vec<Value> = rollouts.collect();
         let revision = self.replica.state().revision();
         let json = json!({
             "layer": site.layer.as_str(),
@@ -61,18 +60,50 @@ impl Engine {
             "as_of": freshness.as_of.map(|time: Timestamp| time.to_string()),
             "age_s": freshness.age_s(),
             "services": services,
-            "rollouts": [],
+            "rollouts": rollouts,
             "reason": self.reason,
         });
         Status {
             json,
-            counts: self.counts,
+            counts: Counts {
+                left_out: self.signs.left_out(),
+                ..self.counts
+            },
             is_ready: self.served.is_ready(),
             in_sync: self.replica.is_in_sync(),
             revision,
             documents: self.replica.state().len(),
+            unwatched: self.gate.unwatched(),
             defaults_problem: self.defaults_problem.clone(),
             reason: self.reason.clone(),
         }
     }
+
+    /// What services are told, and how they say they are; those that are not told of changes come last.
+    fn services(&self) -> Vec<Value> {
+        let told = self
+            .served
+            .told()
+            .map(|(place, told)| service(place, Some(told), self.signs.of(place)));
+        let of_sign = self.signs.rows().filter_map(|(key, row)| {
+            let place = Place {
+                service: key.service.clone(),
+                instance: Some(key.instance.clone()),
+                node: Some(key.node.clone()),
+            };
+            let is_told = self.served.told_to(&place).is_some();
+            (!is_told).then(|| service(&place, None, Some(row)))
+        });
+        told.chain(of_sign).collect()
+    }
+}
+
+fn service(place: &Place, told: Option<&Told>, row: Option<&Row>) -> Value {
+    json!({
+        "service": place.service.as_str(), "instance": place.instance.as_ref().map(|name| name.as_str()),
+        "node": place.node.as_ref().map(NodeName::as_str),
+        "revision": told.map(|told| told.revision), "hash": told.and_then(|told| told.hash.as_deref()),
+        "state": row.map(|row| row.health.as_str()), "config_revision": row.map(|row| row.config_revision),
+        "config_hash": row.map(|row| row.config_hash.as_str()),
+    })
 }

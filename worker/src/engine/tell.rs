@@ -5,19 +5,22 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_domain::config::effective::At;
+use blaze_domain::config::secret;
 use blaze_domain::names::ChannelName;
 use blaze_domain::{DocumentName, InstanceName};
 use bytes::Bytes;
 use tokio::time::Instant;
 
-use super::{Engine, TOGETHER, now};
+use super::{Engine, SETTLE, TOGETHER, lacks_texts, now};
 use crate::copy::{Notes, Position, Told as Noted, Update};
-use crate::core::messages::{self, GetRequest};
-use crate::core::{Flushed, Notice, Place, Site, Standing, Told as ServedTold};
+use crate::core::messages::{self, Delivery, GetRequest};
+use crate::core::{Change, Flushed, Notice, Place, Site, Standing, Told as ServedTold};
 use crate::serve::Told;
 
 /// How long ago a notice may be that a new leader tells once more, because the one before may have died over it.
 const RECENT: Duration = Duration::from_secs(15);
+/// How long after the texts of secrets came everybody with secrets gets a whole answer: each asks within this time.
+const TEXTS: Duration = Duration::from_secs(180);
 /// Notices that are remembered for that.
 const MAX_RECENT: usize = 10_000;
 
@@ -34,7 +37,9 @@ pub(super) fn told_of(notes: &Notes) -> Vec<(Place, ServedTold)> {
         revision: noted.revision,
         hash: noted.hash.as_ref().map(ToString::to_string),
     };
-    let all = notes.all_told().filter_map(|(at, noted)| Some((place(at)?, told(noted))));
+    let all = notes
+        .all_told()
+        .filter_map(|(at, noted)| Some((place(at)?, told(noted))));
     all.collect()
 }
 
@@ -73,34 +78,66 @@ impl Engine {
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
         // First what goes: an instance that moves has the same key there.
         for place in &untracked {
+            self.unnoted.remove(place);
             self.notes.forget(&at(place, &self.identity.site));
-            if self.keyed.remove(place) {
-                told.push(self.without_key(place));
-            }
+            told.extend(self.without_key(place));
         }
         let is_gone = |notice: &&Notice| notice.hash.is_none();
-        for notice in notices.iter().filter(is_gone).chain(notices.iter().filter(|notice| !is_gone(notice))) {
+        for notice in notices
+            .iter()
+            .filter(is_gone)
+            .chain(notices.iter().filter(|notice| !is_gone(notice)))
+        {
             told.extend(self.of_notice(notice));
             if !untracked.contains(&notice.place) {
-                self.note(&notice.place, notice.revision, notice.hash.as_deref());
+                self.note(&notice.place, notice.revision, notice.hash.clone());
             }
         }
         let noticed: BTreeSet<&Place> = notices.iter().map(|notice| &notice.place).collect();
-        for place in &tracked {
+        let is_first = self.served.is_ready() && !std::mem::replace(&mut self.has_swept, self.served.is_ready());
+        // What an earlier life wrote may be gone, or of another form.
+        let all = if is_first { self.places() } else { tracked };
+        for place in &all {
             if let Some(standing) = self.served.standing_of(place) {
-                self.note(place, standing.revision, Some(&standing.hash));
                 if !noticed.contains(place) {
+                    self.note(place, standing.revision, Some(standing.hash.clone()));
                     told.extend(self.of_standing(place, &standing));
                 }
             }
         }
-        if !notices.is_empty() || !tracked.is_empty() || !untracked.is_empty() {
-            self.keep_notes();
-        }
         self.tell(told, instant);
+        if is_first && self.is_leader {
+            self.outputs.speaker.sweep_keys();
+        }
+        // After the notices: only what was told can go well or badly.
+        self.follow_rollouts();
         if self.served.has_pending() {
             self.flush_soon();
         }
+    }
+
+    fn places(&self) -> Vec<Place> {
+        self.served.told().map(|(place, _)| place.clone()).collect()
+    }
+
+    /// The texts of secrets have come, which were not there before: whoever has them redacted has the right hash, and yet not
+    /// what it needs.
+    pub(super) fn note_texts(&mut self, change: &Change) {
+        if self.identity.delivery == Delivery::Redacted || !lacks_texts(&change.old) || lacks_texts(&change.new) {
+            return;
+        }
+        self.texts_until = Some(Instant::now() + TEXTS);
+        self.flush();
+        let told: Vec<Told> = self
+            .places()
+            .iter()
+            .filter_map(|place| {
+                let standing = self.served.standing_of(place)?;
+                let has_secrets = secret::contains(standing.config.value());
+                has_secrets.then(|| self.of_standing(place, &standing)).flatten()
+            })
+            .collect();
+        self.tell(told, Instant::now());
     }
 
     fn tell(&mut self, told: Vec<Told>, at: Instant) {
@@ -122,6 +159,8 @@ impl Engine {
         self.is_leader = is_leader;
         tracing::info!(is_leader, "the lease of the layer");
         if !is_leader {
+            // What waits is the other one's to tell, and may be old by the time the broker takes it.
+            self.outputs.speaker.clear();
             return;
         }
         let now = Instant::now();
@@ -129,12 +168,15 @@ impl Engine {
         let recent = recent.into_iter().filter(|(then, _)| now - *then <= RECENT);
         self.outputs.speaker.tell(recent.map(|(_, told)| told));
         // Keys may be those of an older state.
-        let places: Vec<Place> = self.served.told().map(|(place, _)| place.clone()).collect();
-        let all: Vec<Told> = places
+        let all: Vec<Told> = self
+            .places()
             .iter()
             .filter_map(|place| self.of_standing(place, &self.served.standing_of(place)?))
             .collect();
         self.outputs.speaker.tell(all);
+        if self.served.is_ready() {
+            self.outputs.speaker.sweep_keys();
+        }
     }
 
     /// The key of a place that has asked for the first time.
@@ -145,12 +187,11 @@ impl Engine {
             instance: request.instance.clone(),
             node: self.identity.site.node.clone().or_else(|| request.node.clone()),
         };
-        if self.keyed.contains(&place) {
+        if self.keyed.get(&self.key_name(&place)) == Some(&place) {
             return;
         }
         if let Some(standing) = self.served.standing_of(&place) {
-            self.note(&place, standing.revision, Some(&standing.hash));
-            self.keep_notes();
+            self.note(&place, standing.revision, Some(standing.hash.clone()));
             let told = self.of_standing(&place, &standing);
             self.tell(told.into_iter().collect(), Instant::now());
         }
@@ -164,7 +205,7 @@ impl Engine {
         });
         let key = match notice.standing() {
             Some(standing) => self.key(&notice.place, &standing),
-            None => self.keyed.remove(&notice.place).then(|| (self.key_name(&notice.place), None)),
+            None => self.key_to_go(&notice.place),
         };
         Some(Told {
             place: notice.place.to_string(),
@@ -182,21 +223,33 @@ impl Engine {
         })
     }
 
-    fn without_key(&self, place: &Place) -> Told {
-        Told {
+    /// That the key is to go, if it is this place's.
+    fn without_key(&mut self, place: &Place) -> Option<Told> {
+        Some(Told {
             place: place.to_string(),
-            key: Some((self.key_name(place), None)),
+            key: Some(self.key_to_go(place)?),
             notice: None,
+        })
+    }
+
+    fn key_to_go(&mut self, place: &Place) -> Option<(String, Option<Bytes>)> {
+        let name = self.key_name(place);
+        if self.keyed.get(&name) != Some(place) {
+            return None;
         }
+        self.keyed.remove(&name);
+        Some((name, None))
     }
 
     fn key(&mut self, place: &Place, standing: &Standing) -> Option<(String, Option<Bytes>)> {
         if !self.served.has_key(place) {
-            return None;
+            // It had one while its document was there.
+            return self.key_to_go(place);
         }
         let value = messages::state_value(standing, self.identity.delivery, self.freshness()).ok()?;
-        self.keyed.insert(place.clone());
-        Some((self.key_name(place), Some(Bytes::from(value))))
+        let name = self.key_name(place);
+        self.keyed.insert(name.clone(), place.clone());
+        Some((name, Some(Bytes::from(value))))
     }
 
     /// Without the prefix of the server.
@@ -204,16 +257,41 @@ impl Engine {
         messages::config_key("", &place.service, place.instance.as_ref())
     }
 
-    fn note(&mut self, place: &Place, revision: u64, hash: Option<&str>) {
-        let told = Noted {
-            revision,
-            hash: hash.map(Arc::from),
-        };
-        self.notes.tell(at(place, &self.identity.site), told);
+    /// Has it noted what a place is told, once the broker has taken it: whoever dies before tells it again in the next life.
+    fn note(&mut self, place: &Place, revision: u64, hash: Option<String>) {
+        let known = self.notes.told(&at(place, &self.identity.site));
+        let is_known =
+            known.is_some_and(|known| known.revision == revision && known.hash.as_deref() == hash.as_deref());
+        if is_known && !self.unnoted.contains_key(place) {
+            return;
+        }
+        self.unnoted.insert(place.clone(), (revision, hash));
+        self.settle_at.get_or_insert(Instant::now() + SETTLE);
+    }
+
+    /// Notes what the broker has taken meanwhile.
+    pub(super) fn settle(&mut self) {
+        let speaker = &self.outputs.speaker;
+        // What others tell is theirs to note; for this one it is told.
+        let is_taken = |place: &Place| !self.is_leader || !speaker.is_waiting(&place.to_string());
+        let taken: Vec<Place> = self.unnoted.keys().filter(|place| is_taken(place)).cloned().collect();
+        for place in &taken {
+            if let Some((revision, hash)) = self.unnoted.remove(place) {
+                let told = Noted {
+                    revision,
+                    hash: hash.map(Arc::from),
+                };
+                self.notes.tell(at(place, &self.identity.site), told);
+            }
+        }
+        if !taken.is_empty() {
+            self.keep_notes();
+        }
+        self.settle_at = (!self.unnoted.is_empty()).then(|| Instant::now() + SETTLE);
     }
 
     /// Has the notes kept beside the newest state.
-    fn keep_notes(&mut self) {
+    pub(super) fn keep_notes(&mut self) {
         let Some(copies) = &self.outputs.copies else { return };
         let (Some(store_id), Some(as_of)) = (self.replica.store_id(), self.replica.as_of()) else {
             return;

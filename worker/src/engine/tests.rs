@@ -1,5 +1,8 @@
 //! The engine between a main service, a broker and a lease that the test plays.
 
+#[path = "hear_tests.rs"]
+mod hear;
+
 use async_trait::async_trait;
 use blaze_brokers::redis::KeyChange;
 use blaze_domain::config::Document;
@@ -34,7 +37,10 @@ impl Outlet for Board {
             self.seen.send(seen).await.unwrap();
         }
         for (channel, text) in messages {
-            self.seen.send(Seen::Notice(channel.to_string(), parse(text))).await.unwrap();
+            self.seen
+                .send(Seen::Notice(channel.to_string(), parse(text)))
+                .await
+                .unwrap();
         }
         Ok(())
     }
@@ -46,13 +52,19 @@ impl Outlet for Board {
     async fn keys_lost(&self) {
         std::future::pending().await
     }
+
+    async fn own_keys(&self) -> Result<Vec<String>, OutletError> {
+        Ok(Vec::new())
+    }
 }
 
 struct Answers(mpsc::Sender<(String, Value)>);
 
 impl Replies for Answers {
     fn reply(&self, to: &ChannelName, payload: Bytes) -> Result<(), String> {
-        self.0.try_send((to.to_string(), parse(&payload))).map_err(|error| error.to_string())
+        self.0
+            .try_send((to.to_string(), parse(&payload)))
+            .map_err(|error| error.to_string())
     }
 
     fn shared(&self) -> Option<ChannelName> {
@@ -67,6 +79,7 @@ fn parse(bytes: &[u8]) -> Value {
 struct World {
     sync: mpsc::Sender<SyncEvent>,
     gets: mpsc::Sender<Bytes>,
+    signs: mpsc::Sender<Sign>,
     leader: watch::Sender<bool>,
     defaults: watch::Sender<defaults::Status>,
     queries: mpsc::Sender<Query>,
@@ -77,8 +90,13 @@ struct World {
 }
 
 fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
+    world_with(start, is_leader, None)
+}
+
+fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) -> World {
     let (sync, sync_in) = mpsc::channel(64);
     let (gets, gets_in) = mpsc::channel(64);
+    let (signs, signs_in) = mpsc::channel(64);
     let (queries, queries_in) = mpsc::channel(64);
     let (leader, leader_in) = watch::channel(is_leader);
     let (defaults, defaults_in) = watch::channel(defaults::Status::default());
@@ -98,12 +116,13 @@ fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
     let outputs = Outputs {
         replies: Arc::new(Answers(answer)),
         speaker: speaker.clone(),
-        copies: None,
+        copies,
         acks: acks_out,
     };
     let inputs = Inputs {
         sync: sync_in,
         gets: gets_in,
+        signs: signs_in,
         defaults: defaults_in,
         leader: leader_in,
         queries: queries_in,
@@ -114,6 +133,7 @@ fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
     World {
         sync,
         gets,
+        signs,
         leader,
         defaults,
         queries,
@@ -175,7 +195,11 @@ impl World {
 
     async fn hello(&self) -> v1::Hello {
         let (send, hello) = oneshot::channel();
-        self.sync.send(SyncEvent::Greeting(send)).await.unwrap();
+        let greeting = SyncEvent::Greeting {
+            is_safe: true,
+            answer: send,
+        };
+        self.sync.send(greeting).await.unwrap();
         hello.await.unwrap()
     }
 
@@ -200,7 +224,9 @@ impl World {
                 }
             }
         };
-        tokio::time::timeout(Duration::from_secs(10), wait).await.expect("a notice within 10 s")
+        tokio::time::timeout(Duration::from_secs(10), wait)
+            .await
+            .expect("a notice within 10 s")
     }
 
     /// Everything that has been told by now, and by then.
@@ -221,7 +247,10 @@ async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
     w.opens(documents(30), 2).await;
     w.rest().await;
     let answer = w.slam().await;
-    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(30), &json!("main")));
+    assert_eq!(
+        (&answer["config"]["rate_hz"], &answer["source"]),
+        (&json!(30), &json!("main"))
+    );
     assert_eq!((&answer["node"], &answer["revision"]), (&json!("robot-1"), &json!(2)));
     w.rest().await;
 
@@ -229,12 +258,24 @@ async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
     w.says(commit(3, 2, vec![(Op::Update, changed)])).await;
     let told = w.rest().await;
     let notices: Vec<_> = told.iter().filter(|seen| matches!(seen, Seen::Notice(..))).collect();
-    assert_eq!(notices.len(), 2, "the instance that asked, and the service without one: {told:?}");
+    assert_eq!(
+        notices.len(),
+        2,
+        "the instance that asked, and the service without one: {told:?}"
+    );
     for seen in notices {
-        let Seen::Notice(channel, notice) = seen else { unreachable!() };
+        let Seen::Notice(channel, notice) = seen else {
+            unreachable!()
+        };
         assert_eq!(channel, "blaze/config/changed/slam");
-        assert_eq!((&notice["paths"], &notice["scopes"]), (&json!(["/rate_hz"]), &json!(["service"])));
-        assert_eq!((&notice["config"]["rate_hz"], &notice["revision"]), (&json!(10), &json!(3)));
+        assert_eq!(
+            (&notice["paths"], &notice["scopes"]),
+            (&json!(["/rate_hz"]), &json!(["service"]))
+        );
+        assert_eq!(
+            (&notice["config"]["rate_hz"], &notice["revision"]),
+            (&json!(10), &json!(3))
+        );
         assert_eq!(notice["config"]["log"], "info");
     }
     let keys: Vec<&str> = told
@@ -250,7 +291,11 @@ async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
     assert_eq!(keys, ["blaze:config:slam", "blaze:config:slam:0"]);
 
     // A new revision that says the same is told to nobody.
-    let same = document("Service/slam", 4, json!({ "config": { "rate_hz": 10 }, "description": "new" }));
+    let same = document(
+        "Service/slam",
+        4,
+        json!({ "config": { "rate_hz": 10 }, "description": "new" }),
+    );
     w.says(commit(4, 3, vec![(Op::Update, same)])).await;
     assert_eq!(w.rest().await, []);
     assert_eq!(w.slam().await["revision"], 3);
@@ -263,7 +308,8 @@ async fn what_comes_together_is_told_once_and_the_last_state_always() {
     w.rest().await;
     for revision in 3..53 {
         let changed = document("Service/slam", revision, json!({ "config": { "rate_hz": revision } }));
-        w.says(commit(revision, revision - 1, vec![(Op::Update, changed)])).await;
+        w.says(commit(revision, revision - 1, vec![(Op::Update, changed)]))
+            .await;
     }
     let told = w.rest().await;
     let rates: Vec<u64> = told
@@ -284,10 +330,13 @@ async fn what_is_missing_is_asked_for_anew_and_services_keep_what_they_have() {
     w.rest().await;
     let later = document("Service/slam", 9, json!({ "config": { "rate_hz": 1 } }));
     w.says(commit(9, 7, vec![(Op::Update, later)])).await;
-    tokio::time::timeout(Duration::from_secs(10), stream.cancelled()).await.unwrap();
+    tokio::time::timeout(Duration::from_secs(10), stream.cancelled())
+        .await
+        .unwrap();
     assert_eq!(w.slam().await["config"]["rate_hz"], 30);
     let closed = SyncEvent::Closed {
         reason: "begins anew".to_owned(),
+        is_unreadable: false,
     };
     w.sync.send(closed).await.unwrap();
     let hello = w.hello().await;
@@ -313,7 +362,10 @@ async fn the_main_service_is_told_what_is_here() {
     w.queries.send(Query::Status(send)).await.unwrap();
     let status = status.await.unwrap();
     assert_eq!(status.json["digest"], ack.digest);
-    assert_eq!((&status.json["connected"], &status.json["leader"]), (&json!(true), &json!(true)));
+    assert_eq!(
+        (&status.json["connected"], &status.json["leader"]),
+        (&json!(true), &json!(true))
+    );
     assert!(status.is_ready && status.in_sync);
 }
 
@@ -344,7 +396,12 @@ async fn only_the_leader_answers_and_a_new_one_tells_what_the_last_may_have_left
 async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
     let mut w = world();
     let file = |rate| {
-        let documents = documents(rate).into_iter().map(|document| Arc::new(Document { revision: 0, ..document }));
+        let documents = documents(rate).into_iter().map(|document| {
+            Arc::new(Document {
+                revision: 0,
+                ..document
+            })
+        });
         defaults::Status {
             current: Some(Arc::new(defaults::Defaults {
                 documents: documents.collect(),
@@ -358,7 +415,10 @@ async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
     w.defaults.send_replace(file(1));
     w.rest().await;
     let answer = w.slam().await;
-    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(1), &json!("file")));
+    assert_eq!(
+        (&answer["config"]["rate_hz"], &answer["source"]),
+        (&json!(1), &json!("file"))
+    );
     w.defaults.send_replace(file(2));
     w.rest().await;
     assert_eq!(w.slam().await["config"]["rate_hz"], 2);
@@ -368,10 +428,14 @@ async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
     w.rest().await;
     let closed = SyncEvent::Closed {
         reason: "away".to_owned(),
+        is_unreadable: false,
     };
     w.sync.send(closed).await.unwrap();
     let answer = w.slam().await;
-    assert_eq!((&answer["config"]["rate_hz"], &answer["source"]), (&json!(30), &json!("copy")));
+    assert_eq!(
+        (&answer["config"]["rate_hz"], &answer["source"]),
+        (&json!(30), &json!("copy"))
+    );
 }
 
 #[tokio::test(start_paused = true)]
@@ -409,7 +473,10 @@ async fn a_new_life_serves_what_the_last_one_had_and_tells_only_what_differs() {
     };
     let mut w = world_from(Some(loaded), true);
     let answer = w.slam().await;
-    assert_eq!((&answer["config"], &answer["source"]), (&told["config"], &json!("copy")));
+    assert_eq!(
+        (&answer["config"], &answer["source"]),
+        (&told["config"], &json!("copy"))
+    );
     assert_eq!(answer["as_of"], "1970-01-01T00:00:01.000Z");
     let hello = w.hello().await;
     assert_eq!((hello.revision, hello.store_id.as_str()), (2, "s"));

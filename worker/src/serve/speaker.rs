@@ -123,7 +123,9 @@ impl State {
             && (bytes < BATCH_BYTES || batch.is_empty())
             && let Some((_, place)) = self.order.pop_first()
         {
-            let Some((_, waiting)) = self.waiting.remove(&place) else { continue };
+            let Some((_, waiting)) = self.waiting.remove(&place) else {
+                continue;
+            };
             bytes += waiting.notice.1.len();
             if let Some(key) = waiting.key.as_ref().and_then(|key| self.dirty.take(key)) {
                 bytes += self.wanted.get(&key).map_or(0, Bytes::len);
@@ -287,7 +289,11 @@ impl Speaker {
                 self.shared.more.notified().await;
                 continue;
             }
-            let messages: Vec<_> = batch.waiting.iter().map(|(_, waiting)| waiting.notice.clone()).collect();
+            let messages: Vec<_> = batch
+                .waiting
+                .iter()
+                .map(|(_, waiting)| waiting.notice.clone())
+                .collect();
             match outlet.deliver(&changes, &messages).await {
                 Ok(()) => {
                     (pause, most) = (PAUSE.0, BATCH);
@@ -358,10 +364,16 @@ mod tests {
             if !*self.is_up.borrow() {
                 return Err(OutletError::Away("switched off".to_owned()));
             }
-            if messages.iter().any(|(channel, _)| Some(channel.as_str()) == self.refused) {
+            if messages
+                .iter()
+                .any(|(channel, _)| Some(channel.as_str()) == self.refused)
+            {
                 return Err(OutletError::TooLarge { bytes: 1 });
             }
-            self.delivered.send((changes.to_vec(), messages.to_vec())).await.unwrap();
+            self.delivered
+                .send((changes.to_vec(), messages.to_vec()))
+                .await
+                .unwrap();
             Ok(())
         }
 
@@ -412,7 +424,10 @@ mod tests {
         Told {
             place: place.to_owned(),
             key: Some((format!("blaze:config:{place}"), Some(Bytes::from(text)))),
-            notice: Some((format!("blaze/config/changed/{place}").parse().unwrap(), Bytes::from(text))),
+            notice: Some((
+                format!("blaze/config/changed/{place}").parse().unwrap(),
+                Bytes::from(text),
+            )),
         }
     }
 
@@ -431,7 +446,11 @@ mod tests {
         w.speaker.tell([told("slam", "3")]);
         w.up.send_replace(true);
         let first = w.delivered.recv().await.unwrap();
-        assert_eq!(texts(&first), ["1", "3"], "a newer one comes after what was told meanwhile");
+        assert_eq!(
+            texts(&first),
+            ["1", "3"],
+            "a newer one comes after what was told meanwhile"
+        );
         assert_eq!(first.0.len(), 2);
         tokio::time::sleep(Duration::from_secs(5)).await;
         assert!(w.delivered.is_empty());
@@ -449,7 +468,12 @@ mod tests {
             ..told("nav", "gone")
         }]);
         let gone = w.delivered.recv().await.unwrap();
-        assert_eq!(gone.0, [KeyChange::Delete { key: "blaze:config:nav".to_owned() }]);
+        assert_eq!(
+            gone.0,
+            [KeyChange::Delete {
+                key: "blaze:config:nav".to_owned()
+            }]
+        );
         w.lost.notify_one();
         let again = w.delivered.recv().await.unwrap();
         let old = KeyChange::Delete {
@@ -470,7 +494,11 @@ mod tests {
         state.put(told("slam", "2"));
         state.put_back(batch);
         let left = state.take(BATCH);
-        let texts: Vec<_> = left.waiting.iter().map(|(_, waiting)| waiting.notice.1.clone()).collect();
+        let texts: Vec<_> = left
+            .waiting
+            .iter()
+            .map(|(_, waiting)| waiting.notice.1.clone())
+            .collect();
         assert_eq!(texts, ["2"]);
         assert_eq!(state.changes(&left.keys).len(), 1);
         assert!(state.take(BATCH).is_empty());
@@ -498,7 +526,8 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn whom_the_broker_refuses_holds_up_nobody_else() {
         let mut w = world(true);
-        w.speaker.tell([told("nav", "1"), told("refused", "1"), told("slam", "1")]);
+        w.speaker
+            .tell([told("nav", "1"), told("refused", "1"), told("slam", "1")]);
         let mut heard = Vec::new();
         while heard.len() < 2 {
             heard.extend(texts(&w.delivered.recv().await.unwrap()));

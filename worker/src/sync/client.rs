@@ -67,7 +67,8 @@ impl MainService {
             None => host.split(':').next().unwrap_or_default(),
         };
         let is_loopback = |address: std::net::IpAddr| address.to_canonical().is_loopback();
-        host.parse().map_or_else(|_| host.eq_ignore_ascii_case("localhost"), is_loopback)
+        host.parse()
+            .map_or_else(|_| host.eq_ignore_ascii_case("localhost"), is_loopback)
     }
 }
 
@@ -187,7 +188,10 @@ impl Client {
             let since = Some(contact.elapsed());
             let pause = backoff.next(since, rand::random());
             // The main service knows best; a wish of our own counts only if it is not the next of many.
-            let wait = end.again.filter(|again| end.was_good || !again.is_zero()).unwrap_or(pause);
+            let wait = end
+                .again
+                .filter(|again| end.was_good || !again.is_zero())
+                .unwrap_or(pause);
             tokio::select! {
                 () = tokio::time::sleep(wait) => {}
                 // Another address is worth a try at once; without a sender there is none.
@@ -310,7 +314,8 @@ async fn token(main: &MainService) -> Result<Option<MetadataValue<Ascii>>, Conne
 }
 
 async fn channel(main: &MainService) -> Result<Channel, ConnectError> {
-    let endpoint = Endpoint::from_shared(main.server.clone()).map_err(|error| ConnectError::Address(error.to_string()))?;
+    let endpoint =
+        Endpoint::from_shared(main.server.clone()).map_err(|error| ConnectError::Address(error.to_string()))?;
     let endpoint = endpoint
         .connect_timeout(CONNECT)
         .tcp_nodelay(true)
@@ -332,10 +337,15 @@ async fn channel(main: &MainService) -> Result<Channel, ConnectError> {
                     tls.ca_certificate(Certificate::from_pem(read(path, MAX_CA_BYTES).await.map_err(refuse)?))
                 }
             };
-            endpoint.tls_config(tls).map_err(|error| ConnectError::Transport(chain(&error)))?
+            endpoint
+                .tls_config(tls)
+                .map_err(|error| ConnectError::Transport(chain(&error)))?
         }
     };
-    endpoint.connect().await.map_err(|error| ConnectError::Transport(chain(&error)))
+    endpoint
+        .connect()
+        .await
+        .map_err(|error| ConnectError::Transport(chain(&error)))
 }
 
 /// The library's errors say little; what caused them says more.

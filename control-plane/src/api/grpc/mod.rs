@@ -72,7 +72,11 @@ pub fn router(service: ConfigService, options: GrpcOptions) -> Router {
         metrics: Arc::clone(&options.metrics),
         dev: options.dev,
     });
-    let workers = sync::Service::new(service.clone(), Arc::clone(&options.limits), Arc::clone(&options.metrics));
+    let workers = sync::Service::new(
+        service.clone(),
+        Arc::clone(&options.limits),
+        Arc::clone(&options.metrics),
+    );
     let workers = SyncServiceServer::new(workers).max_decoding_message_size(MAX_MESSAGE_BYTES);
     let config = ConfigServiceServer::new(service::Service::new(service, options.limits, options.metrics))
         .max_decoding_message_size(MAX_MESSAGE_BYTES);

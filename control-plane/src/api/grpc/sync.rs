@@ -144,7 +144,9 @@ fn hear(core: &ConfigService, session: &WorkerSession, said: Result<v1::SyncRequ
         }
         // A message of a newer protocol.
         Ok(None) => Event::Heard,
-        Ok(Some(Said::Hello(_))) => Event::Over(Some(Status::invalid_argument("Hello comes once, as the first message"))),
+        Ok(Some(Said::Hello(_))) => {
+            Event::Over(Some(Status::invalid_argument("Hello comes once, as the first message")))
+        }
         Err(status) => {
             tracing::debug!(%status, worker = session.name().id, "a worker's stream broke off");
             Event::Over(None)
@@ -195,7 +197,10 @@ fn read_hello(hello: v1::Hello) -> Result<SyncHello, Problem> {
     };
     Ok(SyncHello {
         protocol: hello.protocol,
-        layer: hello.layer.parse().map_err(|error| refuse("layer", format!("{error}")))?,
+        layer: hello
+            .layer
+            .parse()
+            .map_err(|error| refuse("layer", format!("{error}")))?,
         node,
         worker_id: hello.worker_id,
         version: hello.version,

@@ -2,9 +2,9 @@
 
 use blaze_domain::config::{Code, FieldFault, Key, Problem};
 
-use blaze_domain::config::state::State;
 use super::super::view::View;
 use super::Form;
+use blaze_domain::config::state::State;
 
 /// Faults of one answer, at most.
 const MAX_FAULTS: usize = 100;

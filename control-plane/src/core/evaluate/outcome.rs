@@ -8,15 +8,15 @@ use blaze_domain::config::{
 };
 use serde_json::{Map, Value, json};
 
-use blaze_domain::config::placement::{is_active, phase, rollout_target};
 use super::super::refs;
-use super::super::rollouts::too_large;
-use blaze_domain::config::state::State;
+use super::super::rollouts::{tell_canary, too_large};
 use super::super::types::{DocumentInput, Precondition};
 use super::super::view::view;
 use super::faults::{invalid, not_found};
-use super::{Content, Form, Item, Prune, Request};
+use super::{Content, Failed, Form, Item, Prune, Request};
 use crate::store::Op;
+use blaze_domain::config::placement::{is_active, phase, rollout_target};
+use blaze_domain::config::state::State;
 
 /// Deletions by `prune` that need no confirmation.
 const PRUNE_FREELY: usize = 20;
@@ -98,6 +98,7 @@ pub(super) fn outcome_of(
         }
         Content::Promote => promote(state, &item.key),
         Content::Abort(reason) => abort(state, &item.key, reason),
+        Content::Fail(failed) => one(fail(current, failed), Op::Update),
     }
 }
 
@@ -106,7 +107,10 @@ fn precondition(state: &State, request: &Request, item: &Item, current: Option<&
     let revision = current.map_or(state.revision(), |document| document.revision);
     let fail = |problem: Problem| Err(Box::new(problem.at(revision)));
     let many = request.form == Form::Many;
-    let rolls_back = matches!(item.content, Content::Restore(_) | Content::Promote | Content::Abort(_));
+    let rolls_back = matches!(
+        item.content,
+        Content::Restore(_) | Content::Promote | Content::Abort(_) | Content::Fail(_)
+    );
     if let Some(revision) = request.unchanged_since.get(&item.key)
         && current.map_or(0, |document| document.revision) != *revision
     {
@@ -298,6 +302,24 @@ fn promote(state: &State, key: &Key) -> Result<Vec<(Key, Outcome, Op)>, Box<Prob
 fn abort(state: &State, key: &Key, reason: &str) -> Result<Vec<(Key, Outcome, Op)>, Box<Problem>> {
     let rollout = canary_phase(state, key)?;
     Ok(vec![(key.clone(), with_phase(&rollout, "aborted", reason), Op::Update)])
+}
+
+/// What becomes of a roll-out that failed on a canary; one that has ended, or is another one, stays as it is.
+fn fail(current: Option<&Document>, failed: &Failed) -> Outcome {
+    let is_it = |rollout: &&Document| rollout.uid == failed.uid && is_active(rollout);
+    let Some(rollout) = current.filter(is_it) else {
+        return Outcome::Keep;
+    };
+    let Failed {
+        node, reason, revision, ..
+    } = failed;
+    let mut outcome = with_phase(rollout, "failed", &format!("{node}: {reason}"));
+    if let Outcome::Put(target) = &mut outcome
+        && let Some(status) = &mut target.status
+    {
+        tell_canary(status, node.as_str(), "failed", *revision, reason);
+    }
+    outcome
 }
 
 pub(super) fn prune_into(

@@ -7,13 +7,13 @@ use blaze_domain::config::{Code, Document, Key, Problem};
 
 use super::super::committer::unavailable;
 use super::super::page::Position;
-use blaze_domain::config::state::{Held, State, redacted};
 use super::super::types::{Answer, Caller, HistoryEntry, Page, ReadOptions};
 use super::super::view::view;
 use super::read::{PAGE_BYTES, answer, page_size};
 use super::{ConfigService, not_found};
 use crate::auth::Right;
 use crate::store::{Op, Version};
+use blaze_domain::config::state::{Held, State, redacted};
 
 /// Versions that are taken from the store at once: each may be a whole document.
 const VERSIONS_AT_ONCE: usize = 32;

@@ -7,17 +7,17 @@ use blaze_domain::{DocumentName, LayerName};
 use serde_json::Value;
 
 use super::super::committer::unavailable;
-use blaze_domain::config::effective::{At, Sources};
 use super::super::page::Position;
-use blaze_domain::config::placement::{Placement, placement};
 use super::super::report;
 use super::super::secrets;
-use blaze_domain::config::state::{State, redacted};
 use super::super::types::{Answer, Caller, Effective, ListQuery, Page, Place, ReadOptions, WatchQuery};
 use super::super::view::{may_reveal, view};
 use super::super::watch::{Filter, WatchStream, is_in_layer, trimmed};
 use super::{ConfigService, WAIT_FOR_REVISION, not_found, selector};
 use crate::auth::Right;
+use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::placement::{Placement, placement};
+use blaze_domain::config::state::{State, redacted};
 
 /// Entries of a page unless it is said.
 const PAGE: u32 = 100;
@@ -158,7 +158,7 @@ impl ConfigService {
             true => self.shown(caller, &held.document, true).await?,
             false => Arc::clone(&held.shown),
         };
-        Ok(answer(&state, document))
+        Ok(answer(&state, self.with_canaries(&state, document)))
     }
 
     /// Documents by name, bytewise; all pages show the state of the first one.
@@ -229,6 +229,9 @@ impl ConfigService {
         drop(found);
         if read.reveal {
             items = self.reveal_all(caller, items).await?;
+        }
+        if read.at_revision.is_none() {
+            items = items.into_iter().map(|item| self.with_canaries(&state, item)).collect();
         }
         let next = items.last().filter(|_| more).map(|document| Position {
             revision: state.revision(),

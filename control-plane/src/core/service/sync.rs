@@ -12,8 +12,8 @@ use blaze_domain::config::placement::placement;
 use blaze_domain::config::state::{Held, State};
 use blaze_domain::config::{Code, Document, Problem, secret};
 use blaze_domain::{LayerName, NodeName};
-use futures::stream::{self, BoxStream};
 use futures::StreamExt as _;
+use futures::stream::{self, BoxStream};
 use rand::RngExt as _;
 use serde_json::Value;
 use tokio::sync::OwnedSemaphorePermit;
@@ -179,7 +179,7 @@ impl ConfigService {
         let state = self.read_state(&ReadOptions::default()).await?;
         let resumed = self.can_resume(&hello, &state).await;
         let since = if resumed { hello.revision } else { state.revision() };
-        let session = self.enter(&hello)?;
+        let session = self.enter(&hello)?.from_address(caller.address);
         let clear = Clear {
             keyring: Arc::clone(&self.inner.evaluator.keyring),
             is_safe,
@@ -208,8 +208,9 @@ impl ConfigService {
         })
     }
 
-    /// Notes what a worker says it has.
+    /// Notes what a worker says it has. A roll-out that failed there ends everywhere.
     pub fn acknowledged(&self, session: &WorkerSession, has: Acknowledged) {
+        self.end_failed(session, &has);
         session.said(has, now());
     }
 
@@ -335,7 +336,9 @@ fn size(held: &Held) -> usize {
 fn check_hello(hello: &SyncHello) -> Result<(), Problem> {
     let fault = match hello {
         SyncHello { protocol: 0, .. } => "protocol 0: there is none before 1",
-        SyncHello { worker_id, .. } if worker_id.is_empty() => "worker_id is empty: several workers could not be told apart",
+        SyncHello { worker_id, .. } if worker_id.is_empty() => {
+            "worker_id is empty: several workers could not be told apart"
+        }
         SyncHello { worker_id, version, .. } if worker_id.len().max(version.len()) > MAX_ID_BYTES => {
             "worker_id or version has more than 256 bytes"
         }

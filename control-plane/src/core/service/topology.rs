@@ -6,13 +6,13 @@ use blaze_domain::config::{Key, Kind, Problem};
 use blaze_domain::{InstanceName, LayerName, NodeName, ServiceName};
 use serde_json::{Value, json};
 
-use blaze_domain::config::state::State;
 use super::super::types::{Answer, Caller, ReadOptions};
 use super::super::view::{View, view};
 use super::super::workers::{Running, RunningState, Worker, WorkerName};
 use super::read::answer;
 use super::{ConfigService, not_found};
 use crate::auth::Right;
+use blaze_domain::config::state::State;
 
 impl ConfigService {
     /// Layers, nodes and services, with what is known of them.
@@ -108,7 +108,9 @@ impl ConfigService {
             let in_sync = worker.is_connected() && worker.has.digest == self.inner.digests.of(state, &name.layer);
             if worker.is_connected() {
                 let services = worker.has.services.iter();
-                fleet.running.extend(services.map(|(running, state)| (running.clone(), state.clone())));
+                fleet
+                    .running
+                    .extend(services.map(|(running, state)| (running.clone(), state.clone())));
             }
             fleet.workers.push(Known { name, worker, in_sync });
         }
@@ -131,7 +133,10 @@ impl ConfigService {
 
 /// The worker of a node: one that is connected before one that has gone, then the one that was seen last.
 fn worker_json(fleet: &Fleet, node: &NodeName) -> Value {
-    let of_node = fleet.workers.iter().filter(|known| known.name.node.as_ref() == Some(node));
+    let of_node = fleet
+        .workers
+        .iter()
+        .filter(|known| known.name.node.as_ref() == Some(node));
     match of_node.max_by_key(|known| (known.worker.is_connected(), known.worker.last_seen)) {
         Some(known) => json!({
             "connected": known.worker.is_connected(), "revision": known.worker.has.revision,
@@ -155,7 +160,10 @@ fn node_json(state: &State, view: &View, fleet: &Fleet, key: &Key) -> Value {
         let instance = InstanceName::from(key.name());
         Some((key.service_name()?.clone(), instance))
     });
-    let runs = fleet.running.keys().filter(|running| running.node.as_ref() == Some(&node));
+    let runs = fleet
+        .running
+        .keys()
+        .filter(|running| running.node.as_ref() == Some(&node));
     let runs = runs.map(|running| (running.service.clone(), running.instance.clone()));
     let services: BTreeSet<(ServiceName, InstanceName)> = placed.chain(runs).collect();
     let services = services.into_iter().map(|(service, instance)| {

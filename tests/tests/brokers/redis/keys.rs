@@ -45,7 +45,9 @@ async fn until<T>(mut ask: impl AsyncFnMut() -> T, is_good: impl Fn(&T) -> bool)
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    tokio::time::timeout(Duration::from_secs(20), wait).await.expect("within 20 s")
+    tokio::time::timeout(Duration::from_secs(20), wait)
+        .await
+        .expect("within 20 s")
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -57,9 +59,12 @@ async fn values_and_the_messages_about_them_come_together() {
     wait_for(&broker, Health::Up).await;
     let mut reader = subscribe(&broker, "blaze/config/changed/slam").await;
     let notice = (channel("blaze/config/changed/slam"), Bytes::from("changed"));
-    keys.apply(&[put("blaze:config:slam", "new"), put("blaze:config:nav", "n")], &[notice])
-        .await
-        .unwrap();
+    keys.apply(
+        &[put("blaze:config:slam", "new"), put("blaze:config:nav", "n")],
+        &[notice],
+    )
+    .await
+    .unwrap();
     let mut batch = Vec::new();
     reader.receive(&mut batch, 1).await;
     assert_eq!(batch.len(), 1);
@@ -93,7 +98,11 @@ async fn a_record_vanishes_unless_it_is_renewed_and_only_those_asked_for_are_fou
     )
     .await;
     assert_eq!(keys.records("blaze:watchdog:", 100).await.unwrap().len(), 1);
-    assert_eq!(keys.records("blaze:", 1).await.unwrap().len(), 1, "no more than asked for");
+    assert_eq!(
+        keys.records("blaze:", 1).await.unwrap().len(),
+        1,
+        "no more than asked for"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -105,7 +114,10 @@ async fn a_lease_has_one_owner_until_it_runs_out_or_is_given_up() {
     assert!(one.hold(lease, "one", LONG).await.unwrap(), "it goes on having it");
     assert!(!other.hold(lease, "other", LONG).await.unwrap());
     other.release(lease, "other").await.unwrap();
-    assert!(!other.hold(lease, "other", LONG).await.unwrap(), "nobody gives up what another has");
+    assert!(
+        !other.hold(lease, "other", LONG).await.unwrap(),
+        "nobody gives up what another has"
+    );
     one.release(lease, "one").await.unwrap();
     assert!(other.hold(lease, "other", SHORT).await.unwrap());
     until(async || one.hold(lease, "one", LONG).await.unwrap(), |has| *has).await;

@@ -1,0 +1,157 @@
+//! What services say about themselves, and what becomes of roll-outs by it.
+
+use std::collections::BTreeMap;
+
+use blaze_domain::NodeName;
+use blaze_proto::v1;
+use bytes::Bytes;
+use tokio::time::Instant;
+
+use super::{ACK_AFTER, Engine, LOOK};
+use crate::core::messages::{ConfigAck, ServiceState, WatchdogKey};
+use crate::core::{Complaint, RolloutState};
+
+/// Something that was heard of services.
+#[derive(Debug)]
+pub enum Sign {
+    /// A message of `blaze/config/ack`.
+    Ack(Bytes),
+    /// A message of `blaze/watchdog`.
+    Beat(Bytes),
+    /// The records below `blaze:watchdog:`.
+    Scan {
+        /// Keys, without the prefix of the server, with their members.
+        records: Vec<(String, BTreeMap<String, String>)>,
+        /// Whether these are all; if not, what is missing may be there nevertheless.
+        is_whole: bool,
+    },
+    /// The broker is away, or was until now.
+    Deaf,
+}
+
+impl Engine {
+    pub(super) fn on_sign(&mut self, sign: Sign) {
+        let now = Instant::now().into_std();
+        let complaints = match sign {
+            Sign::Ack(bytes) => match ConfigAck::parse(&bytes) {
+                Ok(ack) => {
+                    self.counts.signs += 1;
+                    self.signs.acked(ack, now).into_iter().collect()
+                }
+                Err(error) => self.misunderstood(&error),
+            },
+            Sign::Beat(bytes) => match ServiceState::parse(&bytes) {
+                Ok(state) => {
+                    self.counts.signs += 1;
+                    self.signs.beat(state, now).into_iter().collect()
+                }
+                Err(error) => self.misunderstood(&error),
+            },
+            Sign::Scan { records, is_whole } => {
+                let mut states = Vec::with_capacity(records.len());
+                for (key, members) in &records {
+                    match read_record(key, members) {
+                        Ok(state) => states.push(state),
+                        Err(error) => {
+                            self.misunderstood(&error);
+                        }
+                    }
+                }
+                self.counts.signs += states.len() as u64;
+                self.signs.scanned(states, is_whole, now)
+            }
+            Sign::Deaf => {
+                self.signs.deaf(now);
+                Vec::new()
+            }
+        };
+        self.judge(&complaints);
+    }
+
+    fn misunderstood(&mut self, error: &str) -> Vec<Complaint> {
+        self.counts.misunderstood += 1;
+        tracing::debug!(error, "what a service says about itself cannot be read");
+        Vec::new()
+    }
+
+    /// Looks whether anything has run out.
+    pub(super) fn look_at_signs(&mut self) {
+        self.look_at = Instant::now() + LOOK;
+        let complaints = self.signs.expire(Instant::now().into_std());
+        self.judge(&complaints);
+    }
+
+    fn judge(&mut self, complaints: &[Complaint]) {
+        let now = Instant::now().into_std();
+        for complaint in complaints {
+            for failure in self.gate.complain(&self.served, complaint, now) {
+                let reason = failure.reason.as_str();
+                tracing::warn!(rollout = %failure.name, reason, "a roll-out has failed here and is undone");
+                self.counts.failed_rollouts += 1;
+                self.served.fail_rollout(&failure.uid);
+                self.notes.fail(&failure.uid);
+                // A new life must not try it again, whether it tells anybody of the former configuration or not.
+                self.keep_notes();
+                self.flush_soon();
+                self.acknowledge_soon();
+            }
+        }
+        if self.signs.take_changed() {
+            self.acknowledge_soon();
+        }
+    }
+
+    /// Roll-outs that began or ended with what was told just now.
+    pub(super) fn follow_rollouts(&mut self) {
+        if self.gate.follow(&self.served, Instant::now().into_std()) {
+            self.acknowledge_soon();
+        }
+    }
+
+    /// The main service is to know soon, together with what comes until then.
+    pub(super) fn acknowledge_soon(&mut self) {
+        if self.stream.is_some() {
+            self.ack_at = self.ack_at.min(Instant::now() + ACK_AFTER);
+        }
+    }
+
+    /// How roll-outs go on the nodes that are served here. On the broker of a layer these are the nodes that anything was
+    /// heard from: the others have brokers and workers of their own.
+    pub(super) fn rollouts(&self) -> Vec<RolloutState> {
+        let is_own = |node: &NodeName| self.identity.site.node.as_ref().or(self.identity.node.as_ref()) == Some(node);
+        self.gate
+            .states(|node| is_own(node) || self.served.is_asked_from(node) || self.signs.is_heard_from(node))
+    }
+
+    pub(super) fn services_of_ack(&self) -> Vec<v1::ServiceState> {
+        let row = self.signs.rows().map(|(key, row)| v1::ServiceState {
+            service: key.service.to_string(),
+            instance: key.instance.to_string(),
+            node: key.node.to_string(),
+            state: row.health.as_str().to_owned(),
+            config_revision: row.config_revision,
+            config_hash: row.config_hash.clone(),
+        });
+        row.collect()
+    }
+
+    pub(super) fn rollouts_of_ack(&self) -> Vec<v1::RolloutReport> {
+        let states = self.rollouts().into_iter().map(|state| v1::RolloutReport {
+            uid: state.uid,
+            node: state.node.to_string(),
+            phase: state.phase.as_str().to_owned(),
+            reason: state.reason,
+        });
+        states.collect()
+    }
+}
+
+/// A record of Redis. Its key decides where it is looked for, so it must say the same.
+fn read_record(key: &str, members: &BTreeMap<String, String>) -> Result<ServiceState, String> {
+    let fields = members.iter().map(|(name, value)| (name.as_str(), value.as_str()));
+    let state = ServiceState::of_fields(fields)?;
+    match WatchdogKey::parse("", key) {
+        Some(named) if named == state.key => Ok(state),
+        Some(_) | None => Err("the record is of another instance than its key".to_owned()),
+    }
+}

@@ -1,0 +1,248 @@
+//! Roll-outs that services judge, with and without a main service.
+
+use std::collections::BTreeMap;
+
+use blaze_runtime::Supervisor;
+
+use super::*;
+use crate::copy::fake::Fake;
+use crate::copy::{LocalCopy, Target};
+use crate::core::testing::labelled;
+
+/// A roll-out of another rate of `slam` on `robot-1`, watched for 60 s.
+fn rollout(revision: u64, uid: &str, rate: u64) -> Document {
+    let spec = json!({ "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "rate_hz": rate } },
+        "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 } });
+    let mut out = document("Rollout/faster", revision, spec);
+    out.uid = uid.to_owned();
+    out.status = Some(json!({ "phase": "canary" }));
+    out
+}
+
+fn canary_documents() -> Vec<Document> {
+    let mut out = documents(30);
+    out.retain(|document| document.key.to_string() != "Node/robot-1");
+    out.push(labelled(
+        "Node/robot-1",
+        2,
+        json!({ "layer": "edge" }),
+        ("canary", "true"),
+    ));
+    out
+}
+
+fn copies() -> (Supervisor, Arc<Fake>, Copies) {
+    let supervisor = Supervisor::new("test");
+    let fake = Arc::new(Fake::new("fake"));
+    let target = Target {
+        copy: Arc::clone(&fake) as Arc<dyn LocalCopy>,
+        is_current: false,
+    };
+    let copies = Copies::start(&supervisor, vec![target], &Arc::default());
+    (supervisor, fake, copies)
+}
+
+fn beat(instance: &str, state: &str) -> Value {
+    json!({ "layer": "edge", "node": "robot-1", "service": "slam", "instance": instance, "epoch": 1, "state": state,
+        "config_revision": 2, "config_hash": "sha256:ab", "ttl_ms": 15000 })
+}
+
+impl World {
+    /// With an instance of `slam` that has asked.
+    async fn with_canary(mut self) -> Self {
+        self.opens(canary_documents(), 2).await;
+        self.slam().await;
+        self.rest().await;
+        self
+    }
+
+    async fn tries(&mut self, revision: u64, uid: &str, rate: u64) -> Vec<Value> {
+        let edits = vec![(Op::Update, rollout(revision, uid, rate))];
+        self.says(commit(revision, revision - 1, edits)).await;
+        self.rates().await
+    }
+
+    /// Rates that the instance `0` was told of.
+    async fn rates(&mut self) -> Vec<Value> {
+        let told = self.rest().await.into_iter().filter_map(|seen| match seen {
+            Seen::Notice(_, notice) if notice["instance"] == "0" => Some(notice["config"]["rate_hz"].clone()),
+            Seen::Notice(..) | Seen::Key(..) => None,
+        });
+        told.collect()
+    }
+
+    async fn acks(&self, instance: &str, hash: &Value, status: &str) {
+        let ack = json!({ "service": "slam", "instance": instance, "node": "robot-1", "revision": 3, "hash": hash,
+            "status": status, "detail": "too fast" });
+        self.signs.send(Sign::Ack(Bytes::from(ack.to_string()))).await.unwrap();
+    }
+
+    async fn beats(&self, message: &Value) {
+        self.signs
+            .send(Sign::Beat(Bytes::from(message.to_string())))
+            .await
+            .unwrap();
+    }
+
+    async fn reported(&mut self, phase: &str) -> v1::RolloutReport {
+        let is_it = |ack: &Option<v1::Ack>| {
+            let ack = ack.as_ref();
+            ack.is_some_and(|ack| ack.rollouts.first().is_some_and(|report| report.phase == phase))
+        };
+        let wait = self.acks.wait_for(is_it);
+        let ack = tokio::time::timeout(Duration::from_secs(20), wait)
+            .await
+            .expect("a report within 20 s")
+            .unwrap();
+        ack.as_ref().unwrap().rollouts[0].clone()
+    }
+
+    async fn status(&self) -> Status {
+        let (send, status) = oneshot::channel();
+        self.queries.send(Query::Status(send)).await.unwrap();
+        status.await.unwrap()
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_bad_value_is_undone_without_the_main_service_and_stays_away_after_a_restart() {
+    let (_supervisor, fake, copies) = copies();
+    let mut w = world_with(None, true, Some(copies.clone())).with_canary().await;
+    assert_eq!(w.tries(3, "u-1", 500).await, [json!(500)]);
+    assert_eq!(w.reported("applied").await.uid, "u-1");
+    let reason = "away".to_owned();
+    w.sync
+        .send(SyncEvent::Closed {
+            reason,
+            is_unreadable: false,
+        })
+        .await
+        .unwrap();
+    let bad = w.slam().await;
+    assert_eq!(
+        (&bad["config"]["rate_hz"], &bad["rollout"]),
+        (&json!(500), &json!("faster"))
+    );
+    w.acks("0", &bad["hash"], "rejected").await;
+    assert_eq!(w.rates().await, [json!(30)]);
+    let status = w.status().await;
+    let told = &status.json["rollouts"][0];
+    assert_eq!(
+        (&told["phase"], &told["node"], &told["name"]),
+        (&json!("failed"), &json!("robot-1"), &json!("faster"))
+    );
+    assert!(told["reason"].as_str().unwrap().contains("too fast"), "{told}");
+    assert_eq!(status.counts.failed_rollouts, 1);
+
+    assert!(copies.flush(Duration::from_secs(60)).await);
+    drop(w);
+    let loaded = fake.load().await.unwrap().unwrap();
+    assert!(loaded.notes.has_failed("u-1"));
+    let mut w = world_with(Some(loaded), true, Some(copies));
+    assert_eq!(w.rates().await, [] as [Value; 0], "it was told already");
+    let good = w.slam().await;
+    assert_eq!(
+        (&good["config"]["rate_hz"], &good["rollout"]),
+        (&json!(30), &json!(null))
+    );
+    // The main service is back and does not know yet.
+    let mut documents = canary_documents();
+    documents.push(rollout(3, "u-1", 500));
+    w.opens(documents.clone(), 3).await;
+    assert_eq!(w.reported("failed").await.node, "robot-1");
+    assert_eq!(w.rates().await, [] as [Value; 0]);
+    // Another one of the same name may be tried.
+    assert_eq!(w.tries(4, "u-2", 40).await, [json!(40)]);
+    assert_eq!(w.reported("applied").await.uid, "u-2");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_good_value_stays_and_what_others_say_is_nothing_to_it() {
+    let mut w = world().with_canary().await;
+    let before = w.slam().await["hash"].clone();
+    assert_eq!(w.tries(3, "u-1", 40).await, [json!(40)]);
+    let hash = w.slam().await["hash"].clone();
+    w.acks("0", &hash, "applied").await;
+    w.acks("0", &before, "unhealthy").await;
+    let others = [
+        json!({ "service": "nav", "instance": "0", "node": "robot-1", "status": "rejected" }),
+        json!({ "service": "slam", "instance": "0", "node": "robot-2", "status": "rejected" }),
+        json!({ "service": "slam", "status": "fine" }),
+    ];
+    for other in others {
+        w.signs.send(Sign::Ack(Bytes::from(other.to_string()))).await.unwrap();
+    }
+    assert_eq!(w.rates().await, [] as [Value; 0]);
+    assert_eq!(w.reported("applied").await.reason, "");
+    assert_eq!(w.status().await.counts.misunderstood, 1);
+    // The window is over.
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    w.acks("0", &hash, "unhealthy").await;
+    assert_eq!(w.rates().await, [] as [Value; 0]);
+    // The same again in the window of another one.
+    w.tries(4, "u-2", 50).await;
+    w.acks("0", &json!(null), "unhealthy").await;
+    assert_eq!(w.rates().await, [json!(30)]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_lost_watchdog_fails_it() {
+    let mut w = world().with_canary().await;
+    w.beats(&beat("0", "ready")).await;
+    assert_eq!(w.tries(3, "u-1", 500).await, [json!(500)]);
+    w.beats(&beat("0", "ready")).await;
+    let ack = w
+        .acks
+        .wait_for(|ack| ack.as_ref().is_some_and(|ack| !ack.services.is_empty()))
+        .await;
+    let services = ack.unwrap().as_ref().unwrap().services.clone();
+    assert_eq!(
+        (services[0].service.as_str(), services[0].state.as_str()),
+        ("slam", "ready")
+    );
+    assert_eq!((services[0].config_revision, services[0].node.as_str()), (2, "robot-1"));
+    let begin = Instant::now();
+    let (_, notice) = w.notice().await;
+    assert_eq!(notice["config"]["rate_hz"], 30);
+    assert!(begin.elapsed() > Duration::from_secs(9), "{:?}", begin.elapsed());
+    assert!(w.reported("failed").await.reason.contains("lost its watchdog"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_record_that_is_gone_from_redis_fails_it_and_an_outage_does_not() {
+    let mut w = world().with_canary().await;
+    let members: BTreeMap<String, String> = beat("0", "ready")
+        .as_object()
+        .unwrap()
+        .iter()
+        .map(|(name, value)| {
+            (
+                name.clone(),
+                value.as_str().map_or_else(|| value.to_string(), str::to_owned),
+            )
+        })
+        .collect();
+    let scan = |records: Vec<(String, BTreeMap<String, String>)>, is_whole| Sign::Scan { records, is_whole };
+    let one = || {
+        let strange = ("blaze:watchdog:slam:robot-1:7".to_owned(), members.clone());
+        vec![("blaze:watchdog:slam:robot-1:0".to_owned(), members.clone()), strange]
+    };
+    w.signs.send(scan(one(), true)).await.unwrap();
+    assert_eq!(w.tries(3, "u-1", 500).await, [json!(500)]);
+    let status = w.status().await;
+    let slam = status.json["services"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .find(|row| row["instance"] == "0")
+        .unwrap();
+    assert_eq!(
+        (&slam["state"], &slam["config_hash"]),
+        (&json!("ready"), &json!("sha256:ab"))
+    );
+    assert_eq!((status.counts.signs, status.counts.misunderstood), (1, 1));
+    w.signs.send(scan(Vec::new(), false)).await.unwrap();
+    assert_eq!(w.rates().await, [] as [Value; 0]);
+    w.signs.send(scan(Vec::new(), true)).await.unwrap();
+    assert_eq!(w.rates().await, [json!(30)]);
+}
