@@ -78,9 +78,9 @@ pub(super) fn tell_canary(status: &mut Value, node: &str, phase: &str, revision:
         return;
     };
     let line = json!({ "node": node, "phase": phase, "revision": revision, "reason": reason });
-    let is_of_node = |line: &&mut Value| line.get("node").and_then(Value::as_str) == Some(node);
-    match lines.iter_mut().find(is_of_node) {
-        Some(held) => *held = line,
+    let is_of_node = |line: &Value| line.get("node").and_then(Value::as_str) == Some(node);
+    match lines.iter().position(is_of_node) {
+        Some(index) => lines[index] = line,
         None if lines.len() < MAX_CANARIES => lines.push(line),
         None => {}
     }
