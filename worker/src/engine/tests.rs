@@ -47,7 +47,7 @@ impl Outlet for Board {
     }
 
     async fn keys_lost(&self) {
-        std::future::pending().await;
+        std::future::pending::<()>().await;
     }
 }
 
