@@ -203,8 +203,10 @@ impl RunningWorker {
 
     /// The main service is elsewhere from now on.
     pub fn set_main(&self, main: MainService) {
-        self.main
-            .send_if_modified(|now| std::mem::replace(now, main.clone()) != main);
+        let is_another = *self.main.borrow() != main;
+        if is_another {
+            self.main.send_replace(main);
+        }
     }
 
     /// Leaves everything as the next life wants to find it: copies that are up to date, no lease.

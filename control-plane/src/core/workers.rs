@@ -257,7 +257,7 @@ impl Known {
 
 impl WorkerSession {
     /// The same with the address of the worker.
-    pub(crate) fn from_address(mut self, address: IpAddr) -> Self {
+    pub(crate) fn with_address(mut self, address: IpAddr) -> Self {
         self.address = address;
         self
     }

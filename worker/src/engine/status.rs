@@ -1,7 +1,7 @@
 //! How the worker is.
 
-use blaze_domain::NodeName;
 use blaze_domain::config::Timestamp;
+use blaze_domain::{InstanceName, NodeName};
 use serde_json::{Value, json};
 
 use super::{Counts, Engine, now};
@@ -100,7 +100,7 @@ impl Engine {
 
 fn service(place: &Place, told: Option<&Told>, row: Option<&Row>) -> Value {
     json!({
-        "service": place.service.as_str(), "instance": place.instance.as_ref().map(|name| name.as_str()),
+        "service": place.service.as_str(), "instance": place.instance.as_ref().map(InstanceName::as_str),
         "node": place.node.as_ref().map(NodeName::as_str),
         "revision": told.map(|told| told.revision), "hash": told.and_then(|told| told.hash.as_deref()),
         "state": row.map(|row| row.health.as_str()), "config_revision": row.map(|row| row.config_revision),

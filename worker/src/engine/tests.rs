@@ -50,7 +50,7 @@ impl Outlet for Board {
     }
 
     async fn keys_lost(&self) {
-        std::future::pending().await
+        std::future::pending::<()>().await;
     }
 
     async fn own_keys(&self) -> Result<Vec<String>, OutletError> {

@@ -179,7 +179,7 @@ impl ConfigService {
         let state = self.read_state(&ReadOptions::default()).await?;
         let resumed = self.can_resume(&hello, &state).await;
         let since = if resumed { hello.revision } else { state.revision() };
-        let session = self.enter(&hello)?.from_address(caller.address);
+        let session = self.enter(&hello)?.with_address(caller.address);
         let clear = Clear {
             keyring: Arc::clone(&self.inner.evaluator.keyring),
             is_safe,

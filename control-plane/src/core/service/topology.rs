@@ -49,7 +49,7 @@ impl ConfigService {
         self.authorize(&caller.claims, Right::Read)?;
         let state = self.read_state(read).await?;
         let fleet = self.fleet(&state, &view(&caller.claims));
-        let items: Vec<Value> = fleet.workers.iter().map(|known| known.to_json()).collect();
+        let items: Vec<Value> = fleet.workers.iter().map(Known::to_json).collect();
         let value = json!({ "items": items, "revision": state.revision(), "next_page_token": "" });
         Ok(answer(&state, value))
     }
