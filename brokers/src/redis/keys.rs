@@ -163,10 +163,28 @@ impl RedisKeys {
         let key = self.settings.names.key(key);
         let value = self
             .call(|mut connection| async move {
-                redis::cmd("GET").arg(key).query_async::<Option<Vec<u8>>>(&mut connection).await
+                redis::cmd("GET")
+                    .arg(key)
+                    .query_async::<Option<Vec<u8>>>(&mut connection)
+                    .await
             })
             .await?;
         Ok(value.map(Bytes::from))
+    }
+
+    /// A key has this value, for so long (at least 1 ms).
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn put_for(&self, key: &str, value: &Bytes, expires: Duration) -> Result<(), KeyError> {
+        let key = self.settings.names.key(key);
+        let expires_ms = i64::try_from(expires.as_millis()).unwrap_or(i64::MAX).max(1);
+        self.call(|mut connection| async move {
+            let mut set = redis::cmd("SET");
+            set.arg(key).arg(value.as_ref()).arg("PX").arg(expires_ms);
+            set.query_async::<()>(&mut connection).await
+        })
+        .await
     }
 
     /// A record; `None` if there is none or it has vanished.
@@ -177,7 +195,10 @@ impl RedisKeys {
         let key = self.settings.names.key(key);
         let members = self
             .call(|mut connection| async move {
-                redis::cmd("HGETALL").arg(key).query_async::<Record>(&mut connection).await
+                redis::cmd("HGETALL")
+                    .arg(key)
+                    .query_async::<Record>(&mut connection)
+                    .await
             })
             .await?;
         Ok((!members.is_empty()).then_some(members))
@@ -231,7 +252,8 @@ impl RedisKeys {
     /// [`KeyError`]: then it may run out, or be had.
     pub async fn hold(&self, key: &str, owner: &str, time: Duration) -> Result<bool, KeyError> {
         let mut call = self.hold.key(self.settings.names.key(key));
-        call.arg(owner).arg(u64::try_from(time.as_millis()).unwrap_or(u64::MAX).max(1));
+        call.arg(owner)
+            .arg(u64::try_from(time.as_millis()).unwrap_or(u64::MAX).max(1));
         self.call(|mut connection| async move { call.invoke_async::<bool>(&mut connection).await })
             .await
     }
@@ -291,7 +313,10 @@ impl RedisKeys {
         let config = AsyncConnectionConfig::new()
             .set_connection_timeout(Some(CONNECT))
             .set_response_timeout(Some(CALL));
-        let made = self.settings.client.get_multiplexed_async_connection_with_config(&config);
+        let made = self
+            .settings
+            .client
+            .get_multiplexed_async_connection_with_config(&config);
         let made = tokio::time::timeout(CONNECT, made).await;
         let made = made.unwrap_or_else(|_| Err(RedisError::from((redis::ErrorKind::Io, "no connection within 1 s"))));
         let connection = made.map_err(|error| self.failed(&error))?;
