@@ -67,3 +67,25 @@ pub(crate) async fn subscribe(broker: &dyn Broker, channel: &ChannelName) -> Res
         pause = (pause * 2).min(LONGEST_PAUSE);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn answers_come_on_a_channel_of_ones_own_only_where_the_broker_makes_channels_as_they_are_named() {
+        let own: ChannelName = "blaze/reply/slam-0-7f".parse().unwrap();
+        for kind in [BrokerKind::Memory, BrokerKind::Redis] {
+            assert_eq!(reply_channel(kind, own.clone()), own, "{kind}");
+        }
+        for kind in [BrokerKind::Kafka, BrokerKind::Dds, BrokerKind::Ros2] {
+            assert_eq!(reply_channel(kind, own.clone()), ChannelName::shared_reply(), "{kind}");
+        }
+    }
+
+    #[test]
+    fn a_name_that_no_channel_can_have_is_refused() {
+        assert!(channel("blaze/config/get").is_ok_and(|channel| channel.is_reserved()));
+        assert!(matches!(channel("a b"), Err(BrokerError::Name { .. })));
+    }
+}
