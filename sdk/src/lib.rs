@@ -3,7 +3,9 @@
 //! ```text
 //!                      ┌─ broker(): publish; subscribe with a callback on a pool of threads
 //! ServiceManager ──────┤
-//!                      └─ flow(): advertise and request topics; leases renew themselves
+//!                      ├─ flow(): advertise and request topics; leases renew themselves
+//!                      ├─ config(): its configuration, and callbacks when it changes
+//!                      └─ cache(): says that it lives, waits for others, keeps values for a while
 //! ```
 //!
 //! ```
@@ -44,20 +46,37 @@
 //! ```
 
 mod broker;
+mod cache;
+mod config;
 mod flow;
 mod message;
+mod options;
 mod pool;
 mod publisher;
+mod reserved;
 mod service;
 mod subscription;
 
 pub use blaze_brokers::PublishOutcome;
 pub use broker::LocalBroker;
+pub use cache::{
+    CacheError, CacheManager, Liveness, MAX_CACHE_KEY_BYTES, MAX_CACHE_TIME, MAX_CACHE_VALUE_BYTES, ServiceState,
+};
+pub use config::{
+    AckStatus, BaseConfiguration, BaseSource, ConfigChange, ConfigCounts, ConfigError, ConfigListener, ConfigManager,
+    ConfigScope, ConfigSource,
+};
 pub use flow::{
     Advertise, FlowError, FlowEvent, FlowEventKind, FlowEvents, FlowManager, Lease, LeaseState, OriginFilter,
     RefusalCode, Request,
 };
 pub use message::Message;
+pub use options::ServiceOptions;
 pub use publisher::{PublishOptions, Publisher};
-pub use service::{Identity, SdkError, ServiceManager, ServiceOptions};
+pub use service::{Identity, SdkError, ServiceManager};
 pub use subscription::{SubscribeOptions, Subscription, SubscriptionStats};
+
+/// The examples of the page are compiled with those of the crate.
+#[cfg(doctest)]
+#[doc = include_str!("../../docs/sdk-rust.md")]
+struct Page;

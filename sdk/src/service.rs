@@ -3,13 +3,17 @@
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use blaze_brokers::{Broker, BrokerError};
-use blaze_domain::control::{Common, DEFAULT_TTL_S, MAX_TTL_S};
+use blaze_brokers::redis::RedisKeys;
+use blaze_brokers::{Broker, BrokerError, OpenError};
+use blaze_domain::control::{Common, MAX_TTL_S};
 use blaze_domain::{InstanceName, LayerName, NodeName, Origin, Scope, ServiceName};
 use blaze_runtime::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy};
 
 use crate::broker::LocalBroker;
+use crate::cache::{CacheError, CacheManager, ServiceState, Store};
+use crate::config::ConfigManager;
 use crate::flow::FlowManager;
+use crate::options::ServiceOptions;
 use crate::pool::Pool;
 
 /// How long [`ServiceManager::shutdown`] waits for the flow to take leave.
@@ -35,65 +39,15 @@ pub enum SdkError {
     /// The threads for callbacks could not be started.
     #[error("no threads for callbacks: {0}")]
     Threads(#[source] std::io::Error),
+    /// The Redis of the cache can never work.
+    #[error("cache: {0}")]
+    Cache(#[source] OpenError),
+    /// Services that it waits for are not ready.
+    #[error(transparent)]
+    Wait(CacheError),
     /// The service was shut down.
     #[error("the service was shut down")]
     ShutDown,
-}
-
-/// Who a service is and what it works with.
-#[derive(Clone)]
-pub struct ServiceOptions {
-    /// Layer that it runs in.
-    pub layer: LayerName,
-    /// Node that it runs on; absent for a service of a layer.
-    pub node: Option<NodeName>,
-    /// Its name.
-    pub service: ServiceName,
-    /// Which of several of that name it is.
-    pub instance: InstanceName,
-    /// The local broker. The service does not close it.
-    pub broker: Arc<dyn Broker>,
-    /// How far that broker reaches.
-    pub scope: Scope,
-    /// Threads for callbacks; 0 = as many as the process may use cores (cgroups count). At least two are started.
-    pub pool_threads: usize,
-    /// Time to live of the service's leases, 1 s to 1 day; they are renewed at a third of it.
-    pub lease_ttl: Duration,
-    /// How long to wait for a flow's answer to an advertise, request or withdraw.
-    pub control_timeout: Duration,
-    /// Larger is newer; 0 = milliseconds since 1970 at the start.
-    pub epoch: u64,
-    /// The service's tasks and threads run under a child of it: their failure is its failure, and its shutdown ends them,
-    /// though without withdrawing leases; for that call [`ServiceManager::shutdown`] before. Absent = under a supervisor of
-    /// their own, whose failure is logged.
-    pub supervisor: Option<Supervisor>,
-}
-
-impl ServiceOptions {
-    /// The first instance of a service on no particular node, with the default bounds.
-    #[must_use]
-    pub fn new(layer: LayerName, service: ServiceName, broker: Arc<dyn Broker>, scope: Scope) -> Self {
-        Self {
-            layer,
-            node: None,
-            service,
-            instance: InstanceName::first(),
-            broker,
-            scope,
-            pool_threads: 0,
-            lease_ttl: Duration::from_secs(DEFAULT_TTL_S.into()),
-            control_timeout: Duration::from_secs(10),
-            epoch: 0,
-            supervisor: None,
-        }
-    }
-
-    /// The same service on a node.
-    #[must_use]
-    pub fn on_node(mut self, node: NodeName) -> Self {
-        self.node = Some(node);
-        self
-    }
 }
 
 /// Who a service is.
@@ -162,13 +116,17 @@ pub struct ServiceManager {
     shared: Arc<Shared>,
     broker: LocalBroker,
     flow: FlowManager,
+    config: ConfigManager,
+    cache: CacheManager,
 }
 
 impl ServiceManager {
-    /// Starts the service's threads and tasks. It does not wait for the broker or a flow.
+    /// Starts the service's threads and tasks. It does not wait for the broker or a flow, but for the services of `wait_for`,
+    /// saying meanwhile that it is `starting`.
     ///
     /// # Errors
-    /// [`SdkError::Option`] or [`SdkError::Threads`].
+    /// [`SdkError::Option`], [`SdkError::Threads`], [`SdkError::Cache`], or [`SdkError::Wait`] when a service that it waits for
+    /// is not ready in time.
     pub async fn start(options: ServiceOptions) -> Result<Self, SdkError> {
         let ttl_s = u32::try_from(options.lease_ttl.as_secs())
             .ok()
@@ -177,6 +135,11 @@ impl ServiceManager {
                 option: "lease_ttl",
                 reason: format!("is {:?}, 1 s to {MAX_TTL_S} s are allowed", options.lease_ttl),
             })?;
+        options.check_watchdog()?;
+        let store = match &options.cache {
+            Some(section) => Some(Arc::new(RedisKeys::open(section).map_err(SdkError::Cache)?) as Arc<dyn Store>),
+            None => None,
+        };
         let pool_threads = match options.pool_threads {
             0 => std::thread::available_parallelism().map_or(2, usize::from),
             threads => threads,
@@ -211,11 +174,43 @@ impl ServiceManager {
             ttl_s,
             options.control_timeout,
         );
-        Ok(Self {
+        let config = ConfigManager::start(
+            shared.identity.clone(),
+            shared.scope,
+            Arc::clone(&shared.broker),
+            &shared.supervisor,
+            shared.pool.handle(),
+        );
+        let cache = CacheManager::start(
+            shared.identity.clone(),
+            Arc::clone(&shared.broker),
+            store,
+            options.version,
+            options.watchdog_ttl,
+            config.shown(),
+            &shared.supervisor,
+        );
+        // From here on an early return ends what was started.
+        let service = Self {
             broker: LocalBroker::new(Arc::clone(&shared)),
             shared,
             flow,
-        })
+            config,
+            cache,
+        };
+        if !options.wait_for.is_empty() {
+            service.cache.set_state(ServiceState::Starting);
+            let stopping = service.shared.supervisor.stopping_token();
+            let waited = tokio::select! {
+                waited = service.cache.wait_for(&options.wait_for, options.wait_timeout) => waited.map_err(SdkError::Wait),
+                () = stopping.cancelled() => Err(SdkError::ShutDown),
+            };
+            if let Err(error) = waited {
+                service.shutdown().await;
+                return Err(error);
+            }
+        }
+        Ok(service)
     }
 
     /// Publish and subscribe.
@@ -230,18 +225,31 @@ impl ServiceManager {
         &self.flow
     }
 
+    /// The service's configuration. The first call begins to ask for it.
+    #[must_use]
+    pub fn config(&self) -> &ConfigManager {
+        self.config.want();
+        &self.config
+    }
+
+    /// Says that the service lives, waits for others, keeps values.
+    #[must_use]
+    pub fn cache(&self) -> &CacheManager {
+        &self.cache
+    }
+
     /// Who the service is.
     #[must_use]
     pub fn identity(&self) -> &Identity {
         &self.shared.identity
     }
 
-    /// Withdraws all leases, ends all subscriptions, and waits for tasks and for callbacks that run: at most some 7 s. The
+    /// Withdraws all leases, takes its sign of life away, ends all subscriptions, and waits for tasks and for callbacks that run: at most some 7 s. The
     /// broker stays open.
     pub async fn shutdown(self) {
-        let flow = self.flow.clone();
+        let (flow, cache) = (self.flow.clone(), self.cache.clone());
         let steps = ShutdownSteps::new(LEAVE_WITHIN + END_WITHIN).on(ShutdownPhase::Drain, "leases", async move {
-            flow.leave(LEAVE_WITHIN).await;
+            tokio::join!(flow.leave(LEAVE_WITHIN), cache.leave(LEAVE_WITHIN));
         });
         let report = self.shared.supervisor.shutdown_with(steps).await;
         if !report.is_clean() {

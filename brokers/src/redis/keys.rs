@@ -172,6 +172,21 @@ impl RedisKeys {
         Ok(value.map(Bytes::from))
     }
 
+    /// A key has this value, for so long (at least 1 ms).
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn put_for(&self, key: &str, value: &Bytes, expires: Duration) -> Result<(), KeyError> {
+        let key = self.settings.names.key(key);
+        let expires_ms = i64::try_from(expires.as_millis()).unwrap_or(i64::MAX).max(1);
+        self.call(|mut connection| async move {
+            let mut set = redis::cmd("SET");
+            set.arg(key).arg(value.as_ref()).arg("PX").arg(expires_ms);
+            set.query_async::<()>(&mut connection).await
+        })
+        .await
+    }
+
     /// A record; `None` if there is none or it has vanished.
     ///
     /// # Errors

@@ -1,32 +1,17 @@
 //! The task that connects the lease book with the broker.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, BrokerError, BrokerKind, Content, Health, PublisherOptions, Received, SubscribeOptions};
+use blaze_brokers::{Broker, BrokerError, Health, PublisherOptions, Received};
 use blaze_domain::control::{Answer, ControlMessage, Event, EventKind};
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
-use tokio::time::sleep_until;
 
 use super::Shared;
+pub(super) use crate::reserved::now;
+use crate::reserved::{bare, reply_channel, subscribe, until};
 
-const FIRST_PAUSE: Duration = Duration::from_millis(100);
-const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 const BATCH: usize = 256;
-
-/// The clock of the task, which tests can hold still.
-pub(super) fn now() -> Instant {
-    tokio::time::Instant::now().into_std()
-}
-
-/// Where a service gets its answers. On Kafka and DDS all share one topic.
-fn reply_channel(kind: BrokerKind, own: ChannelName) -> ChannelName {
-    match kind {
-        BrokerKind::Memory | BrokerKind::Redis => own,
-        BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => ChannelName::shared_reply(),
-    }
-}
 
 /// Runs until the broker is closed.
 pub(super) async fn run(shared: Arc<Shared>, broker: Arc<dyn Broker>, own_reply: ChannelName) {
@@ -102,40 +87,5 @@ fn on_events(shared: &Shared, events: impl Iterator<Item = Received>) {
         }
         // Without a listener there is nobody to tell.
         let _ = shared.events.send(event);
-    }
-}
-
-fn bare(received: Received) -> Option<Bytes> {
-    match received.content {
-        Content::Bare { payload, .. } => Some(payload),
-        Content::Frame(_) | Content::Malformed { .. } => None,
-    }
-}
-
-async fn until(next: Option<Instant>) {
-    match next {
-        Some(next) => sleep_until(next.into()).await,
-        None => std::future::pending().await,
-    }
-}
-
-/// Subscribes as soon as the broker lets it.
-async fn subscribe(broker: &dyn Broker, channel: &ChannelName) -> Result<blaze_brokers::Subscription, BrokerError> {
-    let mut pause = FIRST_PAUSE;
-    let mut status = broker.status();
-    loop {
-        match broker.subscribe(channel, SubscribeOptions::default()).await {
-            Ok(subscription) => return Ok(subscription),
-            Err(BrokerError::Away(reason)) => {
-                tracing::debug!(%channel, reason, "the broker is away, the service waits for it");
-            }
-            Err(error) => return Err(error),
-        }
-        // A change of the status may mean that it is back.
-        let _ = tokio::time::timeout(pause, status.changed()).await;
-        if status.has_changed().is_err() {
-            return Err(BrokerError::Closed);
-        }
-        pause = (pause * 2).min(LONGEST_PAUSE);
     }
 }

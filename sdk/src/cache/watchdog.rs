@@ -1,0 +1,221 @@
+//! The task that says that the service lives.
+
+use std::time::Duration;
+
+use blaze_brokers::{BrokerError, PublisherOptions};
+use bytes::Bytes;
+use tokio::time::Instant;
+
+use super::record::{self, Heard, Sign};
+use super::store::Store;
+use super::{Liveness, Said, Shared};
+use crate::reserved::{bare, channel, subscribe};
+
+const WATCHDOG: &str = "blaze/watchdog";
+/// Longest pause before a record that could not be written is tried again.
+const RETRY: Duration = Duration::from_millis(500);
+const BATCH: usize = 256;
+/// What a last message counts: nothing is left to wait for.
+const OVER: Duration = Duration::from_millis(1);
+
+/// Runs until the service has ended or was superseded.
+pub(super) async fn run(shared: &Shared) {
+    while !shared.said.lock().is_on {
+        shared.wake.notified().await;
+    }
+    let end = match (&shared.store, &shared.key) {
+        (_, None) => {
+            tracing::warn!(service = %shared.identity.service, "a service without a node cannot say that it lives");
+            Liveness::Off
+        }
+        (Some(store), Some(key)) => in_store(shared, store.as_ref(), key).await,
+        (None, Some(_)) => by_messages(shared).await.unwrap_or_else(|error| {
+            tracing::warn!(%error, "the service cannot say that it lives any more");
+            Liveness::Ended
+        }),
+    };
+    if end == Liveness::Superseded {
+        tracing::warn!(service = %shared.identity.service, "a newer process of the same service, node and instance lives");
+    }
+    shared.liveness.send_replace(end);
+}
+
+/// Writes a record again and again. A look before each write finds out whether a newer process has the key.
+async fn in_store(shared: &Shared, store: &dyn Store, key: &str) -> Liveness {
+    loop {
+        let said = shared.said.lock().clone();
+        let next = match beat(shared, store, key, &said).await {
+            Ok(true) if said.ending => return Liveness::Ended,
+            Ok(true) => {
+                shared.show(Liveness::Alive);
+                shared.pace()
+            }
+            Ok(false) => return Liveness::Superseded,
+            // What is left of it vanishes by itself.
+            Err(_) if said.ending => return Liveness::Ended,
+            Err(error) => {
+                tracing::debug!(%error, "the sign of life could not be written");
+                shared.show(Liveness::Silent);
+                shared.pace().min(RETRY)
+            }
+        };
+        tokio::select! {
+            () = tokio::time::sleep(next) => {}
+            () = shared.wake.notified() => {}
+        }
+    }
+}
+
+/// Returns whether the key is this process's.
+async fn beat(
+    shared: &Shared,
+    store: &dyn Store,
+    key: &str,
+    said: &Said,
+) -> Result<bool, blaze_brokers::redis::KeyError> {
+    let present = store.record(key).await?;
+    if present.is_some_and(|record| record::epoch_of(&record) > shared.identity.epoch) {
+        return Ok(false);
+    }
+    if said.ending {
+        store.delete(key).await?;
+    } else {
+        store.put_record(key, shared.sign(said).record(), shared.ttl).await?;
+    }
+    Ok(true)
+}
+
+/// Sends a message again and again, and listens for a newer process.
+async fn by_messages(shared: &Shared) -> Result<Liveness, BrokerError> {
+    let channel = channel(WATCHDOG)?;
+    let mut others = subscribe(shared.broker.as_ref(), &channel).await?;
+    let publisher = shared.broker.publisher(&channel, PublisherOptions::default())?;
+    let mut heard = Vec::new();
+    loop {
+        let said = shared.said.lock().clone();
+        let ttl = if said.ending { OVER } else { shared.ttl };
+        let text = shared.sign(&said).message(ttl);
+        let outcome = publisher.publish_bare(&Bytes::from(text), None);
+        if said.ending {
+            return Ok(Liveness::Ended);
+        }
+        let was_taken = outcome == blaze_brokers::PublishOutcome::Taken;
+        shared.show(if was_taken { Liveness::Alive } else { Liveness::Silent });
+        let next = Instant::now()
+            + if was_taken {
+                shared.pace()
+            } else {
+                shared.pace().min(RETRY)
+            };
+        loop {
+            tokio::select! {
+                () = tokio::time::sleep_until(next) => break,
+                () = shared.wake.notified() => break,
+                count = others.receive(&mut heard, BATCH) => {
+                    if count == 0 {
+                        return Err(BrokerError::Closed);
+                    }
+                    let mut signs = heard.drain(..).filter_map(bare).filter_map(|payload| Heard::parse(&payload));
+                    let own = &shared.identity;
+                    if signs.any(|sign| sign.is_of(own) && sign.epoch > own.epoch) {
+                        return Ok(Liveness::Superseded);
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl Shared {
+    fn pace(&self) -> Duration {
+        self.ttl / 3
+    }
+
+    fn show(&self, liveness: Liveness) {
+        self.liveness
+            .send_if_modified(|shown| std::mem::replace(shown, liveness) != liveness);
+    }
+
+    fn sign(&self, said: &Said) -> Sign<'_> {
+        Sign {
+            identity: &self.identity,
+            state: said.state,
+            since_ms: said.since_ms,
+            version: &self.version,
+            config: record::of_config(self.config.borrow().held()),
+        }
+    }
+}
+
+/// Waits until each service has an instance that is ready. Never returns otherwise; `missing` has those that are not.
+pub(super) async fn wait(
+    shared: &Shared,
+    services: &[blaze_domain::ServiceName],
+    missing: &parking_lot::Mutex<Vec<blaze_domain::ServiceName>>,
+) -> Result<(), BrokerError> {
+    match &shared.store {
+        Some(store) => wait_for_records(store.as_ref(), services, missing).await,
+        None => wait_for_messages(shared, services, missing).await?,
+    }
+    Ok(())
+}
+
+async fn wait_for_records(
+    store: &dyn Store,
+    services: &[blaze_domain::ServiceName],
+    missing: &parking_lot::Mutex<Vec<blaze_domain::ServiceName>>,
+) {
+    loop {
+        let mut absent = Vec::new();
+        for service in services {
+            let records = store
+                .records(&record::beginning(service.as_str()), super::MAX_INSTANCES)
+                .await;
+            let is_there = match records {
+                Ok(records) => records.iter().any(|(_, record)| super::wait::is_ready(record)),
+                Err(error) => {
+                    tracing::debug!(%error, "who is ready cannot be read");
+                    false
+                }
+            };
+            if !is_there {
+                absent.push(service.clone());
+            }
+        }
+        let is_done = absent.is_empty();
+        *missing.lock() = absent;
+        if is_done {
+            return;
+        }
+        tokio::time::sleep(super::LOOK).await;
+    }
+}
+
+async fn wait_for_messages(
+    shared: &Shared,
+    services: &[blaze_domain::ServiceName],
+    missing: &parking_lot::Mutex<Vec<blaze_domain::ServiceName>>,
+) -> Result<(), BrokerError> {
+    let mut signs = subscribe(shared.broker.as_ref(), &channel(WATCHDOG)?).await?;
+    let mut roll = super::wait::Roll::new(services);
+    let mut heard = Vec::new();
+    loop {
+        let now = crate::reserved::now();
+        let absent = roll.missing(now);
+        let is_done = absent.is_empty();
+        *missing.lock() = absent;
+        if is_done {
+            return Ok(());
+        }
+        if signs.receive(&mut heard, BATCH).await == 0 {
+            return Err(BrokerError::Closed);
+        }
+        for sign in heard
+            .drain(..)
+            .filter_map(bare)
+            .filter_map(|payload| Heard::parse(&payload))
+        {
+            roll.hear(sign, crate::reserved::now());
+        }
+    }
+}
