@@ -162,7 +162,6 @@ impl State {
     }
 
     /// Documents of a kind, in the order of their keys, those after a key.
-    #[must_use]
     pub fn of_kind<'a>(
         &'a self,
         kind: Kind,
@@ -177,13 +176,11 @@ impl State {
     }
 
     /// All documents, in the order of their keys.
-    #[must_use]
     pub fn all(&self) -> impl Iterator<Item = (&Key, &Arc<Held>)> {
         self.documents.iter()
     }
 
     /// Instances of a service.
-    #[must_use]
     pub fn instances<'a>(&'a self, service: &ServiceName) -> impl Iterator<Item = (&'a Key, &'a Arc<Held>)> + use<'a> {
         let service = service.clone();
         let start = Key::instance(service.clone(), first_name());
@@ -193,13 +190,11 @@ impl State {
     }
 
     /// Nodes of a layer and instances placed on it directly.
-    #[must_use]
     pub fn in_layer<'a>(&'a self, layer: &LayerName) -> impl Iterator<Item = &'a Key> + use<'a> {
         indexed(&self.in_layer, layer.into())
     }
 
     /// Instances placed on a node.
-    #[must_use]
     pub fn on_node<'a>(&'a self, node: &NodeName) -> impl Iterator<Item = &'a Key> + use<'a> {
         indexed(&self.on_node, node.into())
     }
@@ -210,7 +205,6 @@ impl State {
     }
 
     /// Roll-outs of a document that are on their canaries now.
-    #[must_use]
     pub fn active_on<'a>(&'a self, target: &Key) -> impl Iterator<Item = &'a Arc<Held>> + use<'a> {
         of_target(&self.active, target.clone()).filter_map(|key| self.documents.get(key))
     }

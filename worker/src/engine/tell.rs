@@ -98,11 +98,11 @@ impl Engine {
         // What an earlier life wrote may be gone, or of another form.
         let all = if is_first { self.places() } else { tracked };
         for place in &all {
-            if let Some(standing) = self.served.standing_of(place) {
-                if !noticed.contains(place) {
-                    self.note(place, standing.revision, Some(standing.hash.clone()));
-                    told.extend(self.of_standing(place, &standing));
-                }
+            if let Some(standing) = self.served.standing_of(place)
+                && !noticed.contains(place)
+            {
+                self.note(place, standing.revision, Some(standing.hash.clone()));
+                told.extend(self.of_standing(place, &standing));
             }
         }
         self.tell(told, instant);

@@ -74,13 +74,16 @@ pub trait Outlet: Send + Sync + 'static {
     async fn keys_lost(&self);
 }
 
+/// Whether a value of a key is one's own.
+type IsOwn = Box<dyn Fn(&[u8]) -> bool + Send + Sync>;
+
 /// A broker, and a Redis for the keys.
 pub struct BrokerOutlet {
     broker: Arc<dyn Broker>,
     keys: Option<Keys>,
     publishers: Mutex<LruCache<ChannelName, Arc<dyn Publisher>>>,
     /// Whether a value is one that a worker of this place writes.
-    is_own: Box<dyn Fn(&[u8]) -> bool + Send + Sync>,
+    is_own: IsOwn,
 }
 
 struct Keys {
