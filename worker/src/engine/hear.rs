@@ -7,7 +7,7 @@ use blaze_proto::v1;
 use bytes::Bytes;
 use tokio::time::Instant;
 
-use super::{ACK_AFTER, Engine, LOOK};
+use super::{ACK_AFTER, ACK_PACE, Engine, LOOK};
 use crate::core::messages::{ConfigAck, ServiceState, WatchdogKey};
 use crate::core::{Complaint, RolloutState};
 
@@ -111,7 +111,8 @@ impl Engine {
     /// The main service is to know soon, together with what comes until then.
     pub(super) fn acknowledge_soon(&mut self) {
         if self.stream.is_some() {
-            self.ack_at = self.ack_at.min(Instant::now() + ACK_AFTER);
+            let soon = (Instant::now() + ACK_AFTER).max(self.acked + ACK_PACE);
+            self.ack_at = self.ack_at.min(soon);
         }
     }
 

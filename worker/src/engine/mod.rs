@@ -48,6 +48,8 @@ const TOGETHER: Duration = Duration::from_millis(20);
 const SETTLE: Duration = Duration::from_millis(200);
 /// What the worker has is said this long after it became so, and with it what came meanwhile.
 const ACK_AFTER: Duration = Duration::from_millis(50);
+/// While there is always something new it is said so often: the digest over everything is worked out each time.
+const ACK_PACE: Duration = Duration::from_secs(1);
 /// It is said again after this time without news.
 const ACK_AGAIN: Duration = Duration::from_secs(15);
 /// Between two looks whether a sign of life has run out.
@@ -149,6 +151,8 @@ pub struct Engine {
     notes: Notes,
     /// What came could not be read, and would come again: everything is to be asked for.
     wants_all: bool,
+    /// The text of a secret is not here.
+    lacks_texts: bool,
     /// Until then whoever has secrets gets everything, also if the hash is the same: the texts have come just now.
     texts_until: Option<Instant>,
     signs: Signs,
@@ -163,6 +167,8 @@ pub struct Engine {
     /// When to look whether the broker has taken what places are told.
     settle_at: Option<Instant>,
     ack_at: Instant,
+    /// When it was said last.
+    acked: Instant,
     /// Places whose key is kept.
     keyed: BTreeMap<String, Place>,
     /// Keys of an earlier life were looked for.
@@ -186,6 +192,7 @@ impl Engine {
             replica: Replica::new(layer.clone()),
             notes: Notes::default(),
             wants_all: false,
+            lacks_texts: false,
             texts_until: None,
             signs: Signs::new(identity.site.clone()),
             gate: Gate::default(),
@@ -197,6 +204,7 @@ impl Engine {
             flush_at: None,
             settle_at: None,
             ack_at: now + ACK_AGAIN,
+            acked: now.checked_sub(ACK_PACE).unwrap_or(now),
             keyed: BTreeMap::new(),
             has_swept: false,
             unnoted: BTreeMap::new(),
@@ -232,6 +240,7 @@ impl Engine {
         if let Err(error) = self.served.load(state, Source::Copy) {
             tracing::error!(%error, "the copy is not used");
         }
+        self.lacks_texts = lacks_texts(self.replica.state());
         self.flush_at = Some(now);
         // The one of the copies that is behind the other catches up.
         self.keep(Changed::Keys(Vec::new()));
@@ -332,7 +341,7 @@ impl Engine {
             digest: resume.digest,
         };
         // Texts come over a safe connection alone, and with a snapshot: what is here has the newest revision already.
-        if self.wants_all || (is_safe && lacks_texts(self.replica.state())) {
+        if self.wants_all || (is_safe && self.lacks_texts) {
             (hello.store_id, hello.revision, hello.digest) = Default::default();
         }
         hello
@@ -354,7 +363,8 @@ impl Engine {
 
     /// Says what is here, if somebody listens.
     fn acknowledge(&mut self) {
-        self.ack_at = Instant::now() + ACK_AGAIN;
+        self.acked = Instant::now();
+        self.ack_at = self.acked + ACK_AGAIN;
         // Also those who have not asked for long are to be forgotten when nothing else happens.
         self.flush_soon();
         if self.stream.is_none() {

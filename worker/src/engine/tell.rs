@@ -11,7 +11,7 @@ use blaze_domain::{DocumentName, InstanceName};
 use bytes::Bytes;
 use tokio::time::Instant;
 
-use super::{Engine, SETTLE, TOGETHER, lacks_texts, now};
+use super::{Engine, SETTLE, TOGETHER, lacks_text, lacks_texts, now};
 use crate::copy::{Notes, Position, Told as Noted, Update};
 use crate::core::messages::{self, Delivery, GetRequest};
 use crate::core::{Change, Flushed, Notice, Place, Site, Standing, Told as ServedTold};
@@ -123,7 +123,16 @@ impl Engine {
     /// The texts of secrets have come, which were not there before: whoever has them redacted has the right hash, and yet not
     /// what it needs.
     pub(super) fn note_texts(&mut self, change: &Change) {
-        if self.identity.delivery == Delivery::Redacted || !lacks_texts(&change.old) || lacks_texts(&change.new) {
+        let lacked = self.lacks_texts;
+        // What is not changed is looked at only as long as something is missing.
+        self.lacks_texts = match lacked {
+            true => lacks_texts(&change.new),
+            false => {
+                let mut changed = change.keys.iter().filter_map(|key| change.new.get(key));
+                changed.any(|held| lacks_text(&held.document.spec))
+            }
+        };
+        if self.identity.delivery == Delivery::Redacted || !lacked || self.lacks_texts {
             return;
         }
         self.texts_until = Some(Instant::now() + TEXTS);
