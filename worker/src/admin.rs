@@ -224,6 +224,12 @@ fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
         "Writes of a copy that failed.",
         &of(|copy| copy.failed),
     );
+    one(
+        "blaze_worker_copy_current",
+        "gauge",
+        "1 while a copy holds all that it should.",
+        &of(|copy| u64::from(copy.is_current)),
+    );
 }
 
 async fn status(State(shown): State<Shown>) -> Response {

@@ -65,17 +65,16 @@ async fn after_everything_was_killed_services_get_their_last_configuration_at_on
     let before = service.ask(asks.clone(), PATIENCE).await;
     // Both copies have it.
     let has_copies = |metrics: &str| {
-        let written = metrics
+        let current = metrics
             .lines()
-            .filter(|line| line.starts_with("blaze_worker_copy_writes_total"));
-        written.filter(|line| !line.ends_with(" 0")).count() == 2
+            .filter(|line| line.starts_with("blaze_worker_copy_current{"));
+        current.filter(|line| line.ends_with(" 1")).count() == 2
     };
     let start = tokio::time::Instant::now();
     while !has_copies(&worker.text("/metrics").await) {
         assert!(start.elapsed() < PATIENCE, "{}", worker.text("/metrics").await);
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
-    tokio::time::sleep(Duration::from_millis(300)).await;
     main.kill().unwrap();
     worker.kill();
     stage.redis.kill().unwrap();

@@ -113,7 +113,8 @@ impl Loaded {
     }
 }
 
-fn lacks_text(value: &serde_json::Value) -> bool {
+/// Whether a secret is there without its text.
+pub(crate) fn lacks_text(value: &serde_json::Value) -> bool {
     let mut lacks = false;
     secret::walk(value, &mut |_, found| {
         lacks |= matches!(Secret::of(found), Some(Ok(Secret::Redacted { .. })));

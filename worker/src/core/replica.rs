@@ -13,12 +13,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_domain::LayerName;
+use blaze_domain::config::placement::whole_digest;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Key, MAX_DOCUMENTS, Timestamp};
 
 use super::change::{Change, difference};
 use super::incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, Op, PROTOCOL, SyncFault, TooLarge};
-use super::stream::{Phase, Stream, digest_of, spec_bytes};
+use super::stream::{Phase, Stream, spec_bytes};
 
 /// What a message did.
 #[derive(Debug)]
@@ -133,7 +134,7 @@ impl Replica {
     /// The digest over all documents; kept until they change.
     pub fn digest(&mut self) -> String {
         let state = &self.state;
-        self.digest.get_or_insert_with(|| digest_of(state)).clone()
+        self.digest.get_or_insert_with(|| whole_digest(state)).clone()
     }
 
     /// What the next Hello says.

@@ -2,9 +2,7 @@
 
 use std::io;
 
-use blaze_domain::ServiceName;
-use blaze_domain::config::state::State;
-use blaze_domain::config::{Document, canonical};
+use blaze_domain::config::Document;
 
 /// Where a stream stands.
 pub(super) enum Stream {
@@ -47,14 +45,6 @@ impl Stream {
             Self::Over => Phase::Over,
         }
     }
-}
-
-/// The digest over all documents of a view.
-pub(super) fn digest_of(state: &State) -> String {
-    canonical::digest(state.all().map(|(key, held)| {
-        let service = key.service_name().map(ServiceName::as_str);
-        (key.kind(), service, key.name().as_str(), held.document.revision)
-    }))
 }
 
 /// Bytes of a spec as compact JSON, without writing it anywhere.

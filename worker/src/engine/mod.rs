@@ -22,18 +22,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_domain::config::Timestamp;
-use blaze_domain::config::secret::{self, Secret};
 use blaze_domain::config::state::State;
 use blaze_domain::names::ChannelName;
 use blaze_domain::{LayerName, NodeName};
 use blaze_proto::v1;
 use bytes::Bytes;
-use serde_json::Value;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
-use crate::copy::{Changed, Copies, Loaded, Notes, Position, Update, defaults};
+use crate::copy::{Changed, Copies, Loaded, Notes, Position, Update, defaults, lacks_text};
 use crate::core::messages::Delivery;
 use crate::core::{Applied, Gate, PROTOCOL, Place, Replica, Served, Signs, Site, Source};
 use crate::serve::{Speaker, Told};
@@ -381,6 +379,16 @@ impl Engine {
 
     /// Has the newest state kept.
     fn keep(&mut self, changed: Changed) {
+        self.store(changed, None);
+    }
+
+    /// Has the notes kept beside the newest state.
+    fn keep_notes(&mut self) {
+        let notes = Arc::new(self.notes.clone());
+        self.store(Changed::Keys(Vec::new()), Some(notes));
+    }
+
+    fn store(&self, changed: Changed, notes: Option<Arc<Notes>>) {
         let Some(copies) = &self.outputs.copies else { return };
         let (Some(store_id), Some(as_of)) = (self.replica.store_id(), self.replica.as_of()) else {
             return;
@@ -394,7 +402,7 @@ impl Engine {
             },
             state: self.replica.state().clone(),
             changed,
-            notes: None,
+            notes,
         });
     }
 
@@ -425,14 +433,6 @@ impl Engine {
 /// Whether the text of a secret is not here: it came over a connection that others could read, or from a copy without a key.
 fn lacks_texts(state: &State) -> bool {
     state.all().any(|(_, held)| lacks_text(&held.document.spec))
-}
-
-fn lacks_text(spec: &Value) -> bool {
-    let mut lacks = false;
-    secret::walk(spec, &mut |_, found| {
-        lacks |= matches!(Secret::of(found), Some(Ok(Secret::Redacted { .. })));
-    });
-    lacks
 }
 
 /// The time, for people.

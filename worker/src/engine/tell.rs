@@ -11,8 +11,8 @@ use blaze_domain::{DocumentName, InstanceName};
 use bytes::Bytes;
 use tokio::time::Instant;
 
-use super::{Engine, SETTLE, TOGETHER, lacks_text, lacks_texts, now};
-use crate::copy::{Notes, Position, Told as Noted, Update};
+use super::{Engine, SETTLE, TOGETHER, lacks_texts, now};
+use crate::copy::{Notes, Told as Noted, lacks_text};
 use crate::core::messages::{self, Delivery, GetRequest};
 use crate::core::{Change, Flushed, Notice, Place, Site, Standing, Told as ServedTold};
 use crate::serve::Told;
@@ -297,24 +297,5 @@ impl Engine {
             self.keep_notes();
         }
         self.settle_at = (!self.unnoted.is_empty()).then(|| Instant::now() + SETTLE);
-    }
-
-    /// Has the notes kept beside the newest state.
-    pub(super) fn keep_notes(&mut self) {
-        let Some(copies) = &self.outputs.copies else { return };
-        let (Some(store_id), Some(as_of)) = (self.replica.store_id(), self.replica.as_of()) else {
-            return;
-        };
-        copies.store(&Update {
-            position: Position {
-                store_id: store_id.to_owned(),
-                layer: self.identity.site.layer.clone(),
-                revision: self.replica.state().revision(),
-                as_of,
-            },
-            state: self.replica.state().clone(),
-            changed: crate::copy::Changed::Keys(Vec::new()),
-            notes: Some(Arc::new(self.notes.clone())),
-        });
     }
 }
