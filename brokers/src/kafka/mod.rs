@@ -6,7 +6,8 @@
 //! ```
 //!
 //! A channel is a topic; a message is a record whose headers are the message's header, as text (module `record`). There is no
-//! consumer group: each client reads all partitions at positions of its own. Topics are made by the flow of the layer alone
+//! consumer group for messages: each client reads all partitions at positions of its own. Groups share out leases alone (module
+//! `group_lease`). Topics are made by the flow of the layer alone
 //! (module `flow_side`); what a service publishes before that waits.
 
 mod admin;
@@ -17,6 +18,8 @@ mod context;
 mod directory;
 mod flow_side;
 mod gate;
+mod group_lease;
+mod group_member;
 mod identity;
 #[cfg(test)]
 mod impostor;
@@ -52,6 +55,8 @@ use crate::port::{
     Begin, Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome, Publisher,
     PublisherOptions, Role, SubscribeOptions, Subscription,
 };
+pub use group_lease::{GroupHeld, GroupLease};
+
 use bell::Bell;
 use clock::BrokerClock;
 use context::LastError;

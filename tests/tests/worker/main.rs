@@ -6,6 +6,8 @@
 //! stage    a main service, a Redis and workers of one layer
 //! serving  what services are told, and whether only those it concerns
 //! outages  the main service, the broker and the worker away, in turns and together
+//! leases   the suite of leases on real servers
+//! several  two workers of one layer, of which one is killed, stopped, or ended
 //! ```
 
 #![allow(
@@ -15,6 +17,8 @@
     reason = "the helpers of a test fail like the test"
 )]
 
+mod leases;
 mod outages;
 mod serving;
+mod several;
 mod stage;

@@ -12,12 +12,14 @@
 
 mod ask;
 mod hear;
+mod lead;
+mod missed;
 mod status;
 mod tell;
 #[cfg(test)]
 mod tests;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -33,9 +35,11 @@ use tokio_util::sync::CancellationToken;
 
 use crate::copy::{Changed, Copies, Loaded, Notes, Position, Update, defaults, lacks_text};
 use crate::core::messages::Delivery;
-use crate::core::{Applied, Gate, PROTOCOL, Place, Replica, Served, Signs, Site, Source};
-use crate::serve::{Speaker, Told};
+use crate::core::{Applied, Gate, Notice, PROTOCOL, Place, Replica, Served, Signs, Site, Source};
+use crate::lease::{Mark, Term};
+use crate::serve::Speaker;
 use crate::sync::SyncEvent;
+use missed::Missed;
 
 pub use hear::Sign;
 pub use status::Status;
@@ -44,6 +48,8 @@ pub use status::Status;
 const TOGETHER: Duration = Duration::from_millis(20);
 /// Between two looks whether the broker has taken what places are told.
 const SETTLE: Duration = Duration::from_millis(200);
+/// The same for a worker that does not tell: between two looks whether others have.
+const WAIT_FOR_OTHERS: Duration = Duration::from_secs(1);
 /// What the worker has is said this long after it became so, and with it what came meanwhile.
 const ACK_AFTER: Duration = Duration::from_millis(50);
 /// While there is always something new it is said so often: the digest over everything is worked out each time.
@@ -90,8 +96,10 @@ pub struct Inputs {
     pub signs: mpsc::Receiver<Sign>,
     /// The mounted file.
     pub defaults: watch::Receiver<defaults::Status>,
-    /// Whether this worker answers and notifies.
-    pub leader: watch::Receiver<bool>,
+    /// The term in which this worker answers and notifies.
+    pub leader: watch::Receiver<Option<u64>>,
+    /// How far services were told, as it lies beside the lease.
+    pub noted: watch::Receiver<Option<Mark>>,
     /// Questions of the admin port.
     pub queries: mpsc::Receiver<Query>,
 }
@@ -106,6 +114,10 @@ pub struct Outputs {
     pub copies: Option<Copies>,
     /// What the worker has, for the main service.
     pub acks: watch::Sender<Option<v1::Ack>>,
+    /// Until when this worker leads.
+    pub term: Term,
+    /// How far it has told services, for whoever leads next.
+    pub told: watch::Sender<Option<Mark>>,
 }
 
 /// A question to the engine.
@@ -138,6 +150,8 @@ pub struct Counts {
     pub left_out: u64,
     /// Roll-outs that failed here and were undone.
     pub failed_rollouts: u64,
+    /// Notices that are not told should this worker lead, because too many are kept for that.
+    pub missed: u64,
 }
 
 /// What the engine owns. Everything that it does happens in [`Engine::run`].
@@ -159,7 +173,14 @@ pub struct Engine {
     stream: Option<CancellationToken>,
     /// Why there is no stream.
     reason: Option<String>,
-    is_leader: bool,
+    /// The number of the term in which it leads.
+    leads: Option<u64>,
+    /// It leads and knows enough to tell services of it.
+    tells: bool,
+    /// How far services were told, by whomever.
+    noted: Option<Mark>,
+    /// The state that is shown.
+    shown: Option<Mark>,
     flushed: Option<Instant>,
     flush_at: Option<Instant>,
     /// When to look whether the broker has taken what places are told.
@@ -173,8 +194,10 @@ pub struct Engine {
     has_swept: bool,
     /// What places are being told, until the broker has taken it.
     unnoted: BTreeMap<Place, (u64, Option<String>)>,
-    /// What was told, or would have been if this worker were the leader, a short while ago.
-    recent: VecDeque<(Instant, Told)>,
+    /// That services are deleted, until the broker has taken it.
+    farewells: BTreeMap<Place, Notice>,
+    /// What others tell, or nobody, as long as this worker does not know that it was told.
+    missed: Missed,
     defaults_problem: Option<String>,
     counts: Counts,
 }
@@ -197,7 +220,10 @@ impl Engine {
             look_at: now + LOOK,
             stream: None,
             reason: None,
-            is_leader: false,
+            leads: None,
+            tells: false,
+            noted: None,
+            shown: None,
             flushed: None,
             flush_at: None,
             settle_at: None,
@@ -206,7 +232,8 @@ impl Engine {
             keyed: BTreeMap::new(),
             has_swept: false,
             unnoted: BTreeMap::new(),
-            recent: VecDeque::new(),
+            farewells: BTreeMap::new(),
+            missed: Missed::default(),
             defaults_problem: None,
             counts: Counts::default(),
             identity,
@@ -246,7 +273,9 @@ impl Engine {
 
     /// Works until `stop`.
     pub async fn run(mut self, mut inputs: Inputs, stop: CancellationToken) {
-        self.is_leader = *inputs.leader.borrow_and_update();
+        self.noted = inputs.noted.borrow_and_update().clone();
+        let term = *inputs.leader.borrow_and_update();
+        self.lead(term);
         self.take_defaults(&inputs.defaults.borrow_and_update().clone());
         loop {
             let flush_at = self.flush_at;
@@ -256,9 +285,14 @@ impl Engine {
                 () = stop.cancelled() => return,
                 () = sleep_until(flush_at.unwrap_or_else(Instant::now)), if flush_at.is_some() => self.flush(),
                 Some(query) = inputs.queries.recv() => self.answer_query(query),
+                // Before the term that it is of: whoever takes over tells what others have not.
+                Ok(()) = inputs.noted.changed() => {
+                    let mark = inputs.noted.borrow_and_update().clone();
+                    self.note_told(mark);
+                }
                 Ok(()) = inputs.leader.changed() => {
-                    let is_leader = *inputs.leader.borrow_and_update();
-                    self.lead(is_leader);
+                    let term = *inputs.leader.borrow_and_update();
+                    self.lead(term);
                 }
                 () = sleep_until(self.look_at) => self.look_at_signs(),
                 Some(event) = inputs.sync.recv() => self.on_sync(event),
@@ -356,6 +390,7 @@ impl Engine {
                 "source of configurations"
             );
         }
+        self.begin_telling();
         self.acknowledge_soon();
     }
 
