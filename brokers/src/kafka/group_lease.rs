@@ -70,7 +70,7 @@ enum Question {
 pub struct GroupLease {
     questions: SyncSender<Question>,
     stop: CancellationToken,
-    /// Ends with it.
+    /// Of the thread, which ends with `stop`.
     _supervisor: Supervisor,
 }
 
@@ -172,6 +172,8 @@ impl Worker {
                 self.member = None;
             }
             match questions.recv_timeout(self.pause()) {
+                // Whoever asked has given up waiting, and asks again.
+                Ok(Question::Hold { answer, .. }) if answer.is_closed() => {}
                 Ok(Question::Hold { note, answer }) => {
                     self.asked_at = Instant::now();
                     // Whoever asked may have given up waiting.
@@ -238,25 +240,35 @@ impl Worker {
         Ok(())
     }
 
-    /// Serves what waits: rebalances reach the context from here alone.
+    /// Serves what waits: rebalances reach the context from here alone. After a fault the group is joined anew.
     fn listen(&mut self) -> Result<(), String> {
         let Some(member) = &self.member else { return Ok(()) };
+        let (mut fault, mut is_too_short) = (None, false);
         while let Some(event) = member.poll(Duration::ZERO) {
             match event {
                 // There are no records, and if there were they would say nothing.
                 Ok(_) => {}
                 Err(error) if error.rdkafka_error_code() == Some(RDKafkaErrorCode::InvalidSessionTimeout) => {
-                    return Err(self.ask_for_longer_session());
+                    is_too_short = true;
+                    break;
                 }
-                Err(error) => {
-                    if member.client().fatal_error().is_some() {
-                        return Err(format!("the client must begin anew: {error}"));
-                    }
-                    tracing::debug!(%error, group = self.group, "the group says");
+                Err(error) if member.client().fatal_error().is_some() => {
+                    fault = Some(format!("the client must begin anew: {error}"));
+                    break;
                 }
+                Err(error) => tracing::debug!(%error, group = self.group, "the group says"),
             }
         }
-        Ok(())
+        if is_too_short {
+            fault = Some(self.ask_for_longer_session());
+        }
+        match fault {
+            None => Ok(()),
+            Some(fault) => {
+                (self.member, self.held) = (None, None);
+                Err(fault)
+            }
+        }
     }
 
     fn ask_for_longer_session(&mut self) -> String {

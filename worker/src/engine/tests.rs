@@ -8,13 +8,20 @@ mod lead;
 use async_trait::async_trait;
 use blaze_brokers::redis::KeyChange;
 use blaze_domain::config::Document;
+use blaze_domain::names::ChannelName;
+use bytes::Bytes;
 use serde_json::{Value, json};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinSet;
 
 use super::*;
+use crate::copy::Copies;
+use crate::core::Site;
+use crate::core::messages::Delivery;
 use crate::core::testing::document;
 use crate::core::{Edit, Incoming, Op};
-use crate::serve::{Outlet, OutletError};
+use crate::lease::Term;
+use crate::serve::{Outlet, OutletError, Speaker};
 
 /// What services see.
 #[derive(Debug, Clone, PartialEq)]

@@ -31,7 +31,8 @@ pub fn open(
         }
         (_, Some(keys), _) => Arc::new(RedisLease::new(Arc::clone(keys), layer, worker_id.to_owned())),
         (_, None, LayerBroker::Kafka(section)) => {
-            kafka(section, layer, settings.lease).context("brokers.layer.kafka")?
+            // As long as it is held, see `keep`: the rest is for the others to hear of it.
+            kafka(section, layer, settings.lease * 9 / 10).context("brokers.layer.kafka")?
         }
         (_, None, LayerBroker::Dds(_) | LayerBroker::Memory) => return Ok(None),
     };

@@ -1,25 +1,21 @@
 //! Tells services what has changed, one after the other, and never twice what is old already: of what waits, only the newest
 //! of each place counts. A broker that is away holds up nobody; what waits then is bounded by the places that there are.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use blaze_brokers::redis::KeyChange;
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
 use super::outlet::{Outlet, OutletError};
+use super::waiting::State;
 use crate::lease::Term;
 
 /// Places that are told of in one transaction.
 const BATCH: usize = 256;
-/// Bytes of one transaction, unless one place alone has more (1 MiB): a large one over a slow connection would not be done in
-/// the time that a call may take, and be tried again for ever.
-const BATCH_BYTES: usize = 1024 * 1024;
 /// Upper bounds of the pause after a failure, which doubles; full jitter.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
 
@@ -51,180 +47,6 @@ pub struct SpeakerCounts {
     pub dropped: u64,
     /// Places that wait.
     pub waiting: u64,
-}
-
-/// A notice that waits.
-struct Waiting {
-    /// The key that must be written no later.
-    key: Option<String>,
-    notice: (ChannelName, Bytes),
-    /// The lowest revision that whoever is told may not have heard of.
-    since: u64,
-}
-
-#[derive(Default)]
-struct State {
-    /// All keys as they should be, to be written again when the server has lost them.
-    wanted: BTreeMap<String, Bytes>,
-    /// Keys that are not as they should be; those that are not wanted are to go.
-    dirty: BTreeSet<String>,
-    /// Places in the order in which they are told of; each stands here once.
-    order: BTreeMap<i64, String>,
-    waiting: BTreeMap<String, (i64, Waiting)>,
-    /// Of the last that was put at the end, and of the first.
-    ends: (i64, i64),
-    /// Keys of before are to be looked for: those of this worker that are not wanted are to go.
-    sweep: bool,
-    /// What is being told just now: the lowest revisions of its places.
-    on_the_way: BTreeMap<String, u64>,
-    /// How often everything was forgotten.
-    cleared: u64,
-}
-
-/// What is told at once.
-struct Batch {
-    keys: BTreeSet<String>,
-    waiting: Vec<(String, Waiting)>,
-    /// How often everything had been forgotten when it was taken.
-    cleared: u64,
-}
-
-impl Batch {
-    fn is_empty(&self) -> bool {
-        self.keys.is_empty() && self.waiting.is_empty()
-    }
-
-    fn len(&self) -> usize {
-        self.keys.len() + self.waiting.len()
-    }
-}
-
-impl State {
-    /// Takes in what is newer than what waits of the same place; it is told at the end, so that the notices of a service come
-    /// in the order of their revisions. Returns whether a notice gave way.
-    fn put(&mut self, told: Told) -> bool {
-        let Told {
-            place,
-            key,
-            notice,
-            revision,
-        } = told;
-        let name = key.map(|(name, value)| {
-            match value {
-                Some(value) => self.wanted.insert(name.clone(), value),
-                None => self.wanted.remove(&name),
-            };
-            self.dirty.insert(name.clone());
-            name
-        });
-        let Some(notice) = notice else { return false };
-        let old = self.waiting.remove(&place);
-        if let Some((at, _)) = &old {
-            self.order.remove(at);
-        }
-        // Until it is told, whoever is told has not heard of the one that gives way either.
-        let since = old.as_ref().map_or(revision, |(_, old)| old.since.min(revision));
-        self.ends.1 += 1;
-        self.order.insert(self.ends.1, place.clone());
-        let waiting = Waiting {
-            key: name,
-            notice,
-            since,
-        };
-        self.waiting.insert(place, (self.ends.1, waiting));
-        old.is_some()
-    }
-
-    /// The first that wait, at most so many and, but for the first, so many bytes.
-    fn take(&mut self, most: usize) -> Batch {
-        let mut batch = Batch {
-            keys: BTreeSet::new(),
-            waiting: Vec::new(),
-            cleared: self.cleared,
-        };
-        let mut bytes = 0;
-        while batch.waiting.len() < most
-            && (bytes < BATCH_BYTES || batch.is_empty())
-            && let Some((_, place)) = self.order.pop_first()
-        {
-            let Some((_, waiting)) = self.waiting.remove(&place) else {
-                continue;
-            };
-            bytes += waiting.notice.1.len();
-            if let Some(key) = waiting.key.as_ref().and_then(|key| self.dirty.take(key)) {
-                bytes += self.wanted.get(&key).map_or(0, Bytes::len);
-                batch.keys.insert(key);
-            }
-            batch.waiting.push((place, waiting));
-        }
-        while batch.len() < most
-            && (bytes < BATCH_BYTES || batch.is_empty())
-            && let Some(key) = self.dirty.pop_first()
-        {
-            bytes += self.wanted.get(&key).map_or(0, Bytes::len);
-            batch.keys.insert(key);
-        }
-        let places = batch.waiting.iter();
-        self.on_the_way = places.map(|(place, waiting)| (place.clone(), waiting.since)).collect();
-        batch
-    }
-
-    /// The lowest revision that somebody may not have heard of.
-    fn untold(&self) -> Option<u64> {
-        let waiting = self.waiting.values().map(|(_, waiting)| waiting.since);
-        waiting.chain(self.on_the_way.values().copied()).min()
-    }
-
-    /// Everything is forgotten, also what is on its way and comes back.
-    fn clear(&mut self) {
-        *self = Self {
-            cleared: self.cleared + 1,
-            ..Self::default()
-        };
-    }
-
-    /// Keys as they should be now.
-    fn changes(&self, keys: &BTreeSet<String>) -> Vec<KeyChange> {
-        let change = |key: &String| match self.wanted.get(key) {
-            Some(value) => KeyChange::Put {
-                key: key.clone(),
-                value: value.clone(),
-            },
-            None => KeyChange::Delete { key: key.clone() },
-        };
-        keys.iter().map(change).collect()
-    }
-
-    /// What could not be told goes back to the front; what has come meanwhile is newer.
-    fn put_back(&mut self, batch: Batch) {
-        self.on_the_way.clear();
-        if batch.cleared != self.cleared {
-            return;
-        }
-        self.dirty.extend(batch.keys);
-        for (place, waiting) in batch.waiting.into_iter().rev() {
-            match self.waiting.get_mut(&place) {
-                Some((_, newer)) => newer.since = newer.since.min(waiting.since),
-                None => {
-                    self.ends.0 -= 1;
-                    self.order.insert(self.ends.0, place.clone());
-                    self.waiting.insert(place, (self.ends.0, waiting));
-                }
-            }
-        }
-    }
-
-    /// All keys are to be written again, and those that came back are to go.
-    fn write_all(&mut self) {
-        self.dirty.extend(self.wanted.keys().cloned());
-        self.sweep = true;
-    }
-
-    /// Of the keys that are there, those that should not be.
-    fn drop_unwanted(&mut self, found: Vec<String>) {
-        let unwanted = found.into_iter().filter(|key| !self.wanted.contains_key(key));
-        self.dirty.extend(unwanted);
-    }
 }
 
 struct Shared {

@@ -1,8 +1,10 @@
 //! The speaker in front of a broker that is away, refuses, or has forgotten.
 
 use async_trait::async_trait;
+use blaze_brokers::redis::KeyChange;
 use tokio::sync::{mpsc, watch};
 
+use super::super::waiting::BATCH_BYTES;
 use super::*;
 
 type Delivered = (Vec<KeyChange>, Vec<(ChannelName, Bytes)>);
@@ -208,5 +210,20 @@ fn a_batch_is_bounded_in_bytes_but_never_empty() {
     state.put(told("c", "small"));
     let counts: Vec<usize> = (0..3).map(|_| state.take(BATCH).waiting.len()).collect();
     assert_eq!(counts, [1, 1, 1]);
+    assert!(state.take(BATCH).is_empty());
+}
+
+#[test]
+fn what_was_forgotten_does_not_come_back_and_is_not_missed() {
+    let mut state = State::default();
+    state.put(told("slam", "7"));
+    state.put(told("slam", "9"));
+    assert_eq!(state.untold(), Some(7), "whoever is told has heard of neither");
+    let batch = state.take(BATCH);
+    state.put(told("nav", "8"));
+    assert_eq!(state.untold(), Some(7), "also while it is on its way");
+    state.clear();
+    state.put_back(batch);
+    assert_eq!(state.untold(), None);
     assert!(state.take(BATCH).is_empty());
 }
