@@ -199,10 +199,10 @@ async fn by_the_sdk(stage: &Stage, worker: &Worker) {
     let service = ServiceManager::start(options.on_node("robot-1".parse().unwrap()))
         .await
         .unwrap();
-    let (told, mut changes) = mpsc::unbounded_channel();
+    let (told, mut changes) = mpsc::channel(64);
     let config = service.config();
     let _listener = config.on_change(move |change| {
-        let _ = told.send((change.revision, change.new.clone()));
+        told.try_send((change.revision, change.new.clone())).unwrap();
     });
     let start = tokio::time::Instant::now();
     config.ready(PATIENCE).await.unwrap();
