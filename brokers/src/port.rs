@@ -357,8 +357,8 @@ pub trait Broker: Send + Sync + 'static {
         None
     }
 
-    /// What only a worker of BlazeConfig does on its broker; absent where the client is somebody else's, or where a channel
-    /// is there as soon as it is used (Redis, memory).
+    /// What only a worker of BlazeConfig does on its broker; absent where a channel is there as soon as it is used (Redis,
+    /// memory), and on Kafka where the client is somebody else's.
     fn worker_side(&self) -> Option<Arc<dyn WorkerSide>> {
         None
     }

@@ -95,6 +95,14 @@ mod tests {
     }
 
     #[test]
+    fn only_on_dds_it_matters_to_those_who_listen_how_a_service_speaks() {
+        let is_reliable = |kind| speaking(kind).reliable;
+        assert!(is_reliable(BrokerKind::Dds) && is_reliable(BrokerKind::Ros2));
+        let kinds = [BrokerKind::Memory, BrokerKind::Redis, BrokerKind::Kafka];
+        assert!(!kinds.into_iter().any(is_reliable));
+    }
+
+    #[test]
     fn a_name_that_no_channel_can_have_is_refused() {
         assert!(channel("blaze/config/get").is_ok_and(|channel| channel.is_reserved()));
         assert!(matches!(channel("a b"), Err(BrokerError::Name { .. })));

@@ -43,11 +43,12 @@ async fn a_plain_client_asks_and_reads_json_with_keys() {
         (&value(&answer)["id"], &value(&answer)["config"]["camera"]["rate_hz"]),
         (&json!("7f1c"), &json!(30))
     );
-    let metrics = worker.text("/metrics").await;
-    assert!(
-        metrics.contains("blaze_worker_requests_total{result=\"refused\"} 1"),
-        "{metrics}"
-    );
+    let refused = "blaze_worker_requests_total{result=\"refused\"} 1";
+    let start = tokio::time::Instant::now();
+    while !worker.text("/metrics").await.contains(refused) {
+        assert!(start.elapsed() < PATIENCE, "{}", worker.text("/metrics").await);
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
 
     let revision = stage.put("/services/slam/instances/0", rate(10)).await;
     let mut notice = changed.next(PATIENCE).expect("a notice");

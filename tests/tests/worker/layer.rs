@@ -70,16 +70,20 @@ async fn on_dds_a_whole_layer_is_served() {
 /// Has a layer served. Gives the revision that each instance of `slam` was told last.
 async fn everything(stage: &Stage) -> (Process, Worker, BTreeMap<String, Value>) {
     let main = stage.main();
-    stage.robot().await;
+    let first = stage.robot().await;
     let worker = stage.worker("server-1");
     stage.equal(&worker, PATIENCE).await;
     answers(stage).await;
-    let last = notices(stage, &worker).await;
+    let last = notices(stage, &worker, first).await;
     by_the_sdk(stage, &worker).await;
     let service = stage.service().await;
     let mut nav = service.listen("nav").await;
     stage.send(reqwest::Method::DELETE, "/services/nav", None).await;
-    let notice = next(&mut nav).await;
+    // On DDS, whose clocks are compared, what was told before may come as if it were new.
+    let mut notice = next(&mut nav).await;
+    while notice["revision"] == first {
+        notice = next(&mut nav).await;
+    }
     assert_eq!(
         (&notice["deleted"], &notice["config"], &notice["hash"]),
         (&json!(true), &json!(null), &json!(null))
@@ -134,7 +138,7 @@ async fn answers(stage: &Stage) {
     assert_eq!(misspelt["error"]["code"], "not_found");
 }
 
-async fn notices(stage: &Stage, worker: &Worker) -> BTreeMap<String, Value> {
+async fn notices(stage: &Stage, worker: &Worker, first: u64) -> BTreeMap<String, Value> {
     let service = stage.service().await;
     let (mut slam, mut nav) = (service.listen("slam").await, service.listen("nav").await);
     // A subscription may reach the network only now; from the first notice on none is missing.
@@ -161,7 +165,11 @@ async fn notices(stage: &Stage, worker: &Worker) -> BTreeMap<String, Value> {
         let notice = next(&mut slam).await;
         last.insert(notice["instance"].to_string(), notice["revision"].clone());
     }
-    assert_eq!(rest(&mut nav).await, [json!(null); 0], "it concerns nobody else");
+    let of_nav = rest(&mut nav).await;
+    assert!(
+        of_nav.iter().all(|notice| notice["revision"] == first),
+        "it concerns nobody else: {of_nav:?}"
+    );
     // Who is there from the first moment on hears of the first change.
     stage
         .apply(&[("Service", "late", json!({ "config": { "x": 1 } }))])
@@ -191,10 +199,10 @@ async fn by_the_sdk(stage: &Stage, worker: &Worker) {
     let service = ServiceManager::start(options.on_node("robot-1".parse().unwrap()))
         .await
         .unwrap();
-    let (told, mut changes) = mpsc::unbounded_channel();
+    let (told, mut changes) = mpsc::channel(64);
     let config = service.config();
     let _listener = config.on_change(move |change| {
-        let _ = told.send((change.revision, change.new.clone()));
+        told.try_send((change.revision, change.new.clone())).unwrap();
     });
     let start = tokio::time::Instant::now();
     config.ready(PATIENCE).await.unwrap();
