@@ -12,7 +12,7 @@ use super::stage::{PATIENCE, Stage, Worker};
 const LEASE: Duration = Duration::from_secs(5);
 /// Between two looks at the status, and what a look may take on a machine that does much else.
 const LOOK: Duration = Duration::from_millis(250);
-/// The broker tells those who wait of a change with the next heartbeat, and is told that they know it.
+/// The broker tells those who wait of a change with the next heartbeat, and each joins anew, at most once a second.
 const REBALANCE: Duration = Duration::from_secs(2);
 
 /// Two workers of a layer whose further sections these are, one of which leads: that one first.
@@ -111,7 +111,7 @@ async fn with_mongodb_another_worker_takes_over_within_a_lease() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn with_kafka_another_worker_takes_over_within_the_least_session_of_the_broker() {
+async fn with_kafka_another_worker_takes_over_after_the_least_session_of_the_broker() {
     let (stage, _main) = stage().await;
     let server = KafkaServer::start(KafkaOptions::default()).unwrap();
     let sections = json!({ "brokers": { "layer": { "kafka": { "bootstrap": [server.bootstrap()] } } } });
@@ -120,7 +120,7 @@ async fn with_kafka_another_worker_takes_over_within_the_least_session_of_the_br
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn with_a_kafka_that_allows_it_another_worker_takes_over_within_a_lease() {
+async fn with_a_kafka_that_allows_short_sessions_another_worker_takes_over_after_a_lease() {
     let (stage, _main) = stage().await;
     let options = KafkaOptions {
         extra: vec!["group.min.session.timeout.ms=1000".to_owned()],
@@ -132,8 +132,8 @@ async fn with_a_kafka_that_allows_it_another_worker_takes_over_within_a_lease() 
         "Kafka with short sessions",
         &stage,
         &sections,
-        LEASE + LOOK,
-        Duration::from_secs(1) + LOOK,
+        LEASE + REBALANCE,
+        Duration::from_secs(1) + REBALANCE,
     )
     .await;
 }
@@ -200,7 +200,7 @@ async fn whoever_was_stopped_writes_nothing_older_over_what_the_next_one_wrote()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_nobody_told_for_long_is_in_the_keys_and_the_mark_once_somebody_leads() {
+async fn what_was_told_is_marked_beside_the_lease_which_a_worker_that_ends_gives_up() {
     let (stage, _main) = stage().await;
     let sections = json!({ "cache": { "redis": { "url": stage.redis.url() } } });
     let worker = stage.layer_worker("fog-1", &sections);

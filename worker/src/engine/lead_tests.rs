@@ -243,6 +243,19 @@ async fn whoever_knows_less_than_was_told_answers_and_tells_nothing_until_it_kno
 }
 
 #[tokio::test(start_paused = true)]
+async fn what_the_main_service_calls_the_newest_counts_more_than_a_mark_but_not_at_once() {
+    let mut w = world_from(None, false);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.noted.send_replace(Some(mark(5)));
+    w.leader.send_replace(Some(1));
+    assert_eq!(w.rest().await, [], "it may have been stopped since it was said");
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    assert_eq!(key_of_slam(&w.rest().await), Some(30));
+    assert_eq!(*w.told.borrow(), Some(mark(2)));
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_speaker_says_nothing_after_its_term() {
     let (mut holder, leadership) = crate::lease::leadership();
     let speaker = Speaker::new(leadership.term.clone());
