@@ -28,11 +28,10 @@ fn notices(seen: &[Seen]) -> Vec<(u64, u64)> {
 }
 
 fn key_of_slam(seen: &[Seen]) -> Option<u64> {
-    let keys = seen.iter().rev().find_map(|seen| match seen {
+    seen.iter().rev().find_map(|seen| match seen {
         Seen::Key(key, Some(value)) if key == "blaze:config:slam" => value["config"]["rate_hz"].as_u64(),
         Seen::Key(..) | Seen::Notice(..) => None,
-    });
-    keys
+    })
 }
 
 #[tokio::test(start_paused = true)]
