@@ -71,7 +71,12 @@ impl RedisKeys {
         }
         call.arg(&lock.owner);
         for command in self.pipeline(changes, messages).cmd_iter() {
-            let words: Vec<&[u8]> = command.args_iter().filter_map(word).collect();
+            let words = command.args_iter().filter_map(|argument| match argument {
+                redis::Arg::Simple(word) => Some(word),
+                // A place for the cursor of a scan, of which there is none.
+                _ => None,
+            });
+            let words: Vec<&[u8]> = words.collect();
             call.arg(words.len());
             for word in words {
                 call.arg(word);
@@ -138,12 +143,3 @@ const RELEASE: &str = r"
 if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end
 return 1
 ";
-
-/// What a command has at this place, which for those of a pipeline is always a word.
-fn word(argument: redis::Arg<&[u8]>) -> Option<&[u8]> {
-    match argument {
-        redis::Arg::Simple(word) => Some(word),
-        // A place for the cursor of a scan.
-        _ => None,
-    }
-}

@@ -163,14 +163,14 @@ impl Stage {
         Worker { process, admin }
     }
 
-    /// A worker of the whole layer, ready, beside others; `more` are further sections. Its broker is none that it can reach,
-    /// unless they name another: keys are enough to see who serves.
+    /// A worker of the whole layer, ready, beside others; `more` are further sections. Its broker is in its own memory, unless
+    /// they name another: keys are enough to see who serves.
     pub(crate) fn layer_worker(&self, node: &str, more: &Value) -> Worker {
         let mut file = json!({
             "log": { "level": "debug" },
             "layer": { "name": "edge", "kind": "edge" },
             "node": { "name": node },
-            "brokers": { "layer": { "kafka": { "bootstrap": ["127.0.0.1:1"] } } },
+            "brokers": { "layer": { "memory": {} } },
             "admin": { "worker": "127.0.0.1:0" },
             "config": { "server": format!("http://{}", self.grpc) },
             "worker": { "state_dir": self.path(node) },

@@ -6,6 +6,7 @@
 //! ```
 
 use std::collections::BTreeSet;
+use std::time::Duration;
 
 use tokio::time::Instant;
 
@@ -14,6 +15,9 @@ use super::{Engine, SETTLE, WAIT_FOR_OTHERS};
 use crate::core::Notice;
 use crate::lease::Mark;
 use crate::serve::Told;
+
+/// The main service says every 15 s what its newest is, and a link that is dead is noticed before.
+const TRUST_AFTER: Duration = Duration::from_secs(20);
 
 impl Engine {
     /// Whether this worker may act for its layer at this instant.
@@ -32,6 +36,7 @@ impl Engine {
             self.stop_telling();
         }
         self.leads = term;
+        self.led_at = Instant::now();
         self.begin_telling();
         if self.leads.is_some() && !self.tells {
             tracing::info!("others have told more than is known here; services are told again once it is");
@@ -52,13 +57,15 @@ impl Engine {
         })
     }
 
-    /// Whether others have told more than is known here. What is certainly the newest is never behind.
+    /// Whether others have told more than is known here. What the main service calls the newest some time after this worker
+    /// began to lead is not behind, whatever the mark says; before, its word may be one from before the process was stopped.
     fn is_behind(&self) -> bool {
         match (&self.noted, &self.shown) {
             (None, _) => false,
             (Some(_), None) => true,
             (Some(noted), Some(shown)) => {
-                noted.store_id == shown.store_id && !shown.covers(noted) && !self.replica.is_in_sync()
+                let is_newest = self.replica.is_in_sync() && self.led_at.elapsed() > TRUST_AFTER;
+                noted.store_id == shown.store_id && !shown.covers(noted) && !is_newest
             }
         }
     }

@@ -28,11 +28,10 @@ fn notices(seen: &[Seen]) -> Vec<(u64, u64)> {
 }
 
 fn key_of_slam(seen: &[Seen]) -> Option<u64> {
-    let keys = seen.iter().rev().find_map(|seen| match seen {
+    seen.iter().rev().find_map(|seen| match seen {
         Seen::Key(key, Some(value)) if key == "blaze:config:slam" => value["config"]["rate_hz"].as_u64(),
         Seen::Key(..) | Seen::Notice(..) => None,
-    });
-    keys
+    })
 }
 
 #[tokio::test(start_paused = true)]
@@ -240,6 +239,19 @@ async fn whoever_knows_less_than_was_told_answers_and_tells_nothing_until_it_kno
     assert_eq!(key_of_slam(&told), Some(11));
     assert!(notices(&told).iter().all(|notice| *notice == (5, 11)), "{told:?}");
     assert_eq!(*w.told.borrow(), Some(mark(5)));
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_the_main_service_calls_the_newest_counts_more_than_a_mark_but_not_at_once() {
+    let mut w = world_from(None, false);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.noted.send_replace(Some(mark(5)));
+    w.leader.send_replace(Some(1));
+    assert_eq!(w.rest().await, [], "it may have been stopped since it was said");
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    assert_eq!(key_of_slam(&w.rest().await), Some(30));
+    assert_eq!(*w.told.borrow(), Some(mark(2)));
 }
 
 #[tokio::test(start_paused = true)]

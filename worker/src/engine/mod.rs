@@ -81,6 +81,8 @@ pub struct Engine {
     reason: Option<String>,
     /// The number of the term in which it leads.
     leads: Option<u64>,
+    /// Since when.
+    led_at: Instant,
     /// It leads and knows enough to tell services of it.
     tells: bool,
     /// How far services were told, by whomever.
@@ -129,6 +131,7 @@ impl Engine {
             stream: None,
             reason: None,
             leads: None,
+            led_at: now,
             tells: false,
             noted: None,
             shown: None,
