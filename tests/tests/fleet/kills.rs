@@ -92,6 +92,7 @@ async fn after_kills_in_the_middle_of_writes_all_workers_have_what_the_main_serv
     while let Some(written) = writers.join_next().await {
         written.unwrap();
     }
+    assert_eq!(progress.fault(), None);
     let ended = Instant::now();
     all_equal(&api, &workers, &processes).await;
     let (unknown, refused) = progress.others();
@@ -117,7 +118,7 @@ fn kill_all(parts: &mut Parts, kills: usize, goal: usize, progress: &Progress) {
         wait::until(
             &format!("{due} writes"),
             Duration::from_secs(600),
-            || progress.done() >= due,
+            || progress.done() >= due || progress.fault().is_some(),
             || format!("there are {}", progress.done()),
         )
         .unwrap();
@@ -160,23 +161,19 @@ async fn services_are_told_that(
     processes: &[(String, WorkerProcess)],
     redis: &RedisServer,
 ) {
+    let begun = Instant::now();
     for worker in workers.iter().take(LOOKED_AT) {
-        let status = worker.running().status().await.unwrap();
-        let told = status.json["services"].as_array().unwrap().clone();
-        let of_service = |name: &str| {
-            let mut without_instance = told.iter().filter(|row| row["instance"].is_null());
-            without_instance
-                .find(|row| row["service"] == name)
-                .map(|row| row["hash"].clone())
-        };
         for name in all_services() {
             let expected = hash(api, &name, worker.node().as_str()).await;
-            assert_eq!(
-                of_service(&name).unwrap_or_default(),
-                expected,
-                "{name} at {}",
-                worker.node()
-            );
+            // What has come just now is told within 20 ms.
+            while told(worker, &name).await != expected {
+                assert!(
+                    begun.elapsed() < EQUAL,
+                    "{name} at {} was not told {expected}",
+                    worker.node()
+                );
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
         }
     }
     for (node, _) in processes {
@@ -200,6 +197,16 @@ async fn services_are_told_that(
             }
         }
     }
+}
+
+/// Hash of what the service without instance was told last; null: nothing, or that it is gone.
+async fn told(worker: &Worker, service: &str) -> Value {
+    let status = worker.running().status().await.unwrap();
+    let rows = status.json["services"].as_array().unwrap();
+    let row = rows
+        .iter()
+        .find(|row| row["service"] == service && row["instance"].is_null());
+    row.map(|row| row["hash"].clone()).unwrap_or_default()
 }
 
 fn all_services() -> impl Iterator<Item = String> {

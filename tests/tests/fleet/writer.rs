@@ -1,7 +1,7 @@
 //! Somebody who changes documents of every kind: creates, updates, deletes, and makes anew under the same name at once.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use blaze_tests::fleet::{Api, Told};
@@ -26,6 +26,8 @@ pub(super) struct Progress {
     unknown: AtomicUsize,
     refused: AtomicUsize,
     goal: usize,
+    /// Why a write was refused that must not be; then all end.
+    fault: OnceLock<String>,
 }
 
 impl Progress {
@@ -35,7 +37,13 @@ impl Progress {
             unknown: AtomicUsize::new(0),
             refused: AtomicUsize::new(0),
             goal,
+            fault: OnceLock::new(),
         }
+    }
+
+    /// Why a write was refused that must not be.
+    pub(super) fn fault(&self) -> Option<&String> {
+        self.fault.get()
     }
 
     /// Writes that took effect, of those known to have.
@@ -77,7 +85,7 @@ impl Writer {
 
     /// Writes until all writers together have written enough.
     pub(super) async fn run(mut self) {
-        while self.progress.done() < self.progress.goal {
+        while self.progress.done() < self.progress.goal && self.progress.fault().is_none() {
             self.write().await;
         }
     }
@@ -90,18 +98,18 @@ impl Writer {
         match self.random.random_range(0..100) {
             0..35 => self.apply(&[service(&name, &json!({ "count": count }))]).await,
             35..55 => {
-                let spec = json!({ "node": node, "config": { "instance": count } });
+                let spec = json!({ "node": node, "config": { "of_instance": count } });
                 let instance = json!({ "kind": "Instance", "service": name, "name": "0", "spec": spec });
                 // The service may be away.
                 self.apply(&[service(&name, &json!({ "with": count })), instance]).await;
             }
             55..70 => {
-                let spec = json!({ "layer": LAYER, "overrides": { name: { "node": count } } });
+                let spec = json!({ "layer": LAYER, "overrides": { name: { "of_node": count } } });
                 self.apply(&[json!({ "kind": "Node", "name": node, "spec": spec })])
                     .await;
             }
             70..78 => {
-                let spec = json!({ "kind": "edge", "config": { "layer": format!("{}-{count}", self.number) } });
+                let spec = json!({ "kind": "edge", "config": { "of_layer": format!("{}-{count}", self.number) } });
                 self.apply(&[json!({ "kind": "Layer", "name": LAYER, "spec": spec })])
                     .await;
             }
@@ -152,7 +160,12 @@ impl Writer {
                     return;
                 }
                 Told::NotNow(_) => tokio::time::sleep(PAUSE).await,
-                refused @ Told::Refused { .. } => panic!("{method} {path}: {refused:?}"),
+                refused @ Told::Refused { .. } => {
+                    self.progress
+                        .fault
+                        .get_or_init(|| format!("{method} {path}: {refused:?}"));
+                    return;
+                }
             }
         }
     }
