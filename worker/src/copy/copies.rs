@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! store(update) ──▶ slot of the database ──▶ task ──▶ advance, or replace after a failure
-//!               └─▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time, and every two seconds
+//!               └─▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time, and once a second
 //!                                                      at most while the database has everything
 //! ```
 //!
@@ -29,9 +29,9 @@ const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_
 const REST: u32 = 4;
 const REST_BOUNDS: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(10));
 
-/// It rests at least so long while another copy holds everything: to write all documents for each change of one wears out
+/// It rests at least so long while another copy holds everything, and so may be this old when that one is lost: to write all documents for each change of one wears out
 /// flash memory, and is most of what a change costs a worker that it does not concern.
-const REST_BESIDE: Duration = Duration::from_secs(2);
+const REST_BESIDE: Duration = Duration::from_secs(1);
 
 /// Where only the time of the position moves on, such a copy is written again when it is this old.
 const MAX_AGE: Duration = Duration::from_secs(300);
