@@ -168,8 +168,8 @@ async fn begin(settings: WorkerSettings, file: &NodeFile, supervisor: &Superviso
         LocalBroker::Node(NodeBroker::Memory) | LocalBroker::Layer(LayerBroker::Memory) => {
             Arc::new(MemoryHub::new(settings.site.layer.to_string()).broker())
         }
-        LocalBroker::Node(section) => open_node(section, &Role::Service).context("brokers.node")?,
-        LocalBroker::Layer(section) => open_layer(section, &Role::Service).context("brokers.layer")?,
+        LocalBroker::Node(section) => open_node(section, &Role::Worker).context("brokers.node")?,
+        LocalBroker::Layer(section) => open_layer(section, &Role::Worker).context("brokers.layer")?,
     };
     let keys = settings.keys.as_ref().map(RedisKeys::open).transpose();
     let keys = keys.context("cache")?.map(Arc::new);

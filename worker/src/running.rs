@@ -27,7 +27,7 @@ use crate::core::Site;
 use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
 use crate::hearing::{ACK, GET, WATCHDOG, listen, notice_deafness, scan};
 use crate::lease::{self, Lease};
-use crate::serve::{BrokerOutlet, Speaker, SpeakerCounts};
+use crate::serve::{BrokerOutlet, Channels, Speaker, SpeakerCounts};
 use crate::settings::WorkerSettings;
 use crate::sync::{MainService, follow};
 
@@ -111,6 +111,9 @@ impl RunningWorker {
         let outputs = Outputs {
             replies: Arc::new(BrokerReplies::new(Arc::clone(&outlet), broker.kind())),
             speaker: speaker.clone(),
+            channels: outlet
+                .makes_channels()
+                .then(|| Arc::clone(&outlet) as Arc<dyn Channels>),
             copies: copies.clone(),
             acks,
         };

@@ -105,7 +105,7 @@ impl Shared {
     fn new(settings: Settings, role: &Role) -> Self {
         let gates = [Gate::new(false), Gate::new(true)];
         let scope = match role {
-            Role::Service => Scope::Free,
+            Role::Service | Role::Worker => Scope::Free,
             Role::Flow { .. } => Scope::Unclaimed,
         };
         let channels = Arc::<AtomicUsize>::default();
@@ -218,7 +218,7 @@ impl RedisBroker {
             shared: Arc::new(Shared::new(settings, role)),
             supervisor: Supervisor::on(runtime, "redis"),
             flow: match role {
-                Role::Service => None,
+                Role::Service | Role::Worker => None,
                 Role::Flow { flow, epoch } => Some(Flow {
                     flow: flow.clone(),
                     epoch: *epoch,

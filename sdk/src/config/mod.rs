@@ -20,7 +20,7 @@ mod wire;
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_brokers::{Broker, PublishOutcome, PublisherOptions};
+use blaze_brokers::{Broker, PublishOutcome};
 use blaze_domain::Scope;
 use blaze_domain::names::ChannelName;
 use blaze_runtime::{Supervisor, TaskPolicy};
@@ -264,7 +264,10 @@ impl ConfigManager {
                 Some(publisher) => Arc::clone(publisher),
                 None => {
                     let channel = reserved::channel(ACK)?;
-                    let publisher = self.shared.broker.publisher(&channel, PublisherOptions::default())?;
+                    let publisher = self
+                        .shared
+                        .broker
+                        .publisher(&channel, reserved::speaking(self.shared.broker.kind()))?;
                     Arc::clone(acks.insert(publisher))
                 }
             }

@@ -3,9 +3,11 @@
 //! Needs `cargo build --workspace` and `scripts/services install`.
 //!
 //! ```text
-//! stage    a main service, a Redis and workers of one layer
+//! stage    a main service, a broker and workers of one layer
 //! serving  what services are told, and whether only those it concerns
 //! outages  the main service, the broker and the worker away, in turns and together
+//! layer    one worker for a whole layer, on Kafka and on DDS
+//! kafka    what is special to Kafka
 //! ```
 
 #![allow(
@@ -15,6 +17,9 @@
     reason = "the helpers of a test fail like the test"
 )]
 
+#[cfg(feature = "kafka")]
+mod kafka;
+mod layer;
 mod outages;
 mod serving;
 mod stage;

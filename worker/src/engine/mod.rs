@@ -11,6 +11,7 @@
 //! ```
 
 mod ask;
+mod fade;
 mod hear;
 mod status;
 mod tell;
@@ -21,8 +22,8 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::config::Timestamp;
 use blaze_domain::config::state::State;
+use blaze_domain::config::{Key, Kind, Timestamp};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{LayerName, NodeName};
 use blaze_proto::v1;
@@ -34,8 +35,9 @@ use tokio_util::sync::CancellationToken;
 use crate::copy::{Changed, Copies, Loaded, Notes, Position, Update, defaults, lacks_text};
 use crate::core::messages::Delivery;
 use crate::core::{Applied, Gate, PROTOCOL, Place, Replica, Served, Signs, Site, Source};
-use crate::serve::{Speaker, Told};
+use crate::serve::{Channels, Speaker, Told};
 use crate::sync::SyncEvent;
+use fade::Fades;
 
 pub use hear::Sign;
 pub use status::Status;
@@ -102,6 +104,8 @@ pub struct Outputs {
     pub replies: Arc<dyn Replies>,
     /// Keys and notices.
     pub speaker: Speaker,
+    /// Channels; absent where the broker has them as soon as they are used.
+    pub channels: Option<Arc<dyn Channels>>,
     /// Copies; absent where nothing is kept.
     pub copies: Option<Copies>,
     /// What the worker has, for the main service.
@@ -173,6 +177,8 @@ pub struct Engine {
     has_swept: bool,
     /// What places are being told, until the broker has taken it.
     unnoted: BTreeMap<Place, (u64, Option<String>)>,
+    /// What the broker keeps of places that are not told of anything any more.
+    fades: Fades,
     /// What was told, or would have been if this worker were the leader, a short while ago.
     recent: VecDeque<(Instant, Told)>,
     defaults_problem: Option<String>,
@@ -206,6 +212,7 @@ impl Engine {
             keyed: BTreeMap::new(),
             has_swept: false,
             unnoted: BTreeMap::new(),
+            fades: Fades::default(),
             recent: VecDeque::new(),
             defaults_problem: None,
             counts: Counts::default(),
@@ -239,6 +246,8 @@ impl Engine {
             tracing::error!(%error, "the copy is not used");
         }
         self.lacks_texts = lacks_texts(self.replica.state());
+        self.fade_from_notes();
+        self.note_services([Kind::Service]);
         self.flush_at = Some(now);
         // The one of the copies that is behind the other catches up.
         self.keep(Changed::Keys(Vec::new()));
@@ -260,7 +269,10 @@ impl Engine {
                     let is_leader = *inputs.leader.borrow_and_update();
                     self.lead(is_leader);
                 }
-                () = sleep_until(self.look_at) => self.look_at_signs(),
+                () = sleep_until(self.look_at) => {
+                    self.look_at_signs();
+                    self.look_at_fading();
+                }
                 Some(event) = inputs.sync.recv() => self.on_sync(event),
                 Some(sign) = inputs.signs.recv() => self.on_sign(sign),
                 Some(request) = inputs.gets.recv() => self.on_get(&request),
@@ -294,6 +306,7 @@ impl Engine {
                         self.counts.changes += 1;
                         self.wants_all = false;
                         self.served.apply(&change);
+                        self.note_services(change.keys.iter().map(Key::kind));
                         self.note_texts(&change);
                         self.keep(Changed::Keys(change.keys));
                         self.flush_soon();
@@ -415,6 +428,7 @@ impl Engine {
         }
         // What came from the main service or a copy of it is better.
         if self.served.load(state, Source::File).is_ok() {
+            self.note_services([Kind::Service]);
             self.flush_soon();
         }
     }

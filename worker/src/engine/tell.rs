@@ -4,18 +4,19 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
+use blaze_brokers::KeyedMessage;
 use blaze_domain::config::effective::At;
 use blaze_domain::config::secret;
-use blaze_domain::names::ChannelName;
 use blaze_domain::{DocumentName, InstanceName};
 use bytes::Bytes;
 use tokio::time::Instant;
 
+use super::fade::record_key;
 use super::{Engine, SETTLE, TOGETHER, lacks_texts, now};
 use crate::copy::{Notes, Told as Noted, lacks_text};
 use crate::core::messages::{self, Delivery, GetRequest};
 use crate::core::{Change, Flushed, Notice, Place, Site, Standing, Told as ServedTold};
-use crate::serve::Told;
+use crate::serve::{Told, changed};
 
 /// How long ago a notice may be that a new leader tells once more, because the one before may have died over it.
 const RECENT: Duration = Duration::from_secs(15);
@@ -26,35 +27,32 @@ const MAX_RECENT: usize = 10_000;
 
 /// What an earlier life told, from its notes.
 pub(super) fn told_of(notes: &Notes) -> Vec<(Place, ServedTold)> {
-    let place = |at: &At| {
-        Some(Place {
-            service: at.service.clone()?,
-            instance: at.instance.as_ref().map(InstanceName::from),
-            node: at.node.clone(),
-        })
-    };
     let told = |noted: &Noted| ServedTold {
         revision: noted.revision,
         hash: noted.hash.as_ref().map(ToString::to_string),
     };
     let all = notes
         .all_told()
-        .filter_map(|(at, noted)| Some((place(at)?, told(noted))));
+        .filter_map(|(at, noted)| Some((place_of(at)?, told(noted))));
     all.collect()
 }
 
-fn at(place: &Place, site: &Site) -> At {
+/// The place of a note.
+pub(super) fn place_of(at: &At) -> Option<Place> {
+    Some(Place {
+        service: at.service.clone()?,
+        instance: at.instance.as_ref().map(InstanceName::from),
+        node: at.node.clone(),
+    })
+}
+
+pub(super) fn at(place: &Place, site: &Site) -> At {
     At {
         service: Some(place.service.clone()),
         instance: place.instance.as_ref().map(DocumentName::from),
         layer: Some(site.layer.clone()),
         node: place.node.clone(),
     }
-}
-
-fn channel(notice: &Notice) -> Option<ChannelName> {
-    // A name of a service is always part of a good one.
-    format!("blaze/config/changed/{}", notice.place.service).parse().ok()
 }
 
 impl Engine {
@@ -78,10 +76,14 @@ impl Engine {
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
         // First what goes: an instance that moves has the same key there.
         for place in &untracked {
-            self.unnoted.remove(place);
-            self.notes.forget(&at(place, &self.identity.site));
+            let noted = at(place, &self.identity.site);
+            if !self.fade(place, &noted) {
+                self.unnoted.remove(place);
+                self.notes.forget(&noted);
+            }
             told.extend(self.without_key(place));
         }
+        self.serve_channels();
         let is_gone = |notice: &&Notice| notice.hash.is_none();
         for notice in notices
             .iter()
@@ -149,7 +151,7 @@ impl Engine {
         self.tell(told, Instant::now());
     }
 
-    fn tell(&mut self, told: Vec<Told>, at: Instant) {
+    pub(super) fn tell(&mut self, told: Vec<Told>, at: Instant) {
         if self.is_leader {
             self.outputs.speaker.tell(told);
             return;
@@ -219,7 +221,11 @@ impl Engine {
         Some(Told {
             place: notice.place.to_string(),
             key,
-            notice: Some((channel(notice)?, Bytes::from(text.ok()?))),
+            notice: Some(KeyedMessage {
+                channel: changed(&notice.place.service)?,
+                key: record_key(&notice.place),
+                value: Some(Bytes::from(text.ok()?)),
+            }),
         })
     }
 
@@ -267,7 +273,7 @@ impl Engine {
     }
 
     /// Has it noted what a place is told, once the broker has taken it: whoever dies before tells it again in the next life.
-    fn note(&mut self, place: &Place, revision: u64, hash: Option<String>) {
+    pub(super) fn note(&mut self, place: &Place, revision: u64, hash: Option<String>) {
         let known = self.notes.told(&at(place, &self.identity.site));
         let is_known =
             known.is_some_and(|known| known.revision == revision && known.hash.as_deref() == hash.as_deref());

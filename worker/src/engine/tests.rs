@@ -1,9 +1,12 @@
 //! The engine between a main service, a broker and a lease that the test plays.
 
+#[path = "fade_tests.rs"]
+mod fade;
 #[path = "hear_tests.rs"]
 mod hear;
 
 use async_trait::async_trait;
+use blaze_brokers::KeyedMessage;
 use blaze_brokers::redis::KeyChange;
 use blaze_domain::config::Document;
 use serde_json::{Value, json};
@@ -19,6 +22,7 @@ use crate::serve::{Outlet, OutletError};
 enum Seen {
     Key(String, Option<Value>),
     Notice(String, Value),
+    TakenAway(String, String),
 }
 
 struct Board {
@@ -27,7 +31,7 @@ struct Board {
 
 #[async_trait]
 impl Outlet for Board {
-    async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+    async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
         for change in changes {
             let seen = match change {
                 KeyChange::Put { key, value } => Seen::Key(key.clone(), Some(parse(value))),
@@ -36,11 +40,12 @@ impl Outlet for Board {
             };
             self.seen.send(seen).await.unwrap();
         }
-        for (channel, text) in messages {
-            self.seen
-                .send(Seen::Notice(channel.to_string(), parse(text)))
-                .await
-                .unwrap();
+        for message in messages {
+            let seen = match &message.value {
+                Some(text) => Seen::Notice(message.channel.to_string(), parse(text)),
+                None => Seen::TakenAway(message.channel.to_string(), message.key.clone()),
+            };
+            self.seen.send(seen).await.unwrap();
         }
         Ok(())
     }
@@ -94,6 +99,16 @@ fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
 }
 
 fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) -> World {
+    world_on(start, is_leader, copies, None)
+}
+
+/// The same on a broker where channels are to be made.
+fn world_on(
+    start: Option<Loaded>,
+    is_leader: bool,
+    copies: Option<Copies>,
+    channels: Option<Arc<dyn Channels>>,
+) -> World {
     let (sync, sync_in) = mpsc::channel(64);
     let (gets, gets_in) = mpsc::channel(64);
     let (signs, signs_in) = mpsc::channel(64);
@@ -116,6 +131,7 @@ fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) ->
     let outputs = Outputs {
         replies: Arc::new(Answers(answer)),
         speaker: speaker.clone(),
+        channels,
         copies,
         acks: acks_out,
     };
@@ -285,7 +301,7 @@ async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
                 assert_eq!(value["config"]["rate_hz"], 10);
                 Some(key.as_str())
             }
-            Seen::Key(_, None) | Seen::Notice(..) => None,
+            Seen::Key(_, None) | Seen::Notice(..) | Seen::TakenAway(..) => None,
         })
         .collect();
     assert_eq!(keys, ["blaze:config:slam", "blaze:config:slam:0"]);
@@ -316,7 +332,7 @@ async fn what_comes_together_is_told_once_and_the_last_state_always() {
         .iter()
         .filter_map(|seen| match seen {
             Seen::Notice(_, notice) => notice["config"]["rate_hz"].as_u64(),
-            Seen::Key(..) => None,
+            Seen::Key(..) | Seen::TakenAway(..) => None,
         })
         .collect();
     assert_eq!(rates.last(), Some(&52));

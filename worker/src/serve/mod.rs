@@ -8,5 +8,5 @@
 pub mod outlet;
 pub mod speaker;
 
-pub use outlet::{BrokerOutlet, Outlet, OutletError};
+pub use outlet::{BrokerOutlet, Channels, Outlet, OutletError, changed};
 pub use speaker::{Speaker, SpeakerCounts, Told};

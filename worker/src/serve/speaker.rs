@@ -6,8 +6,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use blaze_brokers::KeyedMessage;
 use blaze_brokers::redis::KeyChange;
-use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::Notify;
@@ -29,8 +29,8 @@ pub struct Told {
     pub place: String,
     /// Its key and what it has from now on, `None`: there is none; absent where the place has no key.
     pub key: Option<(String, Option<Bytes>)>,
-    /// Channel and text of the notice, if there is one.
-    pub notice: Option<(ChannelName, Bytes)>,
+    /// The notice, if there is one.
+    pub notice: Option<KeyedMessage>,
 }
 
 /// What happened to notices and keys.
@@ -54,7 +54,7 @@ pub struct SpeakerCounts {
 struct Waiting {
     /// The key that must be written no later.
     key: Option<String>,
-    notice: (ChannelName, Bytes),
+    notice: KeyedMessage,
 }
 
 #[derive(Default)]
@@ -66,6 +66,10 @@ struct State {
     /// Places in the order in which they are told of; each stands here once.
     order: BTreeMap<i64, String>,
     waiting: BTreeMap<String, (i64, Waiting)>,
+    /// Places that are told of just now: nobody knows yet whether the broker takes it.
+    under_way: BTreeSet<String>,
+    /// How often everything was forgotten.
+    cleared: u64,
     /// Of the last that was put at the end, and of the first.
     ends: (i64, i64),
     /// Keys of before are to be looked for: those of this worker that are not wanted are to go.
@@ -76,6 +80,8 @@ struct State {
 struct Batch {
     keys: BTreeSet<String>,
     waiting: Vec<(String, Waiting)>,
+    /// [`State::cleared`] of when it was taken.
+    cleared: u64,
 }
 
 impl Batch {
@@ -117,6 +123,7 @@ impl State {
         let mut batch = Batch {
             keys: BTreeSet::new(),
             waiting: Vec::new(),
+            cleared: self.cleared,
         };
         let mut bytes = 0;
         while batch.waiting.len() < most
@@ -126,11 +133,12 @@ impl State {
             let Some((_, waiting)) = self.waiting.remove(&place) else {
                 continue;
             };
-            bytes += waiting.notice.1.len();
+            bytes += waiting.notice.value.as_ref().map_or(0, Bytes::len);
             if let Some(key) = waiting.key.as_ref().and_then(|key| self.dirty.take(key)) {
                 bytes += self.wanted.get(&key).map_or(0, Bytes::len);
                 batch.keys.insert(key);
             }
+            self.under_way.insert(place.clone());
             batch.waiting.push((place, waiting));
         }
         while batch.len() < most
@@ -155,8 +163,13 @@ impl State {
         keys.iter().map(change).collect()
     }
 
-    /// What could not be told goes back to the front; what has come meanwhile is newer.
+    /// What could not be told goes back to the front; what has come meanwhile is newer. What was forgotten meanwhile is
+    /// somebody else's to tell.
     fn put_back(&mut self, batch: Batch) {
+        self.under_way.clear();
+        if batch.cleared != self.cleared {
+            return;
+        }
         self.dirty.extend(batch.keys);
         for (place, waiting) in batch.waiting.into_iter().rev() {
             if !self.waiting.contains_key(&place) {
@@ -226,10 +239,11 @@ impl Speaker {
         self.shared.more.notify_one();
     }
 
-    /// Whether the newest notice of a place still waits.
+    /// Whether the broker has not taken the newest notice of a place yet.
     #[must_use]
     pub fn is_waiting(&self, place: &str) -> bool {
-        self.shared.state.lock().waiting.contains_key(place)
+        let state = self.shared.state.lock();
+        state.waiting.contains_key(place) || state.under_way.contains(place)
     }
 
     /// Has keys of before, which nobody wants any more, looked for and deleted. All that are wanted must have been told.
@@ -240,7 +254,11 @@ impl Speaker {
 
     /// Forgets everything: somebody else tells it from now on.
     pub fn clear(&self) {
-        *self.shared.state.lock() = State::default();
+        let mut state = self.shared.state.lock();
+        *state = State {
+            cleared: state.cleared + 1,
+            ..State::default()
+        };
     }
 
     /// What has happened so far.
@@ -297,6 +315,7 @@ impl Speaker {
             match outlet.deliver(&changes, &messages).await {
                 Ok(()) => {
                     (pause, most) = (PAUSE.0, BATCH);
+                    self.shared.state.lock().under_way.clear();
                     self.shared.keys.fetch_add(changes.len() as u64, Ordering::Relaxed);
                     self.shared.notices.fetch_add(messages.len() as u64, Ordering::Relaxed);
                 }
@@ -305,6 +324,7 @@ impl Speaker {
                     let place = batch.waiting.first().map(|(place, _)| place.as_str());
                     tracing::error!(%error, place, keys = ?batch.keys, "a service is not told of its configuration");
                     self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+                    self.shared.state.lock().under_way.clear();
                 }
                 Err(error) => {
                     tracing::debug!(%error, "services could not be told");
@@ -346,7 +366,7 @@ mod tests {
     use super::super::outlet::OutletError;
     use super::*;
 
-    type Delivered = (Vec<KeyChange>, Vec<(ChannelName, Bytes)>);
+    type Delivered = (Vec<KeyChange>, Vec<KeyedMessage>);
 
     /// A broker that can be away and can lose its keys.
     struct Fake {
@@ -360,13 +380,13 @@ mod tests {
 
     #[async_trait]
     impl Outlet for Fake {
-        async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+        async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
             if !*self.is_up.borrow() {
                 return Err(OutletError::Away("switched off".to_owned()));
             }
             if messages
                 .iter()
-                .any(|(channel, _)| Some(channel.as_str()) == self.refused)
+                .any(|message| Some(message.channel.as_str()) == self.refused)
             {
                 return Err(OutletError::TooLarge { bytes: 1 });
             }
@@ -424,15 +444,17 @@ mod tests {
         Told {
             place: place.to_owned(),
             key: Some((format!("blaze:config:{place}"), Some(Bytes::from(text)))),
-            notice: Some((
-                format!("blaze/config/changed/{place}").parse().unwrap(),
-                Bytes::from(text),
-            )),
+            notice: Some(KeyedMessage {
+                channel: format!("blaze/config/changed/{place}").parse().unwrap(),
+                key: String::new(),
+                value: Some(Bytes::from(text)),
+            }),
         }
     }
 
     fn texts(delivered: &Delivered) -> Vec<Bytes> {
-        delivered.1.iter().map(|(_, text)| text.clone()).collect()
+        let said = delivered.1.iter().filter_map(|message| message.value.clone());
+        said.collect()
     }
 
     #[tokio::test(start_paused = true)]
@@ -497,11 +519,26 @@ mod tests {
         let texts: Vec<_> = left
             .waiting
             .iter()
-            .map(|(_, waiting)| waiting.notice.1.clone())
+            .filter_map(|(_, waiting)| waiting.notice.value.clone())
             .collect();
         assert_eq!(texts, ["2"]);
         assert_eq!(state.changes(&left.keys).len(), 1);
         assert!(state.take(BATCH).is_empty());
+    }
+
+    #[test]
+    fn what_is_under_way_waits_and_does_not_come_back_once_it_is_forgotten() {
+        let speaker = Speaker::default();
+        speaker.tell([told("slam", "1")]);
+        let take = || speaker.shared.state.lock().take(BATCH);
+        let batch = take();
+        assert!(speaker.is_waiting("slam"), "nobody knows whether the broker takes it");
+        speaker.shared.state.lock().put_back(batch);
+        let batch = take();
+        speaker.clear();
+        assert!(!speaker.is_waiting("slam"));
+        speaker.shared.state.lock().put_back(batch);
+        assert!(take().is_empty(), "it is another worker's to tell");
     }
 
     #[test]
