@@ -16,7 +16,7 @@ use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
 use blaze_runtime::{logs, ready_line, say, state};
 use blaze_worker::admin::Shown;
-use blaze_worker::lease::{Lease, RedisLease};
+use blaze_worker::lease;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::{LocalBroker, WorkerSettings};
 use clap::Parser;
@@ -176,18 +176,7 @@ async fn begin(settings: WorkerSettings, file: &NodeFile, supervisor: &Superviso
     let directory = state::state_directory(file.state_dir.as_deref())?;
     let life: u32 = rand::random();
     let worker_id = format!("{}-{life:08x}", settings.node);
-    // On the broker of a node there is one worker; on that of a layer there may be several.
-    let lease = match (&settings.site.node, &keys) {
-        (None, Some(keys)) => {
-            let lease: Arc<dyn Lease> = Arc::new(RedisLease::new(
-                Arc::clone(keys),
-                &settings.site.layer,
-                worker_id.clone(),
-            ));
-            Some(lease)
-        }
-        (Some(_), _) | (None, None) => None,
-    };
+    let lease = lease::open(&settings, keys.as_ref(), &worker_id)?;
     let options = WorkerOptions {
         folder: Some(settings.copy_folder(&directory.path)),
         settings,

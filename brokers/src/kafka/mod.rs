@@ -6,9 +6,9 @@
 //! ```
 //!
 //! A channel is a topic; a message is a record whose headers are the message's header, as text (module `record`). There is no
-//! consumer group: each client reads all partitions at positions of its own. Topics are made by the flow of the layer alone
-//! (module `flow_side`), and those of configurations by its worker (module `worker_side`); what a service publishes before that
-//! waits.
+//! consumer group for messages: each client reads all partitions at positions of its own. Groups share out leases alone (module
+//! `group_lease`). Topics are made by the flow of the layer alone (module `flow_side`), and those of configurations by its worker
+//! (module `worker_side`); what a service publishes before that waits.
 
 mod admin;
 mod bell;
@@ -18,6 +18,8 @@ mod context;
 mod directory;
 mod flow_side;
 mod gate;
+mod group_lease;
+mod group_member;
 mod identity;
 #[cfg(test)]
 mod impostor;
@@ -56,6 +58,8 @@ use crate::port::{
     PublisherOptions, Role, SubscribeOptions, Subscription,
 };
 use crate::worker_side::WorkerSide;
+pub use group_lease::{GroupHeld, GroupLease};
+
 use bell::Bell;
 use clock::BrokerClock;
 use context::LastError;

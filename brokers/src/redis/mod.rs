@@ -17,6 +17,7 @@ mod gate;
 mod kept;
 mod keys;
 mod leases;
+mod lock;
 mod owner;
 mod publisher;
 mod pulse;
@@ -45,6 +46,7 @@ pub use gate::MAX_QUEUE_BYTES;
 pub use kept::{MAX_KEPT_BYTES, MAX_KEPT_WRITERS};
 pub use keys::{KeyChange, KeyError, Record, RedisKeys};
 pub use leases::MAX_LEASES;
+pub use lock::{RedisHeld, RedisLock};
 pub use subscriptions::MAX_CHANNELS;
 
 use crate::open::OpenError;

@@ -31,13 +31,13 @@ use serde_json::Value;
 use tokio::sync::{Notify, watch};
 
 pub use base::{BaseConfiguration, BaseSource};
+pub use blaze_domain::config::AckStatus;
 pub use book::ConfigCounts;
 use book::{ConfigBook, Standing};
 pub(crate) use change::Held;
 pub use change::{ConfigChange, ConfigScope, ConfigSource};
 pub use listeners::ConfigListener;
 use listeners::Listeners;
-pub use wire::AckStatus;
 
 use crate::SdkError;
 use crate::pool::PoolHandle;

@@ -8,6 +8,8 @@
 //! outages  the main service, the broker and the worker away, in turns and together
 //! layer    one worker for a whole layer, on Kafka and on DDS
 //! kafka    what is special to Kafka
+//! leases   the suite of leases on real servers
+//! several  two workers of one layer, of which one is killed, stopped, or ended
 //! ```
 
 #![allow(
@@ -20,6 +22,8 @@
 #[cfg(feature = "kafka")]
 mod kafka;
 mod layer;
+mod leases;
 mod outages;
 mod serving;
+mod several;
 mod stage;

@@ -13,7 +13,7 @@ use blaze_brokers::{
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::{NodeBroker, NodeFile};
-use blaze_tests::process::Process;
+use blaze_tests::process::{Process, Signal};
 use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
 use blaze_tests::wait;
 use bytes::Bytes;
@@ -163,6 +163,27 @@ impl Stage {
         Worker { process, admin }
     }
 
+    /// A worker of the whole layer, ready, beside others; `more` are further sections. Its broker is none that it can reach,
+    /// unless they name another: keys are enough to see who serves.
+    pub(crate) fn layer_worker(&self, node: &str, more: &Value) -> Worker {
+        let mut file = json!({
+            "log": { "level": "debug" },
+            "layer": { "name": "edge", "kind": "edge" },
+            "node": { "name": node },
+            "brokers": { "layer": { "kafka": { "bootstrap": ["127.0.0.1:1"] } } },
+            "admin": { "worker": "127.0.0.1:0" },
+            "config": { "server": format!("http://{}", self.grpc) },
+            "worker": { "state_dir": self.path(node) },
+        });
+        for (name, section) in more.as_object().unwrap() {
+            file[name] = section.clone();
+        }
+        let file = self.write(&format!("{node}.yaml"), &file);
+        let (process, addresses) = launch("blaze-worker", &file).unwrap();
+        let admin = *addresses.get("admin").context("no admin").unwrap();
+        Worker { process, admin }
+    }
+
     /// A request to the main service that must succeed.
     pub(crate) async fn send(&self, method: reqwest::Method, path: &str, body: Option<&Value>) -> Value {
         let mut request = self.http.request(method, format!("http://{}/api/v1{path}", self.rest));
@@ -301,6 +322,19 @@ impl Worker {
     pub(crate) async fn text(&self, path: &str) -> String {
         let url = format!("http://{}{path}", self.admin);
         reqwest::get(url).await.unwrap().text().await.unwrap()
+    }
+
+    pub(crate) fn signal(&self, signal: Signal) {
+        self.process.signal(signal).unwrap();
+    }
+
+    /// Whether it leads; `None`: it does not answer within a tenth of a second.
+    pub(crate) async fn leads(&self) -> Option<bool> {
+        let url = format!("http://{}/v1/status", self.admin);
+        let answer = async { reqwest::get(url).await.ok()?.text().await.ok() };
+        let text = tokio::time::timeout(Duration::from_millis(100), answer).await.ok()??;
+        let status: Value = serde_json::from_str(&text).ok()?;
+        status["leader"].as_bool()
     }
 
     pub(crate) fn kill(mut self) {

@@ -287,6 +287,15 @@ impl Served {
         }
     }
 
+    /// How a place that is told of changes stands, for one that had something with this hash, of which no more is known.
+    #[must_use]
+    pub fn notice_of(&self, place: &Place, previous_hash: Option<String>) -> Option<Notice> {
+        let told = self.places.get(place)?;
+        let hash = told.hash.clone()?;
+        let sources = self.shown.at(&self.site, place)?;
+        Some(self.notice(place, told.revision, previous_hash, None, Some((sources, hash))))
+    }
+
     /// `old` is what the place was told last, as far as it is known.
     fn notice(
         &self,

@@ -147,7 +147,8 @@ impl Engine {
                 key: record_key(place),
                 value: None,
             }),
+            revision: self.served.state().revision(),
         };
-        self.tell(vec![told], Instant::now());
+        self.tell(vec![told]);
     }
 }

@@ -8,7 +8,7 @@ use std::num::NonZeroUsize;
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use blaze_brokers::redis::{KeyChange, KeyError, RedisKeys};
+use blaze_brokers::redis::{KeyChange, KeyError, RedisKeys, RedisLock};
 use blaze_brokers::{
     Broker, BrokerError, Health, KeyedMessage, PublishOutcome, Publisher, PublisherOptions, WorkerSide, WriteError,
 };
@@ -39,6 +39,9 @@ pub enum OutletError {
     /// The broker cannot have such a channel.
     #[error(transparent)]
     Broker(#[from] BrokerError),
+    /// Another worker of the layer leads by now.
+    #[error("another worker has the lease")]
+    Led,
     /// The server of the keys does not do it.
     #[error(transparent)]
     Keys(#[from] KeyError),
@@ -54,7 +57,7 @@ impl OutletError {
                 BrokerError::Name { .. } | BrokerError::Collision { .. } => true,
                 BrokerError::Closed | BrokerError::Away(_) | BrokerError::TooManyChannels(_) => false,
             },
-            Self::Away(_) | Self::Keys(KeyError::Away { .. }) => false,
+            Self::Away(_) | Self::Led | Self::Keys(KeyError::Away { .. }) => false,
         }
     }
 }
@@ -121,6 +124,20 @@ struct Keys {
     client: Arc<RedisKeys>,
     /// It is the broker's own server: keys and notices go in one transaction.
     is_broker: bool,
+    /// The lease, where it lies on the same server: the server changes nothing for whoever has not got it.
+    lock: Option<RedisLock>,
+}
+
+impl Keys {
+    async fn apply(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+        match &self.lock {
+            None => Ok(self.client.apply(changes, messages).await?),
+            Some(lock) => match self.client.apply_if_held(lock, changes, messages).await? {
+                true => Ok(()),
+                false => Err(OutletError::Led),
+            },
+        }
+    }
 }
 
 impl BrokerOutlet {
@@ -146,7 +163,11 @@ impl BrokerOutlet {
         is_broker: bool,
         is_own: impl Fn(&[u8]) -> bool + Send + Sync + 'static,
     ) -> Self {
-        self.keys = Some(Keys { client, is_broker });
+        self.keys = Some(Keys {
+            client,
+            is_broker,
+            lock: None,
+        });
         self.is_own = Box::new(is_own);
         self
     }
@@ -155,6 +176,15 @@ impl BrokerOutlet {
     #[must_use]
     pub fn makes_channels(&self) -> bool {
         self.side.is_some()
+    }
+
+    /// The same for one of several workers, whose lease lies on the Redis of the keys.
+    #[must_use]
+    pub fn while_held(mut self, lock: Option<RedisLock>) -> Self {
+        if let Some(keys) = &mut self.keys {
+            keys.lock = lock;
+        }
+        self
     }
 
     /// Publishes one message, now. What a broker that is away does not take is dropped: whoever asked asks again.
@@ -201,10 +231,9 @@ impl Outlet for BrokerOutlet {
         match &self.keys {
             Some(keys) if keys.is_broker => {
                 let messages: Vec<_> = said(messages).map(|(to, text)| (to.clone(), text.clone())).collect();
-                keys.client.apply(changes, &messages).await?;
-                return Ok(());
+                return keys.apply(changes, &messages).await;
             }
-            Some(keys) => keys.client.apply(changes, &[]).await?,
+            Some(keys) => keys.apply(changes, &[]).await?,
             None => {}
         }
         if messages.is_empty() {
