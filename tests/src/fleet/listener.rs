@@ -38,7 +38,7 @@ impl Listener {
     /// # Errors
     /// When the worker gives it none in time.
     pub async fn start(worker: &Worker, service: &str, instance: &str, limit: Duration) -> anyhow::Result<Self> {
-        let broker = Arc::clone(worker.broker());
+        let broker = worker.open_broker()?;
         let options = ServiceOptions::new(worker.layer().clone(), service.parse()?, broker, worker.scope());
         let options = ServiceOptions {
             instance: instance.parse()?,

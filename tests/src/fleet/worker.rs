@@ -11,6 +11,7 @@ use blaze_brokers::{Broker, Role, open_layer, open_node};
 use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
 use blaze_domain::{LayerName, NodeName, Scope};
 use blaze_runtime::Supervisor;
+use blaze_worker::lease;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::{LocalBroker, WorkerSettings};
 use serde_json::{Value, json};
@@ -104,10 +105,29 @@ pub struct Standing {
 pub struct Worker {
     running: RunningWorker,
     supervisor: Supervisor,
-    broker: Arc<dyn Broker>,
+    place: Place,
     layer: LayerName,
     node: NodeName,
-    scope: Scope,
+}
+
+/// Where services are.
+struct Place {
+    /// The server of a memory broker.
+    hub: MemoryHub,
+    section: LocalBroker,
+}
+
+impl Place {
+    /// A client of its own.
+    fn open(&self, role: &Role) -> anyhow::Result<Arc<dyn Broker>> {
+        Ok(match &self.section {
+            LocalBroker::Node(NodeBroker::Memory) | LocalBroker::Layer(LayerBroker::Memory) => {
+                Arc::new(self.hub.broker())
+            }
+            LocalBroker::Node(section) => open_node(section, role)?,
+            LocalBroker::Layer(section) => open_layer(section, role)?,
+        })
+    }
 }
 
 impl Worker {
@@ -122,35 +142,30 @@ impl Worker {
         };
         let (file, _) = NodeFile::read(&spec.node_file()).map_err(faults)?;
         let settings = WorkerSettings::of(&file).map_err(faults)?;
-        let (broker, scope): (Arc<dyn Broker>, Scope) = match &settings.broker {
-            LocalBroker::Node(NodeBroker::Memory) => {
-                (Arc::new(MemoryHub::new(spec.node.as_str()).broker()), Scope::Node)
-            }
-            LocalBroker::Layer(LayerBroker::Memory) => {
-                (Arc::new(MemoryHub::new(spec.node.as_str()).broker()), Scope::Layer)
-            }
-            LocalBroker::Node(section) => (open_node(section, &Role::Service)?, Scope::Node),
-            LocalBroker::Layer(section) => (open_layer(section, &Role::Service)?, Scope::Layer),
+        let place = Place {
+            hub: MemoryHub::new(spec.node.as_str()),
+            section: settings.broker.clone(),
         };
+        let broker = place.open(&Role::Worker)?;
         let keys = settings.keys.as_ref().map(RedisKeys::open).transpose()?.map(Arc::new);
         let (layer, node) = (settings.site.layer.clone(), settings.node.clone());
+        let worker_id = format!("{node}-{:08x}", rand::random::<u32>());
         let options = WorkerOptions {
-            worker_id: format!("{node}-{:08x}", rand::random::<u32>()),
+            lease: lease::open(&settings, keys.as_ref(), &worker_id)?,
+            worker_id,
             settings,
-            broker: Arc::clone(&broker),
+            broker,
             keys,
             folder: spec.folder.clone(),
-            lease: None,
         };
         let supervisor = Supervisor::new(node.to_string());
         let running = RunningWorker::start(options, &supervisor).await?;
         Ok(Self {
             running,
             supervisor,
-            broker,
+            place,
             layer,
             node,
-            scope,
         })
     }
 
@@ -160,10 +175,12 @@ impl Worker {
         &self.running
     }
 
-    /// The broker that it serves.
-    #[must_use]
-    pub fn broker(&self) -> &Arc<dyn Broker> {
-        &self.broker
+    /// A connection of a service to the broker that it serves.
+    ///
+    /// # Errors
+    /// When there can be none.
+    pub fn open_broker(&self) -> anyhow::Result<Arc<dyn Broker>> {
+        self.place.open(&Role::Service)
     }
 
     /// Its layer.
@@ -181,7 +198,10 @@ impl Worker {
     /// How far its broker reaches.
     #[must_use]
     pub fn scope(&self) -> Scope {
-        self.scope
+        match &self.place.section {
+            LocalBroker::Node(_) => Scope::Node,
+            LocalBroker::Layer(_) => Scope::Layer,
+        }
     }
 
     /// How it stands now.

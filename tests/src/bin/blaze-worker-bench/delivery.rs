@@ -2,10 +2,12 @@
 
 use std::ops::RangeInclusive;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use blaze_brokers::{Broker, Content, PublisherOptions, SubscribeOptions, Subscription};
+use blaze_brokers::{Broker, Content, Publisher, PublisherOptions, SubscribeOptions, Subscription};
+use blaze_domain::names::ChannelName;
 use blaze_tests::fleet::Written;
 use bytes::Bytes;
 use serde::Serialize;
@@ -93,7 +95,7 @@ pub(crate) async fn run(parent: &Path, plan: &Plan) -> anyhow::Result<Vec<Row>> 
     let worker = fleet.taken_per_worker()?;
     fleet.start_listeners().await?;
     let with_service = fleet.taken_per_worker()?;
-    let mut plain = Plain::new(fleet.workers[0].broker().as_ref()).await?;
+    let mut plain = Plain::new(fleet.workers[0].open_broker()?, plan.broker).await?;
     let mut rows = Vec::new();
     for whom in [Whom::One, Whom::All] {
         let mut times = Times::default();
@@ -189,19 +191,25 @@ fn since(written: &Written, heard: Instant) -> Duration {
 
 /// A message that nobody but this program knows of.
 struct Plain {
-    publisher: std::sync::Arc<dyn blaze_brokers::Publisher>,
+    publisher: Arc<dyn Publisher>,
     subscription: Subscription,
     count: u64,
+    _broker: Arc<dyn Broker>,
 }
 
 impl Plain {
-    async fn new(broker: &dyn Broker) -> anyhow::Result<Self> {
-        let channel = "bench/plain".parse()?;
+    async fn new(broker: Arc<dyn Broker>, kind: BrokerKind) -> anyhow::Result<Self> {
+        let channel = match kind {
+            BrokerKind::Redis => "bench/plain".parse()?,
+            // Channels must be made there; services leave alone what is no answer to them.
+            BrokerKind::Kafka => ChannelName::shared_reply(),
+        };
         let subscription = broker.subscribe(&channel, SubscribeOptions::default()).await?;
         Ok(Self {
             publisher: broker.publisher(&channel, PublisherOptions::default())?,
             subscription,
             count: 0,
+            _broker: broker,
         })
     }
 
