@@ -1,9 +1,11 @@
 //! What end-to-end tests stand on: real processes and servers, emulated networks, faults, and waits on conditions.
 
 pub mod admin;
+pub mod fleet;
 pub mod flow;
 mod guard;
 pub mod ledger;
+pub mod machine;
 pub mod network;
 #[cfg(feature = "kafka")]
 pub mod plain;

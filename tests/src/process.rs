@@ -60,10 +60,25 @@ pub fn cpu_time(id: u32) -> anyhow::Result<Duration> {
     Ok(Duration::from_secs_f64((ticks(11)? + ticks(12)?) / TICKS_PER_S))
 }
 
+/// What a process holds of the machine now; `None` when there is no such process.
+#[must_use]
+pub fn usage(id: u32) -> Option<Usage> {
+    let status = std::fs::read_to_string(format!("/proc/{id}/status")).ok()?;
+    let number = |name: &str| {
+        let line = status.lines().find(|line| line.starts_with(name))?;
+        line.split_whitespace().nth(1)?.parse::<u64>().ok()
+    };
+    Some(Usage {
+        resident_kib: number("VmRSS:")?,
+        threads: number("Threads:")?,
+        descriptors: std::fs::read_dir(format!("/proc/{id}/fd")).ok()?.count() as u64,
+    })
+}
+
 type Lines = Arc<Mutex<Vec<String>>>;
 
 /// What a process holds of its machine.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct Usage {
     /// Resident memory in KiB.
     pub resident_kib: u64,
@@ -234,17 +249,7 @@ impl Process {
     /// What it holds of the machine now; `None` when it does not run.
     #[must_use]
     pub fn usage(&self) -> Option<Usage> {
-        let id = self.child.id();
-        let status = std::fs::read_to_string(format!("/proc/{id}/status")).ok()?;
-        let number = |name: &str| {
-            let line = status.lines().find(|line| line.starts_with(name))?;
-            line.split_whitespace().nth(1)?.parse::<u64>().ok()
-        };
-        Some(Usage {
-            resident_kib: number("VmRSS:")?,
-            threads: number("Threads:")?,
-            descriptors: std::fs::read_dir(format!("/proc/{id}/fd")).ok()?.count() as u64,
-        })
+        usage(self.child.id())
     }
 
     /// Whether it still runs.

@@ -51,6 +51,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "blaze-flow",
             "blaze-sdk",
             "blaze-auth",
+            "blaze-worker",
         ],
     ),
 ];

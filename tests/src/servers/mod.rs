@@ -25,6 +25,7 @@ pub use kafka::{KafkaOptions, KafkaServer};
 pub use mongo::{
     MongoOptions, MongoServer, abandon_mongo_transaction, drop_mongo_database, mongo_command, mongo_insert,
 };
+pub use ports::free as free_port;
 pub use redis::{RedisKind, RedisOptions, RedisServer};
 pub use shared::{address, shared_kafka, shared_kafka_cloud, shared_mongo, shared_redis, shared_valkey};
 

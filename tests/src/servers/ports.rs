@@ -13,7 +13,7 @@ const COUNT: u32 = 12_000;
 ///
 /// # Errors
 /// When none of the ports from 20000 to 31999 is free.
-pub(super) fn free() -> anyhow::Result<u16> {
+pub fn free() -> anyhow::Result<u16> {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let seed = std::process::id().wrapping_mul(7919);
     for _ in 0..COUNT {

@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! store(update) ──▶ slot of the database ──▶ task ──▶ advance, or replace after a failure
-//!               └─▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time
+//!               └─▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time, and once a second
+//!                                                      at most while the database has everything
 //! ```
 //!
 //! A slot holds one update: a newer one is merged into it and counted. So whoever stores never waits, a copy that is slow or
@@ -11,25 +12,26 @@
 use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use blaze_domain::config::Key;
 use blaze_domain::config::state::State;
 use blaze_runtime::{Supervisor, TaskPolicy};
-use parking_lot::Mutex;
-use tokio::sync::{Notify, watch};
 use tokio::time::Instant;
 
+use super::slot::{Next, Slot};
 use super::{CopyError, Loaded, LocalCopy, Notes, Position};
 
-/// Keys that a slot remembers as changed; beyond that everything is written.
-const MAX_KEYS: usize = 10_000;
 /// Bounds of the pause after a failure; the pause is drawn from zero to the bound, which doubles.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(30));
 /// A copy that always writes everything rests this many times as long as the write took, between these bounds.
 const REST: u32 = 4;
 const REST_BOUNDS: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(10));
+
+/// It rests at least so long while another copy holds everything, and so may be this old when that one is lost: to write all documents for each change of one wears out
+/// flash memory, and is most of what a change costs a worker that it does not concern.
+const REST_BESIDE: Duration = Duration::from_secs(1);
 
 /// Where only the time of the position moves on, such a copy is written again when it is this old.
 const MAX_AGE: Duration = Duration::from_secs(300);
@@ -92,18 +94,22 @@ impl Copies {
     /// Starts one task per copy. `notes` are those that the copies were started from.
     #[must_use]
     pub fn start(supervisor: &Supervisor, targets: Vec<Target>, notes: &Arc<Notes>) -> Self {
-        let slots = targets.into_iter().map(|target| {
-            let slot = Arc::new(Slot::new(target.copy.describe(), notes));
-            let (stop, writer) = (supervisor.shutdown_token(), Writer::new(target, Arc::clone(&slot)));
-            supervisor.spawn(format!("copy to {}", slot.place), TaskPolicy::Essential, async move {
+        let slot = |target: &Target| Arc::new(Slot::new(target.copy.describe(), notes));
+        let slots: Arc<[Arc<Slot>]> = targets.iter().map(slot).collect();
+        for (target, slot) in targets.into_iter().zip(&*slots) {
+            let name = format!("copy to {}", slot.place);
+            let (stop, writer) = (
+                supervisor.shutdown_token(),
+                Writer::new(target, Arc::clone(slot), Arc::clone(&slots)),
+            );
+            supervisor.spawn(name, TaskPolicy::Essential, async move {
                 tokio::select! {
                     () = writer.run() => {}
                     () = stop.cancelled() => {}
                 }
             });
-            slot
-        });
-        Self { slots: slots.collect() }
+        }
+        Self { slots }
     }
 
     /// Has a state written to every copy, when it can be. Never waits.
@@ -113,9 +119,14 @@ impl Copies {
         }
     }
 
-    /// Waits until every copy holds what was stored before, at most so long. Gives whether they do.
+    /// Waits until every copy holds what was stored before, at most so long. Gives whether they do. Those that rest are woken.
     pub async fn flush(&self, limit: Duration) -> bool {
         let all = async {
+            for slot in &*self.slots {
+                if !slot.is_current() {
+                    slot.hurry.notify_one();
+                }
+            }
             for slot in &*self.slots {
                 let stored = slot.stored.load(Ordering::Acquire);
                 // The sender lives as long as the slot.
@@ -138,123 +149,12 @@ impl fmt::Debug for Copies {
     }
 }
 
-/// What waits for one copy.
-struct Slot {
-    place: String,
-    waiting: Mutex<Waiting>,
-    wake: Notify,
-    /// Updates that were stored.
-    stored: AtomicU64,
-    /// Of these, how many the copy holds.
-    done: watch::Sender<u64>,
-    written: AtomicU64,
-    failed: AtomicU64,
-    coalesced: AtomicU64,
-    error: Mutex<Option<String>>,
-}
-
-struct Waiting {
-    next: Option<Next>,
-    /// The newest, for a write of everything.
-    notes: Arc<Notes>,
-}
-
-/// One write that is to be done.
-struct Next {
-    /// How many updates are in it, with all before.
-    number: u64,
-    position: Position,
-    state: State,
-    notes: Arc<Notes>,
-    have_notes_changed: bool,
-    /// None: everything.
-    keys: Option<BTreeSet<Key>>,
-}
-
-impl Next {
-    fn merge_keys(&mut self, changed: &Changed) {
-        match (changed, &mut self.keys) {
-            (Changed::Keys(new), Some(keys)) => keys.extend(new.iter().cloned()),
-            (Changed::All, keys) => *keys = None,
-            (Changed::Keys(_), None) => {}
-        }
-        if self.keys.as_ref().is_some_and(|keys| keys.len() > MAX_KEYS) {
-            self.keys = None;
-        }
-    }
-}
-
-impl Slot {
-    fn new(place: String, notes: &Arc<Notes>) -> Self {
-        Self {
-            place,
-            waiting: Mutex::new(Waiting {
-                next: None,
-                notes: Arc::clone(notes),
-            }),
-            wake: Notify::new(),
-            stored: AtomicU64::new(0),
-            done: watch::Sender::new(0),
-            written: AtomicU64::new(0),
-            failed: AtomicU64::new(0),
-            coalesced: AtomicU64::new(0),
-            error: Mutex::new(None),
-        }
-    }
-
-    fn put(&self, update: &Update) {
-        let mut waiting = self.waiting.lock();
-        if let Some(notes) = &update.notes {
-            waiting.notes = Arc::clone(notes);
-        }
-        let before = waiting.next.take();
-        if before.is_some() {
-            self.coalesced.fetch_add(1, Ordering::Relaxed);
-        }
-        let (keys, had_notes) = before.map_or((Some(BTreeSet::new()), false), |next| {
-            (next.keys, next.have_notes_changed)
-        });
-        let mut next = Next {
-            number: self.stored.fetch_add(1, Ordering::AcqRel) + 1,
-            position: update.position.clone(),
-            state: update.state.clone(),
-            notes: Arc::clone(&waiting.notes),
-            have_notes_changed: had_notes || update.notes.is_some(),
-            keys,
-        };
-        next.merge_keys(&update.changed);
-        waiting.next = Some(next);
-        drop(waiting);
-        self.wake.notify_one();
-    }
-
-    /// A write that failed waits again, unless a newer one does: that one is then to write everything anyway.
-    fn put_back(&self, next: Next) {
-        let mut waiting = self.waiting.lock();
-        if waiting.next.is_some() {
-            self.coalesced.fetch_add(1, Ordering::Relaxed);
-        } else {
-            waiting.next = Some(next);
-        }
-    }
-
-    fn counts(&self) -> Counts {
-        let number = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        Counts {
-            place: self.place.clone(),
-            written: number(&self.written),
-            failed: number(&self.failed),
-            coalesced: number(&self.coalesced),
-            is_current: *self.done.borrow() >= self.stored.load(Ordering::Acquire),
-            error: self.error.lock().clone(),
-        }
-    }
-}
-
 /// The task of one copy.
 struct Writer {
     copy: Arc<dyn LocalCopy>,
     slot: Arc<Slot>,
+    /// Of all copies, this one too.
+    all: Arc<[Arc<Slot>]>,
     /// The copy holds what the next update is counted from.
     is_current: bool,
     failures: u32,
@@ -263,10 +163,11 @@ struct Writer {
 }
 
 impl Writer {
-    fn new(target: Target, slot: Arc<Slot>) -> Self {
+    fn new(target: Target, slot: Arc<Slot>, all: Arc<[Arc<Slot>]>) -> Self {
         Self {
             copy: target.copy,
             slot,
+            all,
             is_current: target.is_current,
             failures: 0,
             written: None,
@@ -280,7 +181,10 @@ impl Writer {
                 None => self.slot.wake.notified().await,
                 Some(next) => {
                     let pause = self.write_one(next).await;
-                    tokio::time::sleep(pause).await;
+                    tokio::select! {
+                        () = tokio::time::sleep(pause) => {}
+                        () = self.slot.hurry.notified() => {}
+                    }
                 }
             }
         }
@@ -300,7 +204,7 @@ impl Writer {
                 self.succeeded(next.number);
                 self.written = Some(next.position);
                 if self.copy.writes_whole() {
-                    (began.elapsed() * REST).clamp(REST_BOUNDS.0, REST_BOUNDS.1)
+                    self.rest_after(began.elapsed())
                 } else {
                     Duration::ZERO
                 }
@@ -309,6 +213,17 @@ impl Writer {
                 self.slot.put_back(next);
                 self.failed(&error)
             }
+        }
+    }
+
+    /// How long a copy rests that always writes everything.
+    fn rest_after(&self, taken: Duration) -> Duration {
+        let rest = (taken * REST).clamp(REST_BOUNDS.0, REST_BOUNDS.1);
+        let mut others = self.all.iter().filter(|slot| !Arc::ptr_eq(slot, &self.slot));
+        if others.any(|slot| slot.is_current()) {
+            rest.max(REST_BESIDE)
+        } else {
+            rest
         }
     }
 

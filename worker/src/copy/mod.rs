@@ -40,6 +40,7 @@ mod notes;
 mod progress;
 #[cfg(test)]
 mod samples;
+mod slot;
 mod sqlite;
 mod sqlite_database;
 mod start;

@@ -7,6 +7,7 @@
 
 use std::sync::Arc;
 use std::sync::OnceLock;
+use std::time::Duration;
 
 use blaze_domain::config::placement::placement;
 use blaze_domain::config::state::{Held, State};
@@ -36,6 +37,8 @@ const PART_BYTES: usize = 512 * 1024;
 const OVERHEAD_BYTES: usize = 512;
 /// Snapshots that are on their way at once: after an outage everybody wants one, and users are to be answered meanwhile.
 pub(super) const SNAPSHOTS: usize = 8;
+/// Whoever has waited for its turn so long gets its snapshot beside the others: some of those may read slowly, or not at all.
+const TURN: Duration = Duration::from_secs(2);
 /// When a worker is told to come again: not all at once.
 const AGAIN_MS: std::ops::Range<u32> = 100..2000;
 /// Name of a worker, in bytes.
@@ -253,7 +256,8 @@ impl ConfigService {
         let room = Arc::clone(&self.inner.snapshots);
         let begin = async move {
             // It is never closed.
-            let place = room.acquire_owned().await.ok();
+            let place = tokio::time::timeout(TURN, room.acquire_owned()).await;
+            let place = place.ok().and_then(Result::ok);
             let seen = state
                 .all()
                 .filter(|(_, held)| placement(&state, &held.document).visible.contains(&layer))

@@ -287,6 +287,22 @@ async fn a_slow_worker_misses_nothing() {
 }
 
 #[tokio::test]
+async fn workers_that_do_not_read_on_keep_nobody_from_its_snapshot() {
+    const AT_ONCE: usize = 8;
+    let w = world().await;
+    w.robot().await;
+    let mut stuck = Vec::new();
+    for _ in 0..AT_ONCE {
+        let mut worker = w.worker(hello("edge", 0, "")).await;
+        assert!(matches!(worker.items.next().await, Some(SyncItem::Snapshot { .. })));
+        stuck.push(worker);
+    }
+    let mut next = w.worker(hello("edge", 0, "")).await;
+    next.until(1).await;
+    assert_eq!(next.documents.len(), 4);
+}
+
+#[tokio::test]
 async fn what_a_worker_has_is_known_while_it_is_here_and_after() {
     let w = world().await;
     w.robot().await;

@@ -18,7 +18,6 @@ mod documents;
 mod fan_out;
 mod figures;
 mod load;
-mod machine;
 mod report;
 mod subject;
 mod watches;
@@ -42,6 +41,8 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use blaze_tests::machine;
+use blaze_tests::servers::EtcdServer;
 use clap::Parser;
 
 use clients::Way;
@@ -161,7 +162,7 @@ fn main() -> anyhow::Result<ExitCode> {
         .prefix("blaze-config-bench-")
         .tempdir_in(&parent)
         .with_context(|| format!("a folder in {}", parent.display()))?;
-    let mut report = Report::new(machine::describe(folder.path())?);
+    let mut report = Report::new(machine::describe(folder.path())?, EtcdServer::version()?);
     report.print_machine();
 
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;

@@ -2,19 +2,17 @@
 
 use std::path::Path;
 
+use blaze_tests::machine::Machine;
 use serde::Serialize;
 
 use super::figures::{Bar, Row};
-use super::machine::Machine;
 use super::subject::Subject;
-
-/// Load of a machine that does nothing else.
-const IDLE: f64 = 0.5;
 
 /// All that a run found.
 #[derive(Serialize)]
 pub(crate) struct Report {
     machine: Machine,
+    etcd: String,
     memory: Vec<Memory>,
     rows: Vec<Row>,
 }
@@ -42,38 +40,19 @@ struct Median {
 }
 
 impl Report {
-    pub(crate) fn new(machine: Machine) -> Self {
+    pub(crate) fn new(machine: Machine, etcd: String) -> Self {
         Self {
             machine,
+            etcd,
             memory: Vec::new(),
             rows: Vec::new(),
         }
     }
 
     pub(crate) fn print_machine(&self) {
-        let machine = &self.machine;
-        println!(
-            "{} x {}, {} MiB; data on {}, 4 KiB written and synced in {:.2} ms; {}",
-            machine.processors,
-            machine.processor,
-            machine.memory_mib,
-            machine.file_system,
-            machine.sync_ms,
-            machine.etcd
-        );
-        if machine.load_average > IDLE {
-            println!(
-                "NOTE: others use this machine (load {:.1}): figures mean little",
-                machine.load_average
-            );
-        }
-        if machine.in_memory {
-            println!(
-                "NOTE: this file system is in memory, where syncing costs nothing: choose another one with --data"
-            );
-        }
-        if !machine.optimised {
-            println!("NOTE: built without optimisation: figures of blaze mean little");
+        println!("{}; {}", self.machine, self.etcd);
+        for remark in self.machine.remarks() {
+            println!("NOTE: {remark}");
         }
     }
 

@@ -1,4 +1,4 @@
-//! Where it was measured.
+//! Where something was measured: figures depend on it.
 
 use std::fs::File;
 use std::io::{Seek as _, Write as _};
@@ -6,38 +6,42 @@ use std::path::Path;
 use std::time::Instant;
 
 use anyhow::Context as _;
-use blaze_tests::servers::EtcdServer;
 use serde::Serialize;
 
 /// File systems that keep nothing on a disk.
 const IN_MEMORY: [&str; 2] = ["tmpfs", "ramfs"];
+/// Load of a machine that does nothing else.
+const IDLE: f64 = 0.5;
 /// Writes that are synced to see what that costs.
 const SYNCS: usize = 50;
 const BLOCK: [u8; 4096] = [7; 4096];
 
 /// What figures depend on.
 #[derive(Debug, Clone, Serialize)]
-pub(crate) struct Machine {
-    pub(crate) processor: String,
-    pub(crate) processors: usize,
-    pub(crate) memory_mib: u64,
-    pub(crate) file_system: String,
+pub struct Machine {
+    /// Its name.
+    pub processor: String,
+    /// How many of them this process may use.
+    pub processors: usize,
+    /// Of the whole machine.
+    pub memory_mib: u64,
+    /// Type of the file system that data is on.
+    pub file_system: String,
     /// Whether all data is lost with the power: then writes mean nothing.
-    pub(crate) in_memory: bool,
+    pub in_memory: bool,
     /// To write 4 KiB in place and sync them, at the median.
-    pub(crate) sync_ms: f64,
-    pub(crate) etcd: String,
+    pub sync_ms: f64,
     /// Programs that wanted a processor in the minute before.
-    pub(crate) load_average: f64,
+    pub load_average: f64,
     /// Whether this program, and so the rest of the workspace beside it, was built with optimisation.
-    pub(crate) optimised: bool,
+    pub optimised: bool,
 }
 
 /// Looks at the machine and at the disk of a folder.
 ///
 /// # Errors
-/// When the folder cannot be written, or etcd is not installed.
-pub(crate) fn describe(folder: &Path) -> anyhow::Result<Machine> {
+/// When the folder cannot be written.
+pub fn describe(folder: &Path) -> anyhow::Result<Machine> {
     let processor = value_of("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".to_owned());
     let memory = value_of("/proc/meminfo", "MemTotal").unwrap_or_default();
     let memory_kib: u64 = memory.trim_end_matches(" kB").parse().unwrap_or(0);
@@ -51,10 +55,42 @@ pub(crate) fn describe(folder: &Path) -> anyhow::Result<Machine> {
         file_system: file_system.to_owned(),
         in_memory: IN_MEMORY.contains(&file_system),
         sync_ms: sync_ms(&folder)?,
-        etcd: EtcdServer::version()?,
         load_average: load_average().unwrap_or_default(),
         optimised: !cfg!(debug_assertions),
     })
+}
+
+impl Machine {
+    /// What makes the figures mean little, in whole sentences.
+    #[must_use]
+    pub fn remarks(&self) -> Vec<String> {
+        let mut remarks = Vec::new();
+        if self.load_average > IDLE {
+            remarks.push(format!(
+                "others use this machine (load {:.1}): figures mean little",
+                self.load_average
+            ));
+        }
+        if self.in_memory {
+            remarks.push(
+                "this file system is in memory, where syncing costs nothing: choose another one with --data".to_owned(),
+            );
+        }
+        if !self.optimised {
+            remarks.push("built without optimisation: figures of blaze mean little".to_owned());
+        }
+        remarks
+    }
+}
+
+impl std::fmt::Display for Machine {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "{} x {}, {} MiB; data on {}, 4 KiB written and synced in {:.2} ms",
+            self.processors, self.processor, self.memory_mib, self.file_system, self.sync_ms
+        )
+    }
 }
 
 fn load_average() -> Option<f64> {
