@@ -27,6 +27,7 @@ use crate::core::Site;
 use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
 use crate::hearing::{ACK, GET, WATCHDOG, listen, notice_deafness, scan};
 use crate::lease::{self, Lease};
+use crate::own::{OwnConfig, say_again};
 use crate::serve::{BrokerOutlet, Speaker, SpeakerCounts};
 use crate::settings::WorkerSettings;
 use crate::sync::{MainService, follow};
@@ -60,6 +61,7 @@ pub struct RunningWorker {
     lease: Option<Arc<dyn Lease>>,
     lease_over: CancellationToken,
     main: watch::Sender<MainService>,
+    own: OwnConfig,
 }
 
 impl RunningWorker {
@@ -132,7 +134,9 @@ impl RunningWorker {
                 }
             });
         };
-        let engine = Engine::new(identity, outputs, start.loaded);
+        let (own, said_of_own, own_acks) = OwnConfig::new(&settings.node)?;
+        spawn("own state", Box::pin(say_again(own_acks, said.clone())));
+        let engine = Engine::new(identity, outputs, start.loaded).with_own(said_of_own);
         spawn("engine", Box::pin(engine.run(inputs, stop.clone())));
         spawn("notices", Box::pin(speaker.clone().run(outlet)));
         spawn(
@@ -179,6 +183,7 @@ impl RunningWorker {
             lease,
             lease_over,
             main: main_sender,
+            own,
         })
     }
 
@@ -207,6 +212,12 @@ impl RunningWorker {
         if is_another {
             self.main.send_replace(main);
         }
+    }
+
+    /// Its own configuration.
+    #[must_use]
+    pub fn own(&self) -> &OwnConfig {
+        &self.own
     }
 
     /// Leaves everything as the next life wants to find it: copies that are up to date, no lease.

@@ -12,6 +12,7 @@
 
 mod ask;
 mod hear;
+mod own;
 mod status;
 mod tell;
 #[cfg(test)]
@@ -38,6 +39,7 @@ use crate::serve::{Speaker, Told};
 use crate::sync::SyncEvent;
 
 pub use hear::Sign;
+pub use own::Own;
 pub use status::Status;
 
 /// Within this time several changes may become one notice.
@@ -176,6 +178,8 @@ pub struct Engine {
     /// What was told, or would have been if this worker were the leader, a short while ago.
     recent: VecDeque<(Instant, Told)>,
     defaults_problem: Option<String>,
+    /// The worker's own configuration.
+    own: Option<Own>,
     counts: Counts,
 }
 
@@ -208,6 +212,7 @@ impl Engine {
             unnoted: BTreeMap::new(),
             recent: VecDeque::new(),
             defaults_problem: None,
+            own: None,
             counts: Counts::default(),
             identity,
             outputs,

@@ -109,6 +109,7 @@ impl Engine {
         if is_first && self.is_leader {
             self.outputs.speaker.sweep_keys();
         }
+        self.tell_own();
         // After the notices: only what was told can go well or badly.
         self.follow_rollouts();
         if self.served.has_pending() {
