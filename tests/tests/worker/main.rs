@@ -6,6 +6,8 @@
 //! stage    a main service, a Redis and workers of one layer
 //! serving  what services are told, and whether only those it concerns
 //! outages  the main service, the broker and the worker away, in turns and together
+//! flow     BlazeFlow's own settings: what counts, what is refused, who else hears
+//! flow_live  the same while messages flow, in a roll-out, and whatever starts first
 //! ```
 
 #![allow(
@@ -15,6 +17,8 @@
     reason = "the helpers of a test fail like the test"
 )]
 
+mod flow;
+mod flow_live;
 mod outages;
 mod serving;
 mod stage;
