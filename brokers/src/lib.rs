@@ -13,9 +13,11 @@ mod open;
 mod outbox;
 pub mod port;
 pub mod redis;
+mod worker_side;
 
 pub use open::{OpenError, check_layer, open_layer, open_node};
 pub use port::{
     Begin, Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, Place, PublishOutcome,
     Publisher, PublisherOptions, Received, Role, SubscribeOptions, Subscription, SubscriptionSender, subscription,
 };
+pub use worker_side::{KeyedMessage, WorkerSide, WriteError};

@@ -22,6 +22,8 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
+use crate::worker_side::WorkerSide;
+
 /// Which message system an adapter speaks to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum BrokerKind {
@@ -355,6 +357,12 @@ pub trait Broker: Send + Sync + 'static {
         None
     }
 
+    /// What only a worker of BlazeConfig does on its broker; absent where the client is somebody else's, or where a channel
+    /// is there as soon as it is used (Redis, memory).
+    fn worker_side(&self) -> Option<Arc<dyn WorkerSide>> {
+        None
+    }
+
     /// Delivers what was taken, as far as the server takes it within a second, then closes all subscriptions.
     async fn close(&self);
 }
@@ -371,6 +379,8 @@ pub enum Role {
         /// Its life: larger is newer.
         epoch: u64,
     },
+    /// A worker of BlazeConfig: it makes the channels on which services ask and are told, and disturbs no flow.
+    Worker,
 }
 
 /// What only the flow of a scope does on its broker, beside messages. Nothing here waits but reading leases.

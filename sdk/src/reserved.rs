@@ -2,7 +2,9 @@
 
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Broker, BrokerError, BrokerKind, Content, Received, SubscribeOptions, Subscription};
+use blaze_brokers::{
+    Broker, BrokerError, BrokerKind, Content, PublisherOptions, Received, SubscribeOptions, Subscription,
+};
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 use tokio::time::sleep_until;
@@ -20,6 +22,15 @@ pub(crate) fn reply_channel(kind: BrokerKind, own: ChannelName) -> ChannelName {
     match kind {
         BrokerKind::Memory | BrokerKind::Redis => own,
         BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => ChannelName::shared_reply(),
+    }
+}
+
+/// How a service speaks there. What is lost is said again, so only DDS is asked to repair it: there, whoever listens reliably
+/// does not hear who speaks otherwise.
+pub(crate) fn speaking(kind: BrokerKind) -> PublisherOptions {
+    PublisherOptions {
+        reliable: matches!(kind, BrokerKind::Dds | BrokerKind::Ros2),
+        ..PublisherOptions::default()
     }
 }
 

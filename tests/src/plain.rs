@@ -55,6 +55,18 @@ impl KafkaReader {
     /// # Errors
     /// When the topic is not there within ten seconds.
     pub fn from_end(bootstrap: &str, topic: &str) -> anyhow::Result<Self> {
+        Self::open(bootstrap, topic, |_, end| end)
+    }
+
+    /// Reads a topic from what it still has, once it is there.
+    ///
+    /// # Errors
+    /// As [`KafkaReader::from_end`].
+    pub fn from_beginning(bootstrap: &str, topic: &str) -> anyhow::Result<Self> {
+        Self::open(bootstrap, topic, |beginning, _| beginning)
+    }
+
+    fn open(bootstrap: &str, topic: &str, start: fn(i64, i64) -> i64) -> anyhow::Result<Self> {
         let consumer: BaseConsumer = client(bootstrap)
             .set("group.id", "plain")
             .set("enable.auto.commit", "false")
@@ -63,15 +75,15 @@ impl KafkaReader {
             .set("reconnect.backoff.max.ms", "200")
             .create()?;
         let until = Instant::now() + Duration::from_secs(10);
-        let end = loop {
+        let offset = loop {
             match consumer.fetch_watermarks(topic, 0, Duration::from_secs(2)) {
-                Ok((_, end)) => break end,
+                Ok((beginning, end)) => break start(beginning, end),
                 Err(error) if Instant::now() > until => return Err(error).context(topic.to_owned()),
                 Err(_) => std::thread::sleep(Duration::from_millis(20)),
             }
         };
         let mut partitions = TopicPartitionList::new();
-        partitions.add_partition_offset(topic, 0, Offset::Offset(end))?;
+        partitions.add_partition_offset(topic, 0, Offset::Offset(offset))?;
         consumer.assign(&partitions)?;
         Ok(Self { consumer })
     }

@@ -120,6 +120,13 @@ fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
         "1 while there is a stream from the main service.",
         &plain(f64::from(u8::from(connected))),
     );
+    let leader = json["leader"].as_bool().unwrap_or_default();
+    one(
+        "blaze_worker_leader",
+        "gauge",
+        "1 while this worker answers and notifies for its layer or node.",
+        &plain(f64::from(u8::from(leader))),
+    );
     one(
         "blaze_worker_revision",
         "gauge",
@@ -163,6 +170,18 @@ fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
         &plain(speaker.waiting as f64),
     );
     let counts = status.counts;
+    one(
+        "blaze_worker_notices_unconfirmed",
+        "gauge",
+        "Places that another worker is to tell, until it is known that it has.",
+        &plain(status.unconfirmed as f64),
+    );
+    one(
+        "blaze_worker_notices_forgotten_total",
+        "counter",
+        "Places that would not be told on a takeover, because too many are unconfirmed.",
+        &plain(counts.missed as f64),
+    );
     let requests = [
         ("answered", counts.answered),
         ("refused", counts.refused),

@@ -125,3 +125,7 @@ pub(crate) async fn scan(keys: Arc<RedisKeys>, signs: mpsc::Sender<Sign>) {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "hearing_tests.rs"]
+mod tests;

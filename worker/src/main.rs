@@ -18,7 +18,7 @@ use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
 use blaze_runtime::{logs, ready_line, say, state};
 use blaze_worker::admin::Shown;
-use blaze_worker::lease::{Lease, RedisLease};
+use blaze_worker::lease;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::{LocalBroker, WorkerSettings};
 use clap::Parser;
@@ -181,26 +181,15 @@ async fn begin(settings: WorkerSettings, file: &NodeFile, supervisor: &Superviso
         LocalBroker::Node(NodeBroker::Memory) | LocalBroker::Layer(LayerBroker::Memory) => {
             Arc::new(MemoryHub::new(settings.site.layer.to_string()).broker())
         }
-        LocalBroker::Node(section) => open_node(section, &Role::Service).context("brokers.node")?,
-        LocalBroker::Layer(section) => open_layer(section, &Role::Service).context("brokers.layer")?,
+        LocalBroker::Node(section) => open_node(section, &Role::Worker).context("brokers.node")?,
+        LocalBroker::Layer(section) => open_layer(section, &Role::Worker).context("brokers.layer")?,
     };
     let keys = settings.keys.as_ref().map(RedisKeys::open).transpose();
     let keys = keys.context("cache")?.map(Arc::new);
     let directory = state::state_directory(file.state_dir.as_deref())?;
     let life: u32 = rand::random();
     let worker_id = format!("{}-{life:08x}", settings.node);
-    // On the broker of a node there is one worker; on that of a layer there may be several.
-    let lease = match (&settings.site.node, &keys) {
-        (None, Some(keys)) => {
-            let lease: Arc<dyn Lease> = Arc::new(RedisLease::new(
-                Arc::clone(keys),
-                &settings.site.layer,
-                worker_id.clone(),
-            ));
-            Some(lease)
-        }
-        (Some(_), _) | (None, None) => None,
-    };
+    let lease = lease::open(&settings, keys.as_ref(), &worker_id)?;
     let options = WorkerOptions {
         folder: Some(settings.copy_folder(&directory.path)),
         settings,

@@ -7,6 +7,7 @@
 use std::time::Duration;
 
 use anyhow::Context as _;
+use blaze_domain::config::AckStatus;
 use blaze_domain::{InstanceName, NodeName};
 use blaze_runtime::config::{Overlay, Verdict};
 use bytes::Bytes;
@@ -14,7 +15,6 @@ use serde_json::json;
 use tokio::sync::{mpsc, watch};
 
 use crate::core::Place;
-use crate::core::messages::AckStatus;
 use crate::engine::{Own, Sign};
 
 /// Between two acknowledgements: each counts for a while.

@@ -26,9 +26,9 @@ use crate::copy::{
 use crate::core::Site;
 use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
 use crate::hearing::{ACK, GET, WATCHDOG, listen, notice_deafness, scan};
-use crate::lease::{self, Lease};
+use crate::lease::{self, Holder, Leadership, Lease};
 use crate::own::{OwnConfig, say_again};
-use crate::serve::{BrokerOutlet, Speaker, SpeakerCounts};
+use crate::serve::{BrokerOutlet, Channels, Speaker, SpeakerCounts};
 use crate::settings::WorkerSettings;
 use crate::sync::{MainService, follow};
 
@@ -36,6 +36,8 @@ use crate::sync::{MainService, follow};
 const LOOK_AT_FILE: Duration = Duration::from_millis(500);
 /// How long the end waits for the copies.
 const KEEP_WITHIN: Duration = Duration::from_secs(2);
+/// How long it waits until the lease is given up.
+const GIVE_UP_WITHIN: Duration = Duration::from_secs(2);
 
 /// What a worker is made of.
 pub struct WorkerOptions {
@@ -47,7 +49,7 @@ pub struct WorkerOptions {
     pub keys: Option<Arc<RedisKeys>>,
     /// Folder of the copies; it is made if it is not there. `None`: nothing is kept.
     pub folder: Option<PathBuf>,
-    /// The lease of its layer; `None`: it is alone.
+    /// The lease of its layer, which, if it is on a Redis, is on that of the keys; `None`: it is alone.
     pub lease: Option<Arc<dyn Lease>>,
     /// Its name among the workers of the layer.
     pub worker_id: String,
@@ -58,10 +60,15 @@ pub struct RunningWorker {
     queries: mpsc::Sender<Query>,
     speaker: Speaker,
     copies: Option<Copies>,
-    lease: Option<Arc<dyn Lease>>,
-    lease_over: CancellationToken,
+    lease: Option<LeaseEnd>,
     main: watch::Sender<MainService>,
     own: OwnConfig,
+}
+
+/// How the task that keeps the lease is ended, and says that it has.
+struct LeaseEnd {
+    give_up: CancellationToken,
+    is_given_up: CancellationToken,
 }
 
 impl RunningWorker {
@@ -84,13 +91,23 @@ impl RunningWorker {
         if let Some(from) = &start.from {
             tracing::info!(from, "services get their last configuration");
         }
-        let speaker = Speaker::default();
+        let (holder, leadership) = match &lease {
+            Some(lease) => {
+                let (holder, leadership) = lease::leadership();
+                (Some((holder, Arc::clone(lease))), leadership)
+            }
+            None => (None, Leadership::alone()),
+        };
+        let speaker = Speaker::new(leadership.term.clone());
         let mut outlet = BrokerOutlet::new(Arc::clone(&broker));
         let records = keys.clone();
         if let Some(keys) = keys {
             let site = settings.site.clone();
             let is_own = move |value: &[u8]| is_own(&site, value);
-            outlet = outlet.with_keys(keys, settings.keys_on_broker(), is_own);
+            let lock = lease.as_ref().and_then(|lease| lease.lock().cloned());
+            outlet = outlet
+                .with_keys(keys, settings.keys_on_broker(), is_own)
+                .while_held(lock);
         }
         let outlet = Arc::new(outlet);
         let (acks, acked) = watch::channel(None);
@@ -98,8 +115,6 @@ impl RunningWorker {
         let (events, sync) = mpsc::channel(QUEUE);
         let (requests, gets) = mpsc::channel(QUEUE);
         let (said, signs) = mpsc::channel(QUEUE);
-        let (lead, leader) = watch::channel(lease.is_none());
-        let lease_over = CancellationToken::new();
         let defaults = match &settings.defaults_file {
             Some(path) => defaults::watch_file(supervisor, path.clone(), settings.site.layer.clone(), LOOK_AT_FILE),
             None => watch::channel(defaults::Status::default()).1,
@@ -113,15 +128,21 @@ impl RunningWorker {
         let outputs = Outputs {
             replies: Arc::new(BrokerReplies::new(Arc::clone(&outlet), broker.kind())),
             speaker: speaker.clone(),
+            channels: outlet
+                .makes_channels()
+                .then(|| Arc::clone(&outlet) as Arc<dyn Channels>),
             copies: copies.clone(),
             acks,
+            term: leadership.term,
+            told: leadership.told,
         };
         let inputs = Inputs {
             sync,
             gets,
             signs,
             defaults,
-            leader,
+            leader: leadership.leader,
+            noted: leadership.noted,
             queries: asked,
         };
         let stop = supervisor.shutdown_token();
@@ -155,22 +176,23 @@ impl RunningWorker {
         if let Some(records) = records {
             spawn("records of watchdogs", Box::pin(scan(records, said)));
         }
-        if let Some(lease) = &lease {
-            let (over, again) = (lease_over.clone(), lead.clone());
-            let keep = lease::keep(Arc::clone(lease), settings.lease, lead);
+        let lease = holder.map(|(holder, lease)| {
+            let end = LeaseEnd {
+                give_up: CancellationToken::new(),
+                is_given_up: CancellationToken::new(),
+            };
+            let (give_up, is_given_up) = (end.give_up.clone(), end.is_given_up.clone());
+            let time = settings.lease;
             spawn(
                 "lease",
                 Box::pin(async move {
-                    tokio::select! {
-                        () = keep => {}
-                        () = over.cancelled() => {
-                            again.send_replace(false);
-                            std::future::pending::<()>().await;
-                        }
-                    }
+                    keep_until(lease, time, holder, &give_up).await;
+                    is_given_up.cancel();
+                    std::future::pending::<()>().await;
                 }),
             );
-        }
+            end
+        });
         let main = settings.main.clone();
         let (main_sender, main_receiver) = watch::channel(main.clone().unwrap_or_default());
         if main.is_some() {
@@ -181,7 +203,6 @@ impl RunningWorker {
             speaker,
             copies,
             lease,
-            lease_over,
             main: main_sender,
             own,
         })
@@ -228,11 +249,24 @@ impl RunningWorker {
             tracing::warn!("a copy is behind; the next start gets the rest from the other one or the main service");
         }
         // From now on nothing is told, and the lease is not taken again.
-        self.lease_over.cancel();
         if let Some(lease) = &self.lease {
-            lease.release().await;
+            lease.give_up.cancel();
+            if tokio::time::timeout(GIVE_UP_WITHIN, lease.is_given_up.cancelled())
+                .await
+                .is_err()
+            {
+                tracing::warn!("the lease was not given up in time; it runs out");
+            }
         }
     }
+}
+
+async fn keep_until(lease: Arc<dyn Lease>, time: Duration, mut holder: Holder, give_up: &CancellationToken) {
+    tokio::select! {
+        () = lease::keep(Arc::clone(&lease), time, &mut holder) => {}
+        () = give_up.cancelled() => {}
+    }
+    lease::give_up(&*lease, &mut holder).await;
 }
 
 /// Where copies are kept.

@@ -25,20 +25,35 @@ pub(super) enum Purpose {
     Messages,
     /// The last value of each key.
     LastValues,
+    /// The same, of few and small values: what is old goes soon, so that whoever reads all has little to read.
+    Notices,
 }
 
 impl Purpose {
     fn settings(self) -> Vec<(&'static str, &'static str)> {
+        let (segment, message) = match self {
+            Self::Messages | Self::LastValues => ("67108864", "17825792"),
+            // A segment that is written to is never compacted.
+            Self::Notices => ("4194304", "2097152"),
+        };
         let mut settings = vec![
-            ("segment.bytes", "67108864"),
-            ("max.message.bytes", "17825792"),
+            ("segment.bytes", segment),
+            ("max.message.bytes", message),
             ("message.timestamp.type", "LogAppendTime"),
         ];
         settings.extend(match self {
             Self::Messages => [("retention.ms", "600000"), ("retention.bytes", "268435456")],
-            Self::LastValues => [("cleanup.policy", "compact"), ("min.cleanable.dirty.ratio", "0.1")],
+            Self::LastValues | Self::Notices => [("cleanup.policy", "compact"), ("min.cleanable.dirty.ratio", "0.1")],
         });
         settings
+    }
+
+    /// Whether its topics keep the last value of each key.
+    pub(super) fn keeps(self) -> bool {
+        match self {
+            Self::Messages => false,
+            Self::LastValues | Self::Notices => true,
+        }
     }
 }
 
@@ -129,7 +144,7 @@ impl Admin {
         let done = block_on(self.0.alter_configs([&change], &Self::options()))?;
         match done.into_iter().next() {
             Some(Ok(_)) => {
-                tracing::info!(topic, "the topic now keeps the last messages of each writer");
+                tracing::info!(topic, "the topic now keeps the last values of its keys");
                 Ok(())
             }
             Some(Err((_, code))) => Err(KafkaError::AdminOp(code)),

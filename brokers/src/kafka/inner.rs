@@ -17,9 +17,10 @@ use super::bell::Bell;
 use super::clock::BrokerClock;
 use super::consumer::{Consumer, Join, Refused, Source};
 use super::context::LastError;
-use super::directory::{Directory, LookupError, Marks};
+use super::directory::{Directory, Listing, LookupError, Marks};
 use super::flow_side::FlowState;
 use super::gate::Gate;
+use super::maker::Made;
 use super::names::{self, Names};
 use super::producer::Producer;
 use super::read_to_end::ReaderToEnd;
@@ -27,10 +28,11 @@ use super::receive::receive;
 use super::record;
 use super::settings::{Lot, Settings};
 use super::topics::Topics;
+use super::worker_side::WorkerState;
 use crate::port::{Begin, BrokerError, BrokerStatus, Health, Received, SubscribeOptions, Subscription, subscription};
 
-/// Channels that one client reads at most.
-const MAX_CHANNELS: usize = 10_000;
+/// Channels that one client reads at most, and a worker makes.
+pub(super) const MAX_CHANNELS: usize = 10_000;
 /// How long subscribing may take.
 const SUBSCRIBE: Duration = Duration::from_secs(5);
 /// How often a server is asked again that names ends which do not hold where a reader was told to begin …
@@ -76,6 +78,7 @@ pub(super) struct Inner {
     pub(super) last_error: Arc<LastError>,
     pub(super) clients: Mutex<Clients>,
     pub(super) flow: Option<Arc<FlowState>>,
+    pub(super) worker: Option<Arc<WorkerState>>,
     pub(super) cluster: Once,
     pub(super) admin: Mutex<Option<Arc<Admin>>>,
     pub(super) status: watch::Sender<BrokerStatus>,
@@ -91,6 +94,20 @@ pub(super) struct Inner {
 impl Inner {
     pub(super) fn is_closed(&self) -> bool {
         self.closed.load(Ordering::Acquire)
+    }
+
+    /// Whether it makes topics, for which it must know all that there are.
+    pub(super) fn makes_topics(&self) -> bool {
+        self.flow.is_some() || self.worker.is_some()
+    }
+
+    /// Makes the topics that are missing, if it makes any.
+    pub(super) fn keep_topics(&self, listing: &Listing) -> Result<Made, String> {
+        match (&self.flow, &self.worker) {
+            (Some(flow), _) => flow.keep_topics(self, listing),
+            (None, Some(worker)) => worker.maker.make(self, listing).map(|(made, _)| made),
+            (None, None) => Ok(Made::Nothing),
+        }
     }
 
     /// The client that makes topics and asks for their settings, made at first use.
@@ -277,7 +294,9 @@ impl Inner {
         loop {
             let starts = reader.read(&ends, deadline, &|| self.is_closed(), |message, payload| {
                 let key = message.key()?;
-                record::is_kept(key).then(|| receive(channel, message, payload, None, &self.clock))
+                // On channels of BlazeAIoT's own, whatever has a key is the last word about it.
+                let is_kept = channel.is_reserved() || record::is_kept(key);
+                is_kept.then(|| receive(channel, message, payload, None, &self.clock))
             })?;
             let mut kept = || -> Vec<Received> {
                 reader

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use super::consumer::Consumer;
 use super::directory::{Listing, LookupError};
-use super::flow_side::Made;
 use super::inner::Inner;
+use super::maker::Made;
 use super::settings::Lot;
 use super::topics::Topic;
 
@@ -127,8 +127,8 @@ impl Watch {
 
 /// Asks once and acts on the answer. Returns whether nothing is missing.
 fn round(inner: &Inner, turn: usize, watch: &mut Watch) -> bool {
-    // A flow needs to know all topics, to make those that are missing; a service only whether someone answers.
-    let one = inner.flow.is_none().then_some(&*inner.probe);
+    // Who makes topics needs to know all, for those that are missing; a service only whether someone answers.
+    let one = (!inner.makes_topics()).then_some(&*inner.probe);
     let listed = inner.directory.list(one, ANSWER);
     let answered = listed.as_ref().is_ok_and(|listing| listing.brokers > 0);
     if watch.directory.note(Instant::now(), answered) {
@@ -148,8 +148,8 @@ fn round(inner: &Inner, turn: usize, watch: &mut Watch) -> bool {
     if let Some(reason) = inner.supervisor.failure() {
         return lost(inner, &reason);
     }
-    if let Some(flow) = &inner.flow {
-        let kept = flow.keep_topics(inner, &listing);
+    if inner.makes_topics() {
+        let kept = inner.keep_topics(&listing);
         if watch.admin.note(Instant::now(), kept.is_ok()) {
             inner.close_admin();
         }
@@ -194,7 +194,7 @@ fn found(inner: &Inner, brokers: usize) {
 
 /// What is written and was missing may have come.
 fn note_topics(inner: &Inner, listing: &Listing) {
-    let came = if inner.flow.is_some() {
+    let came = if inner.makes_topics() {
         let listed: HashMap<&str, usize> = listing.topics.iter().map(|(name, n)| (name.as_str(), *n)).collect();
         learn_limits(inner, |topic| listed.contains_key(&*topic.name));
         inner.topics.note_all(&listed)
@@ -250,7 +250,7 @@ fn watched(topics: &[Arc<str>], turn: usize) -> Vec<Arc<str>> {
 fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn: usize) {
     consumer.sweep();
     let topics = consumer.topics();
-    if inner.flow.is_some() {
+    if inner.makes_topics() {
         for (name, partitions) in &listing.topics {
             consumer.note_partitions(name, *partitions);
         }
@@ -270,9 +270,9 @@ fn keep_reading(inner: &Inner, consumer: &Arc<Consumer>, listing: &Listing, turn
         let awaited = consumer.is_awaited(&topic);
         if awaited {
             looks += 1;
-            // A flow's list holds all that there is; a service asks for some of what it waits for, in turn.
+            // The list of who makes topics holds all that there is; a service asks for some of what it waits for, in turn.
             let listed = listing.topics.iter().any(|(name, _)| **name == *topic);
-            if (inner.flow.is_some() && !listed) || !(looks + turn).is_multiple_of(waiting.div_ceil(PER_ROUND).max(1)) {
+            if (inner.makes_topics() && !listed) || !(looks + turn).is_multiple_of(waiting.div_ceil(PER_ROUND).max(1)) {
                 continue;
             }
         }

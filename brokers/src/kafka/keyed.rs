@@ -13,6 +13,7 @@ use tokio_util::sync::CancellationToken;
 use super::gate::Gate;
 use super::producer::Producer;
 use super::topics::Topic;
+use crate::outbox::Fate;
 
 /// Values that wait at most; those beyond are dropped and counted.
 const MAX_WAITING: usize = 131_072;
@@ -95,12 +96,12 @@ impl KeyedWriter {
             let mut answers = Vec::with_capacity(batch.len());
             for (key, entry) in batch {
                 let (done, answer) = oneshot::channel();
-                producer.send_keyed(&key.0, entry.partition, &key.1, entry.value.as_ref(), done);
+                producer.send_keyed(&entry.topic, entry.partition, &key.1, entry.value.as_ref(), done);
                 answers.push((key, entry, answer));
             }
             let mut refused = Vec::new();
             for (key, entry, answer) in answers {
-                if !answer.await.unwrap_or(false) {
+                if !matches!(answer.await, Ok(Fate::Delivered)) {
                     refused.push((key, entry));
                 }
             }

@@ -6,8 +6,9 @@
 //! ```
 //!
 //! A channel is a topic; a message is a record whose headers are the message's header, as text (module `record`). There is no
-//! consumer group: each client reads all partitions at positions of its own. Topics are made by the flow of the layer alone
-//! (module `flow_side`); what a service publishes before that waits.
+//! consumer group for messages: each client reads all partitions at positions of its own. Groups share out leases alone (module
+//! `group_lease`). Topics are made by the flow of the layer alone (module `flow_side`), and those of configurations by its worker
+//! (module `worker_side`); what a service publishes before that waits.
 
 mod admin;
 mod bell;
@@ -17,12 +18,15 @@ mod context;
 mod directory;
 mod flow_side;
 mod gate;
+mod group_lease;
+mod group_member;
 mod identity;
 #[cfg(test)]
 mod impostor;
 mod inner;
 mod keeper;
 mod keyed;
+mod maker;
 mod names;
 mod producer;
 mod read_to_end;
@@ -30,6 +34,7 @@ mod receive;
 mod record;
 mod settings;
 mod topics;
+mod worker_side;
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -52,6 +57,9 @@ use crate::port::{
     Begin, Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome, Publisher,
     PublisherOptions, Role, SubscribeOptions, Subscription,
 };
+use crate::worker_side::WorkerSide;
+pub use group_lease::{GroupHeld, GroupLease};
+
 use bell::Bell;
 use clock::BrokerClock;
 use context::LastError;
@@ -63,6 +71,7 @@ use names::Names;
 use producer::{Keying, Target};
 use settings::{Lot, Settings};
 use topics::Topics;
+use worker_side::{KafkaWorkerSide, WorkerState};
 
 /// How long closing waits for what was taken while the server is known not to answer.
 const DRAIN: Duration = Duration::from_secs(1);
@@ -101,11 +110,12 @@ impl KafkaBroker {
         };
         let directory = Directory::new(&settings, &last_error).map_err(|error| refused(error.to_string()))?;
         let topics = Topics::default();
-        let (layer, flow) = match role {
-            Role::Service => (String::new(), None),
+        let (layer, flow, worker) = match role {
+            Role::Service => (String::new(), None, None),
+            Role::Worker => (String::new(), None, Some(Arc::new(WorkerState::new(&names)))),
             Role::Flow { flow, .. } => {
                 let state = FlowState::new(&names, &topics);
-                (flow.layer.to_string(), Some(Arc::new(state)))
+                (flow.layer.to_string(), Some(Arc::new(state)), None)
             }
         };
         let connecting = BrokerStatus {
@@ -125,6 +135,7 @@ impl KafkaBroker {
             last_error,
             clients: Mutex::default(),
             flow,
+            worker,
             admin: Mutex::default(),
             cluster: Once::default(),
             status: watch::Sender::new(connecting),
@@ -147,12 +158,15 @@ impl KafkaBroker {
             .supervisor
             .spawn_thread("kafka-keeper", TaskPolicy::MayEnd, move || keeper::run(&keeper))
             .map_err(|error| error.to_string())?;
-        let Some(flow) = inner.flow.clone() else { return Ok(()) };
         // A new producer needs up to a second for its number: what is surely used gets it beforehand.
         let small = |reliable| {
             let lot = Lot { reliable, large: false };
             inner.producer(lot).map_err(|error| error.to_string())
         };
+        if inner.worker.is_some() {
+            small(false)?;
+        }
+        let Some(flow) = inner.flow.clone() else { return Ok(()) };
         small(false)?;
         let producer = small(true)?;
         let (gate, stop) = (Arc::clone(&inner.gate), inner.stop.clone());
@@ -231,6 +245,14 @@ impl Broker for KafkaBroker {
     fn flow_side(&self) -> Option<Arc<dyn FlowSide>> {
         let state = Arc::clone(self.inner.flow.as_ref()?);
         Some(Arc::new(KafkaFlowSide {
+            inner: Arc::clone(&self.inner),
+            state,
+        }))
+    }
+
+    fn worker_side(&self) -> Option<Arc<dyn WorkerSide>> {
+        let state = Arc::clone(self.inner.worker.as_ref()?);
+        Some(Arc::new(KafkaWorkerSide {
             inner: Arc::clone(&self.inner),
             state,
         }))

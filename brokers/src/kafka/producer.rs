@@ -31,7 +31,8 @@ use super::clock::BrokerClock;
 use super::context::LastError;
 use super::gate::Gate;
 use super::settings::{Lot, Settings};
-use crate::outbox::{Lane, Outbox, OutboxLimits, Waiting};
+use super::topics::Topic;
+use crate::outbox::{Fate, Lane, Outbox, OutboxLimits, Waiting};
 use delivery::{Batch, Delivery, SharedContext, WriteContext};
 use ready::Ready;
 pub(super) use ready::{Keying, Target};
@@ -290,29 +291,32 @@ impl Producer {
         }
     }
 
-    /// Writes the value of a key, or takes it away; `done` is told whether the server has it.
+    /// Writes the value of a key, or takes it away; `done` is told what became of it.
     pub(super) fn send_keyed(
         &self,
-        topic: &str,
+        topic: &Arc<Topic>,
         partition: Option<i32>,
         key: &str,
         value: Option<&Bytes>,
-        done: oneshot::Sender<bool>,
+        done: oneshot::Sender<Fate>,
     ) {
         let Some(client) = self.client.lock().clone() else {
             return;
         };
         let delivery = Box::new(Delivery::Keyed {
             done,
+            topic: Arc::clone(topic),
             sent: Instant::now(),
             batch: Batch::begin(&self.context),
         });
-        let mut record = BaseRecord::<str, [u8], _>::with_opaque_to(topic, delivery).key(key);
+        let mut record = BaseRecord::<str, [u8], _>::with_opaque_to(&topic.name, delivery).key(key);
         record.partition = partition;
         record.payload = value.map(|value| &value[..]);
-        // What is refused is dropped here with its `done`, which tells as well.
-        if let Err((error, _)) = client.send(record) {
-            tracing::debug!(topic, key, %error, "a value was not taken");
+        if let Err((error, record)) = client.send(record)
+            && let Delivery::Keyed { done, .. } = *record.delivery_opaque
+        {
+            // Nobody waits any more when the broker is closed.
+            let _ = done.send(self.context.failed(&error, topic));
         }
     }
 

@@ -1,9 +1,8 @@
-//! Keys on a Redis server: values, records with an expiry, a lease. What the worker of BlazeConfig and the cache of a service
+//! Keys on a Redis server: values, records with an expiry; locks are in module `lock`. What the worker of BlazeConfig and the cache of a service
 //! keep there, beside messages.
 //!
 //! ```text
 //! apply(changes, messages) ─► MULTI … EXEC   all of it or nothing
-//! hold(key, owner, time)   ─► one script      who has it, and for how long
 //! ```
 //!
 //! A connection is made when it is needed and forgotten when it fails: every call either does what it should within its time
@@ -18,8 +17,9 @@ use blaze_domain::node_file::RedisBroker as Section;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use redis::aio::MultiplexedConnection;
-use redis::{AsyncConnectionConfig, RedisError, Script};
+use redis::{AsyncConnectionConfig, RedisError};
 
+use super::lock::Scripts;
 use super::settings::Settings;
 use crate::open::OpenError;
 
@@ -79,17 +79,26 @@ pub enum KeyChange {
     },
 }
 
+impl KeyChange {
+    /// The key that changes, without the prefix of the section.
+    #[must_use]
+    pub fn key(&self) -> &str {
+        match self {
+            Self::Put { key, .. } | Self::PutRecord { key, .. } | Self::Delete { key } => key,
+        }
+    }
+}
+
 /// Members of a record, by their names.
 pub type Record = BTreeMap<String, String>;
 
 /// A client for keys. Clones of what is behind it are cheap; calls may overlap.
 pub struct RedisKeys {
-    settings: Settings,
+    pub(super) settings: Settings,
     connection: Mutex<Option<MultiplexedConnection>>,
     /// Which start of the server was met last.
     run: Mutex<Option<String>>,
-    hold: Script,
-    release: Script,
+    pub(super) scripts: Scripts,
 }
 
 impl RedisKeys {
@@ -102,8 +111,7 @@ impl RedisKeys {
             settings: Settings::read(section)?,
             connection: Mutex::new(None),
             run: Mutex::new(None),
-            hold: Script::new(HOLD),
-            release: Script::new(RELEASE),
+            scripts: Scripts::default(),
         })
     }
 
@@ -121,8 +129,14 @@ impl RedisKeys {
         if changes.is_empty() && messages.is_empty() {
             return Ok(());
         }
-        let mut pipe = redis::pipe();
+        let mut pipe = self.pipeline(changes, messages);
         pipe.atomic();
+        self.call(|mut connection| async move { pipe.query_async::<()>(&mut connection).await })
+            .await
+    }
+
+    pub(super) fn pipeline(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> redis::Pipeline {
+        let mut pipe = redis::pipe();
         for change in changes {
             self.add(&mut pipe, change);
         }
@@ -130,8 +144,7 @@ impl RedisKeys {
             let channel = self.settings.names.channel(channel);
             pipe.publish(&*channel, payload.as_ref()).ignore();
         }
-        self.call(|mut connection| async move { pipe.query_async::<()>(&mut connection).await })
-            .await
+        pipe
     }
 
     fn add(&self, pipe: &mut redis::Pipeline, change: &KeyChange) {
@@ -270,29 +283,6 @@ impl RedisKeys {
         }
     }
 
-    /// Takes a lease that nobody has, or goes on having it, for so long from now. Returns whether `owner` has it.
-    ///
-    /// # Errors
-    /// [`KeyError`]: then it may run out, or be had.
-    pub async fn hold(&self, key: &str, owner: &str, time: Duration) -> Result<bool, KeyError> {
-        let mut call = self.hold.key(self.settings.names.key(key));
-        call.arg(owner)
-            .arg(u64::try_from(time.as_millis()).unwrap_or(u64::MAX).max(1));
-        self.call(|mut connection| async move { call.invoke_async::<bool>(&mut connection).await })
-            .await
-    }
-
-    /// Gives a lease up, if `owner` has it.
-    ///
-    /// # Errors
-    /// [`KeyError`]: then it runs out by itself.
-    pub async fn release(&self, key: &str, owner: &str) -> Result<(), KeyError> {
-        let mut call = self.release.key(self.settings.names.key(key));
-        call.arg(owner);
-        self.call(|mut connection| async move { call.invoke_async::<()>(&mut connection).await })
-            .await
-    }
-
     /// Waits until the server has been started anew: then it may have lost what it had. One that does not say which start it
     /// is (no right to `INFO`) is never found to be another.
     pub async fn restarted(&self) {
@@ -324,7 +314,7 @@ impl RedisKeys {
         Ok(run.map(|run| run.trim().to_owned()))
     }
 
-    async fn call<T, F>(&self, ask: impl FnOnce(MultiplexedConnection) -> F) -> Result<T, KeyError>
+    pub(super) async fn call<T, F>(&self, ask: impl FnOnce(MultiplexedConnection) -> F) -> Result<T, KeyError>
     where
         F: Future<Output = Result<T, RedisError>>,
     {
@@ -363,20 +353,6 @@ impl RedisKeys {
         }
     }
 }
-
-/// Taken when free, prolonged when one's own.
-const HOLD: &str = r"
-local owner = redis.call('GET', KEYS[1])
-if owner and owner ~= ARGV[1] then return 0 end
-redis.call('SET', KEYS[1], ARGV[1], 'PX', ARGV[2])
-return 1
-";
-
-/// Deleted when one's own.
-const RELEASE: &str = r"
-if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end
-return 1
-";
 
 /// A text that a pattern of the server finds as it is.
 fn escaped(text: &str) -> String {

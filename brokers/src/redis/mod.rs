@@ -17,6 +17,7 @@ mod gate;
 mod kept;
 mod keys;
 mod leases;
+mod lock;
 mod owner;
 mod publisher;
 mod pulse;
@@ -45,6 +46,7 @@ pub use gate::MAX_QUEUE_BYTES;
 pub use kept::{MAX_KEPT_BYTES, MAX_KEPT_WRITERS};
 pub use keys::{KeyChange, KeyError, Record, RedisKeys};
 pub use leases::MAX_LEASES;
+pub use lock::{RedisHeld, RedisLock};
 pub use subscriptions::MAX_CHANNELS;
 
 use crate::open::OpenError;
@@ -105,7 +107,7 @@ impl Shared {
     fn new(settings: Settings, role: &Role) -> Self {
         let gates = [Gate::new(false), Gate::new(true)];
         let scope = match role {
-            Role::Service => Scope::Free,
+            Role::Service | Role::Worker => Scope::Free,
             Role::Flow { .. } => Scope::Unclaimed,
         };
         let channels = Arc::<AtomicUsize>::default();
@@ -218,7 +220,7 @@ impl RedisBroker {
             shared: Arc::new(Shared::new(settings, role)),
             supervisor: Supervisor::on(runtime, "redis"),
             flow: match role {
-                Role::Service => None,
+                Role::Service | Role::Worker => None,
                 Role::Flow { flow, epoch } => Some(Flow {
                     flow: flow.clone(),
                     epoch: *epoch,

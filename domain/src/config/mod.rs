@@ -8,6 +8,7 @@
 //!
 //! The main service and the worker share all of it, so that both come to the same configuration and the same hash.
 
+mod ack;
 #[cfg(test)]
 mod arbitrary;
 pub mod canonical;
@@ -26,6 +27,7 @@ pub mod spec;
 pub mod state;
 mod time;
 
+pub use ack::AckStatus;
 pub use code::Code;
 pub use document::{Document, Labels};
 pub use key::{Key, KeyError, Kind};

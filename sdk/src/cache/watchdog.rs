@@ -2,14 +2,14 @@
 
 use std::time::Duration;
 
-use blaze_brokers::{BrokerError, PublisherOptions};
+use blaze_brokers::BrokerError;
 use bytes::Bytes;
 use tokio::time::Instant;
 
 use super::record::{self, Heard, Sign};
 use super::store::Store;
 use super::{Liveness, Said, Shared};
-use crate::reserved::{bare, channel, subscribe};
+use crate::reserved::{bare, channel, speaking, subscribe};
 
 const WATCHDOG: &str = "blaze/watchdog";
 /// Longest pause before a record that could not be written is tried again.
@@ -89,7 +89,7 @@ async fn beat(
 async fn by_messages(shared: &Shared) -> Result<Liveness, BrokerError> {
     let channel = channel(WATCHDOG)?;
     let mut others = subscribe(shared.broker.as_ref(), &channel).await?;
-    let publisher = shared.broker.publisher(&channel, PublisherOptions::default())?;
+    let publisher = shared.broker.publisher(&channel, speaking(shared.broker.kind()))?;
     let mut heard = Vec::new();
     loop {
         let said = shared.said.lock().clone();

@@ -1,11 +1,11 @@
 //! The task that connects the state machine with the broker.
 
-use blaze_brokers::{BrokerError, Health, PublisherOptions, Received};
+use blaze_brokers::{BrokerError, Health, Received};
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 
 use super::{ConfigChange, Shared};
-use crate::reserved::{bare, channel, now, reply_channel, subscribe, until};
+use crate::reserved::{bare, channel, now, reply_channel, speaking, subscribe, until};
 
 const GET: &str = "blaze/config/get";
 const CHANGED: &str = "blaze/config/changed";
@@ -24,7 +24,7 @@ async fn drive(shared: &Shared, own_reply: ChannelName) -> Result<(), BrokerErro
     // Both are heard before the first request is sent, so that nothing falls between an answer and the notices after it.
     let mut replies = subscribe(broker, &reply_channel(broker.kind(), own_reply)).await?;
     let mut notices = subscribe(broker, &channel(&format!("{CHANGED}/{}", shared.identity.service))?).await?;
-    let requests = broker.publisher(&channel(GET)?, PublisherOptions::default())?;
+    let requests = broker.publisher(&channel(GET)?, speaking(broker.kind()))?;
     let mut status = broker.status();
     let mut was_up = status.borrow_and_update().health == Health::Up;
     let (mut answered, mut told) = (Vec::new(), Vec::new());

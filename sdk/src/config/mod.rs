@@ -24,7 +24,7 @@ mod wire;
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_brokers::{Broker, PublishOutcome, PublisherOptions};
+use blaze_brokers::{Broker, PublishOutcome};
 use blaze_domain::Scope;
 use blaze_domain::names::ChannelName;
 use blaze_runtime::{Supervisor, TaskPolicy};
@@ -35,6 +35,7 @@ use serde_json::Value;
 use tokio::sync::{Notify, watch};
 
 pub use base::{BaseConfiguration, BaseSource};
+pub use blaze_domain::config::AckStatus;
 pub use book::ConfigCounts;
 use book::{ConfigBook, Standing};
 pub(crate) use change::Held;
@@ -42,7 +43,6 @@ pub use change::{ConfigChange, ConfigScope, ConfigSource};
 pub use listeners::ConfigListener;
 use listeners::Listeners;
 pub use program::ProgramConfig;
-pub use wire::AckStatus;
 
 use crate::SdkError;
 use crate::pool::PoolHandle;
@@ -284,7 +284,10 @@ impl ConfigManager {
                 Some(publisher) => Arc::clone(publisher),
                 None => {
                     let channel = reserved::channel(ACK)?;
-                    let publisher = self.shared.broker.publisher(&channel, PublisherOptions::default())?;
+                    let publisher = self
+                        .shared
+                        .broker
+                        .publisher(&channel, reserved::speaking(self.shared.broker.kind()))?;
                     Arc::clone(acks.insert(publisher))
                 }
             }

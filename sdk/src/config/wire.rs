@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use blaze_domain::config::MAX_EFFECTIVE_BYTES;
+use blaze_domain::config::{AckStatus, MAX_EFFECTIVE_BYTES};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
@@ -13,32 +13,6 @@ use crate::service::Identity;
 const MAX_MESSAGE_BYTES: usize = MAX_EFFECTIVE_BYTES + 256 * 1024;
 /// Longest detail of an acknowledgement that a worker reads, in bytes.
 const MAX_DETAIL_BYTES: usize = 4 * 1024;
-
-/// How a service gets on with its configuration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum AckStatus {
-    /// It runs with it.
-    Applied,
-    /// It does not take it, and goes on with the one before.
-    Rejected,
-    /// It runs with it, and not well.
-    Unhealthy,
-    /// It runs well again.
-    Healthy,
-}
-
-impl AckStatus {
-    /// The word in messages.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Applied => "applied",
-            Self::Rejected => "rejected",
-            Self::Unhealthy => "unhealthy",
-            Self::Healthy => "healthy",
-        }
-    }
-}
 
 /// Why a worker gave no configuration.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -8,6 +8,7 @@ mod places;
 mod plain;
 mod rules;
 mod topics;
+mod worker;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

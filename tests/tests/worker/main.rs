@@ -3,11 +3,15 @@
 //! Needs `cargo build --workspace` and `scripts/services install`.
 //!
 //! ```text
-//! stage    a main service, a Redis and workers of one layer
+//! stage    a main service, a broker and workers of one layer
 //! serving  what services are told, and whether only those it concerns
 //! outages  the main service, the broker and the worker away, in turns and together
 //! flow     BlazeFlow's own settings: what counts, what is refused, who else hears
 //! flow_live  the same while messages flow, in a roll-out, and whatever starts first
+//! layer    one worker for a whole layer, on Kafka and on DDS
+//! kafka    what is special to Kafka
+//! leases   the suite of leases on real servers
+//! several  two workers of one layer, of which one is killed, stopped, or ended
 //! ```
 
 #![allow(
@@ -19,6 +23,11 @@
 
 mod flow;
 mod flow_live;
+#[cfg(feature = "kafka")]
+mod kafka;
+mod layer;
+mod leases;
 mod outages;
 mod serving;
+mod several;
 mod stage;

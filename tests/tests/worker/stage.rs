@@ -1,4 +1,4 @@
-//! A main service without tokens, a Redis, and workers of layer `edge`.
+//! A main service without tokens, a broker, and workers of layer `edge`.
 
 use std::collections::BTreeMap;
 use std::net::{SocketAddr, TcpListener};
@@ -7,10 +7,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use blaze_brokers::redis::{RedisBroker, RedisKeys};
-use blaze_brokers::{Broker as _, Content, Health, PublisherOptions, Role, SubscribeOptions, Subscription};
+use blaze_brokers::redis::RedisKeys;
+use blaze_brokers::{
+    Broker, BrokerKind, Content, Health, PublisherOptions, Role, SubscribeOptions, Subscription, open_layer, open_node,
+};
+use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::{NodeBroker, NodeFile};
-use blaze_tests::process::Process;
+use blaze_tests::process::{Process, Signal};
 use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
 use blaze_tests::wait;
 use bytes::Bytes;
@@ -25,10 +28,22 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 /// What the processes of one test have in common.
 pub(crate) struct Stage {
     folder: TempDir,
-    pub(crate) redis: RedisServer,
+    pub(crate) redis: OwnRedis,
+    /// The section of the node file.
+    brokers: Value,
     rest: SocketAddr,
     grpc: SocketAddr,
     http: reqwest::Client,
+}
+
+/// A Redis, where the stage has one.
+pub(crate) struct OwnRedis(Option<RedisServer>);
+
+impl std::ops::Deref for OwnRedis {
+    type Target = RedisServer;
+    fn deref(&self) -> &RedisServer {
+        self.0.as_ref().expect("the stage has a Redis")
+    }
 }
 
 /// A running worker and where it is asked.
@@ -55,10 +70,32 @@ fn launch(program: &str, node_file: &str) -> anyhow::Result<(Process, BTreeMap<S
 }
 
 impl Stage {
+    /// Nodes with a Redis each.
     pub(crate) fn new() -> Self {
+        let redis = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
+        let brokers = json!({ "node": { "redis": { "url": redis.url() } } });
+        Self::with(Some(redis), brokers)
+    }
+
+    /// A layer on this broker, as in the node file.
+    pub(crate) fn of_layer(broker: &Value) -> Self {
+        Self::with(None, json!({ "layer": broker }))
+    }
+
+    /// The same with a Redis beside it.
+    pub(crate) fn with_cache(self) -> Self {
+        let redis = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
+        Self {
+            redis: OwnRedis(Some(redis)),
+            ..self
+        }
+    }
+
+    fn with(redis: Option<RedisServer>, brokers: Value) -> Self {
         Self {
             folder: TempDir::new().unwrap(),
-            redis: RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap(),
+            redis: OwnRedis(redis),
+            brokers,
             rest: free(),
             grpc: free(),
             http: reqwest::Client::new(),
@@ -108,18 +145,40 @@ impl Stage {
     pub(crate) fn worker_with(&self, node: &str, section: Value) -> Worker {
         let mut section = section;
         section["state_dir"] = json!(self.path(node));
-        let file = self.write(
-            &format!("{node}.yaml"),
-            &json!({
-                "log": { "level": "info" },
-                "layer": { "name": "edge", "kind": "edge" },
-                "node": { "name": node },
-                "brokers": { "node": { "redis": { "url": self.redis.url() } } },
-                "admin": { "worker": "127.0.0.1:0" },
-                "config": { "server": format!("http://{}", self.grpc) },
-                "worker": section,
-            }),
-        );
+        let mut file = json!({
+            "log": { "level": "info" },
+            "layer": { "name": "edge", "kind": "edge" },
+            "node": { "name": node },
+            "brokers": self.brokers,
+            "admin": { "worker": "127.0.0.1:0" },
+            "config": { "server": format!("http://{}", self.grpc) },
+            "worker": section,
+        });
+        if let (OwnRedis(Some(redis)), Some(_)) = (&self.redis, self.brokers.get("layer")) {
+            file["cache"] = json!({ "redis": { "url": redis.url() } });
+        }
+        let file = self.write(&format!("{node}.yaml"), &file);
+        let (process, addresses) = launch("blaze-worker", &file).unwrap();
+        let admin = *addresses.get("admin").context("no admin").unwrap();
+        Worker { process, admin }
+    }
+
+    /// A worker of the whole layer, ready, beside others; `more` are further sections. Its broker is none that it can reach,
+    /// unless they name another: keys are enough to see who serves.
+    pub(crate) fn layer_worker(&self, node: &str, more: &Value) -> Worker {
+        let mut file = json!({
+            "log": { "level": "debug" },
+            "layer": { "name": "edge", "kind": "edge" },
+            "node": { "name": node },
+            "brokers": { "layer": { "kafka": { "bootstrap": ["127.0.0.1:1"] } } },
+            "admin": { "worker": "127.0.0.1:0" },
+            "config": { "server": format!("http://{}", self.grpc) },
+            "worker": { "state_dir": self.path(node) },
+        });
+        for (name, section) in more.as_object().unwrap() {
+            file[name] = section.clone();
+        }
+        let file = self.write(&format!("{node}.yaml"), &file);
         let (process, addresses) = launch("blaze-worker", &file).unwrap();
         let admin = *addresses.get("admin").context("no admin").unwrap();
         Worker { process, admin }
@@ -188,22 +247,35 @@ impl Stage {
         RedisKeys::open(&self.section()).unwrap()
     }
 
-    /// A service that knows only the broker.
-    pub(crate) async fn service(&self) -> Service {
-        let broker = RedisBroker::open(&self.section(), &Role::Service).unwrap();
+    /// A client of the broker, as services have it, that is connected.
+    pub(crate) async fn broker(&self) -> Arc<dyn Broker> {
+        let file = NodeFile::read(&json!({ "brokers": self.brokers })).unwrap().0.brokers;
+        let broker = match (&file.node, &file.layer) {
+            (Some(section), _) => open_node(section, &Role::Service).unwrap(),
+            (None, Some(section)) => open_layer(section, &Role::Service).unwrap(),
+            (None, None) => panic!("no broker"),
+        };
         let mut status = broker.status();
         let up = status.wait_for(|status| status.health == Health::Up);
         tokio::time::timeout(PATIENCE, up)
             .await
-            .expect("Redis answers")
+            .expect("the broker answers")
             .unwrap();
-        let subscription = broker
-            .subscribe(&"blaze/reply/test".parse().unwrap(), SubscribeOptions::default())
-            .await
-            .unwrap();
+        broker
+    }
+
+    /// A service that knows only the broker.
+    pub(crate) async fn service(&self) -> Service {
+        let broker = self.broker().await;
+        let reply: ChannelName = match broker.kind() {
+            BrokerKind::Redis | BrokerKind::Memory => "blaze/reply/test".parse().unwrap(),
+            BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => ChannelName::shared_reply(),
+        };
+        let replies = broker.subscribe(&reply, SubscribeOptions::default()).await.unwrap();
         Service {
-            broker: Arc::new(broker),
-            replies: subscription,
+            broker,
+            replies,
+            life: rand::random(),
             asked: 0,
         }
     }
@@ -252,6 +324,19 @@ impl Worker {
         reqwest::get(url).await.unwrap().text().await.unwrap()
     }
 
+    pub(crate) fn signal(&self, signal: Signal) {
+        self.process.signal(signal).unwrap();
+    }
+
+    /// Whether it leads; `None`: it does not answer within a tenth of a second.
+    pub(crate) async fn leads(&self) -> Option<bool> {
+        let url = format!("http://{}/v1/status", self.admin);
+        let answer = async { reqwest::get(url).await.ok()?.text().await.ok() };
+        let text = tokio::time::timeout(Duration::from_millis(100), answer).await.ok()??;
+        let status: Value = serde_json::from_str(&text).ok()?;
+        status["leader"].as_bool()
+    }
+
     pub(crate) fn kill(mut self) {
         self.process.kill().unwrap();
     }
@@ -267,24 +352,39 @@ impl Worker {
 
 /// A service that knows only the broker.
 pub(crate) struct Service {
-    broker: Arc<RedisBroker>,
+    broker: Arc<dyn Broker>,
     replies: Subscription,
+    /// Others may be answered on the same channel.
+    life: u32,
     asked: u64,
 }
 
 impl Service {
     /// Hears of changes of a service from now on.
     pub(crate) async fn listen(&self, service: &str) -> Subscription {
+        self.listen_with(service, SubscribeOptions::default()).await
+    }
+
+    /// The same, beginning with what the broker keeps.
+    pub(crate) async fn listen_late(&self, service: &str) -> Subscription {
+        let options = SubscribeOptions {
+            with_kept: true,
+            ..SubscribeOptions::default()
+        };
+        self.listen_with(service, options).await
+    }
+
+    async fn listen_with(&self, service: &str, options: SubscribeOptions) -> Subscription {
         let channel = format!("blaze/config/changed/{service}").parse().unwrap();
-        self.broker
-            .subscribe(&channel, SubscribeOptions::default())
-            .await
-            .unwrap()
+        self.broker.subscribe(&channel, options).await.unwrap()
     }
 
     /// Asks until it is answered, as often as a service may: each second.
     pub(crate) async fn ask(&mut self, mut request: Value, limit: Duration) -> Value {
-        let options = PublisherOptions::default();
+        let options = PublisherOptions {
+            reliable: true,
+            ..PublisherOptions::default()
+        };
         let publisher = self
             .broker
             .publisher(&"blaze/config/get".parse().unwrap(), options)
@@ -292,7 +392,7 @@ impl Service {
         let start = tokio::time::Instant::now();
         loop {
             self.asked += 1;
-            let id = self.asked.to_string();
+            let id = format!("{:08x}-{}", self.life, self.asked);
             request["id"] = json!(id);
             request["reply_to"] = json!("blaze/reply/test");
             publisher.publish_bare(&Bytes::from(request.to_string()), None);

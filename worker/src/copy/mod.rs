@@ -33,7 +33,7 @@ mod kill_tests;
 #[cfg(feature = "mongodb")]
 mod mongo;
 #[cfg(feature = "mongodb")]
-mod mongo_client;
+pub(crate) mod mongo_client;
 #[cfg(feature = "mongodb")]
 mod mongo_rows;
 mod notes;

@@ -25,7 +25,7 @@ const DUPLICATE_KEY: i32 = 11_000;
 const NEVER: [i32; 3] = [13, 18, 59];
 
 /// Where the copy is.
-pub(super) struct Server {
+pub(crate) struct Server {
     uri: SecretText,
     database: String,
     app_name: String,
@@ -35,9 +35,10 @@ pub(super) struct Server {
 
 /// Its collections. Writes count once a majority has them on disk; a server that is alone is its own majority.
 #[derive(Clone)]
-pub(super) struct Tables {
-    pub(super) head: Collection<Document>,
-    pub(super) documents: Collection<Document>,
+pub(crate) struct Tables {
+    pub(crate) head: Collection<Document>,
+    pub(crate) documents: Collection<Document>,
+    pub(crate) leases: Collection<Document>,
 }
 
 impl Server {
@@ -45,7 +46,7 @@ impl Server {
     ///
     /// # Errors
     /// [`CopyError::Refused`] for a name that no database can have.
-    pub(super) fn new(uri: SecretText, database: &str, copy: &str, place: &str) -> Result<Self, CopyError> {
+    pub(crate) fn new(uri: SecretText, database: &str, copy: &str, place: &str) -> Result<Self, CopyError> {
         let allowed = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
         if database.is_empty() || database.len() > NAME_BYTES || !database.chars().all(allowed) {
             return Err(CopyError::Refused {
@@ -66,7 +67,7 @@ impl Server {
     ///
     /// # Errors
     /// [`CopyError::Refused`], [`CopyError::Away`].
-    pub(super) async fn tables(&self) -> Result<Tables, CopyError> {
+    pub(crate) async fn tables(&self) -> Result<Tables, CopyError> {
         let mut held = self.tables.lock().await;
         if let Some(tables) = &*held {
             return Ok(tables.clone());
@@ -92,6 +93,7 @@ impl Server {
         let tables = Tables {
             head: database.collection("head"),
             documents: database.collection("documents"),
+            leases: database.collection("leases"),
         };
         Ok(held.insert(tables).clone())
     }
@@ -100,7 +102,7 @@ impl Server {
     ///
     /// # Errors
     /// [`CopyError::Away`] at the limit, else what the driver says.
-    pub(super) async fn limited<T>(
+    pub(crate) async fn limited<T>(
         &self,
         work: impl IntoFuture<Output = mongodb::error::Result<T>>,
     ) -> Result<T, CopyError> {
@@ -111,7 +113,7 @@ impl Server {
     ///
     /// # Errors
     /// [`CopyError::Away`] at the limit.
-    pub(super) async fn within<T>(
+    pub(crate) async fn within<T>(
         &self,
         work: impl IntoFuture<Output = mongodb::error::Result<T>>,
     ) -> Result<mongodb::error::Result<T>, CopyError> {
@@ -123,7 +125,7 @@ impl Server {
     }
 
     /// What an error of the driver means.
-    pub(super) fn failed(&self, error: &Error) -> CopyError {
+    pub(crate) fn failed(&self, error: &Error) -> CopyError {
         // The kind alone: the rest may repeat documents.
         let (place, detail) = (self.place.clone(), error.kind.to_string());
         let never = match error.kind.as_ref() {
@@ -142,7 +144,7 @@ impl Server {
 }
 
 /// Whether a record with this `_id` is there already.
-pub(super) fn is_duplicate(error: &Error) -> bool {
+pub(crate) fn is_duplicate(error: &Error) -> bool {
     match error.kind.as_ref() {
         ErrorKind::Write(WriteFailure::WriteError(write)) => write.code == DUPLICATE_KEY,
         ErrorKind::Command(command) => command.code == DUPLICATE_KEY,

@@ -13,8 +13,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use blaze_domain::NodeName;
+use blaze_domain::config::AckStatus;
 
-use super::messages::{AckStatus, ConfigAck, DEFAULT_TTL_MS, Health, ServiceState, WatchdogKey};
+use super::messages::{ConfigAck, DEFAULT_TTL_MS, Health, ServiceState, WatchdogKey};
 use super::place::{Place, Site};
 
 /// Instances that are known, at most; more are counted and not known.

@@ -24,6 +24,7 @@ use std::time::Instant;
 use blaze_domain::config::Key;
 use blaze_domain::config::effective::{At, Sources};
 use blaze_domain::config::state::State;
+use blaze_domain::{InstanceName, ServiceName};
 use serde_json::{Map, Value};
 
 use super::asked::Asked;
@@ -141,6 +142,26 @@ impl Served {
     /// Every place that is told of changes, with what it was told last.
     pub fn told(&self) -> impl Iterator<Item = (&Place, &Told)> {
         self.places.all()
+    }
+
+    /// What a place was told last, if it is told of changes.
+    #[must_use]
+    pub fn told_at(&self, place: &Place) -> Option<&Told> {
+        self.places.get(place)
+    }
+
+    /// Whether an instance of a service, or the service without one, is told of changes anywhere.
+    #[must_use]
+    pub fn tells(&self, service: &ServiceName, instance: Option<&InstanceName>) -> bool {
+        match instance {
+            Some(instance) => self.places.of_instance(service, instance).next().is_some(),
+            // Those without come before all others.
+            None => self
+                .places
+                .of_service(service)
+                .next()
+                .is_some_and(|place| place.instance.is_none()),
+        }
     }
 
     /// Uids of the roll-outs that failed here, the oldest first.
@@ -264,6 +285,15 @@ impl Served {
         } else if self.places.remove(&place) {
             out.untracked.push(place);
         }
+    }
+
+    /// How a place that is told of changes stands, for one that had something with this hash, of which no more is known.
+    #[must_use]
+    pub fn notice_of(&self, place: &Place, previous_hash: Option<String>) -> Option<Notice> {
+        let told = self.places.get(place)?;
+        let hash = told.hash.clone()?;
+        let sources = self.shown.at(&self.site, place)?;
+        Some(self.notice(place, told.revision, previous_hash, None, Some((sources, hash))))
     }
 
     /// `old` is what the place was told last, as far as it is known.

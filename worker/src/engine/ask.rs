@@ -17,7 +17,7 @@ impl Engine {
                 if self.served.has_pending() {
                     self.flush_soon();
                 }
-                if !self.is_leader {
+                if !self.is_leader() {
                     // That somebody asked is good to know for whoever takes over.
                     self.counts.left_to_others += 1;
                     return;
@@ -29,7 +29,7 @@ impl Engine {
             }
             Err(RefusedRequest { id, reply_to, error }) => {
                 self.counts.refused += 1;
-                if !self.is_leader {
+                if !self.is_leader() {
                     return;
                 }
                 let text = messages::refusal(&error, id.as_deref());

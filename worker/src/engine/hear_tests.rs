@@ -66,7 +66,7 @@ impl World {
     async fn rates(&mut self) -> Vec<Value> {
         let told = self.rest().await.into_iter().filter_map(|seen| match seen {
             Seen::Notice(_, notice) if notice["instance"] == "0" => Some(notice["config"]["rate_hz"].clone()),
-            Seen::Notice(..) | Seen::Key(..) => None,
+            Seen::Notice(..) | Seen::Key(..) | Seen::TakenAway(..) => None,
         });
         told.collect()
     }

@@ -11,41 +11,46 @@
 //! ```
 
 mod ask;
+mod fade;
 mod hear;
+mod lead;
+mod missed;
 mod own;
+mod ports;
 mod status;
 mod tell;
 #[cfg(test)]
 mod tests;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::config::Timestamp;
+use blaze_domain::LayerName;
 use blaze_domain::config::state::State;
-use blaze_domain::names::ChannelName;
-use blaze_domain::{LayerName, NodeName};
+use blaze_domain::config::{Key, Kind, Timestamp};
 use blaze_proto::v1;
-use bytes::Bytes;
-use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
-use crate::copy::{Changed, Copies, Loaded, Notes, Position, Update, defaults, lacks_text};
-use crate::core::messages::Delivery;
-use crate::core::{Applied, Gate, PROTOCOL, Place, Replica, Served, Signs, Site, Source};
-use crate::serve::{Speaker, Told};
+use crate::copy::{Changed, Loaded, Notes, Position, Update, defaults, lacks_text};
+use crate::core::{Applied, Gate, Notice, PROTOCOL, Place, Replica, Served, Signs, Source};
+use crate::lease::Mark;
 use crate::sync::SyncEvent;
+use fade::Fades;
+use missed::Missed;
 
 pub use hear::Sign;
 pub use own::Own;
+pub use ports::{Counts, Identity, Inputs, Outputs, Query, Replies};
 pub use status::Status;
 
 /// Within this time several changes may become one notice.
 const TOGETHER: Duration = Duration::from_millis(20);
 /// Between two looks whether the broker has taken what places are told.
 const SETTLE: Duration = Duration::from_millis(200);
+/// The same for a worker that does not tell: between two looks whether others have.
+const WAIT_FOR_OTHERS: Duration = Duration::from_secs(1);
 /// What the worker has is said this long after it became so, and with it what came meanwhile.
 const ACK_AFTER: Duration = Duration::from_millis(50);
 /// While there is always something new it is said so often: the digest over everything is worked out each time.
@@ -56,91 +61,6 @@ const ACK_AGAIN: Duration = Duration::from_secs(15);
 const LOOK: Duration = Duration::from_secs(1);
 /// Events that wait for the engine.
 pub const QUEUE: usize = 256;
-
-/// Gives answers to those who ask.
-pub trait Replies: Send + Sync + 'static {
-    /// Sends one, now. What cannot be sent is dropped: whoever asked asks again.
-    ///
-    /// # Errors
-    /// For people.
-    fn reply(&self, to: &ChannelName, payload: Bytes) -> Result<(), String>;
-
-    /// The one channel that all answers go to, where the broker cannot make one for each who asks; then an id is needed.
-    fn shared(&self) -> Option<ChannelName>;
-}
-
-/// Who the worker is and how it serves.
-#[derive(Debug, Clone)]
-pub struct Identity {
-    /// Whom it serves.
-    pub site: Site,
-    /// The node that it runs on.
-    pub node: Option<NodeName>,
-    /// Its name among the workers of its layer; no other life of it has the same.
-    pub worker_id: String,
-    /// How secrets reach services.
-    pub delivery: Delivery,
-}
-
-/// What comes in.
-pub struct Inputs {
-    /// From the main service.
-    pub sync: mpsc::Receiver<SyncEvent>,
-    /// Requests for configurations, as they came.
-    pub gets: mpsc::Receiver<Bytes>,
-    /// What services say about themselves.
-    pub signs: mpsc::Receiver<Sign>,
-    /// The mounted file.
-    pub defaults: watch::Receiver<defaults::Status>,
-    /// Whether this worker answers and notifies.
-    pub leader: watch::Receiver<bool>,
-    /// Questions of the admin port.
-    pub queries: mpsc::Receiver<Query>,
-}
-
-/// Where things go.
-pub struct Outputs {
-    /// Answers.
-    pub replies: Arc<dyn Replies>,
-    /// Keys and notices.
-    pub speaker: Speaker,
-    /// Copies; absent where nothing is kept.
-    pub copies: Option<Copies>,
-    /// What the worker has, for the main service.
-    pub acks: watch::Sender<Option<v1::Ack>>,
-}
-
-/// A question to the engine.
-#[derive(Debug)]
-pub enum Query {
-    /// How it is.
-    Status(oneshot::Sender<Status>),
-}
-
-/// What happened since the start.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Counts {
-    /// Requests that were answered.
-    pub answered: u64,
-    /// Requests that could not be read or answered.
-    pub refused: u64,
-    /// Requests that another worker of the layer answers.
-    pub left_to_others: u64,
-    /// Commits and snapshots that were taken over.
-    pub changes: u64,
-    /// Streams that were begun anew because something was missing or different.
-    pub faults: u64,
-    /// Notices that followed from changes.
-    pub notices: u64,
-    /// Acknowledgements and signs of life that were understood.
-    pub signs: u64,
-    /// Those that could not be read.
-    pub misunderstood: u64,
-    /// Those of instances beyond as many as are known at a time.
-    pub left_out: u64,
-    /// Roll-outs that failed here and were undone.
-    pub failed_rollouts: u64,
-}
 
 /// What the engine owns. Everything that it does happens in [`Engine::run`].
 pub struct Engine {
@@ -161,7 +81,14 @@ pub struct Engine {
     stream: Option<CancellationToken>,
     /// Why there is no stream.
     reason: Option<String>,
-    is_leader: bool,
+    /// The number of the term in which it leads.
+    leads: Option<u64>,
+    /// It leads and knows enough to tell services of it.
+    tells: bool,
+    /// How far services were told, by whomever.
+    noted: Option<Mark>,
+    /// The state that is shown.
+    shown: Option<Mark>,
     flushed: Option<Instant>,
     flush_at: Option<Instant>,
     /// When to look whether the broker has taken what places are told.
@@ -175,8 +102,12 @@ pub struct Engine {
     has_swept: bool,
     /// What places are being told, until the broker has taken it.
     unnoted: BTreeMap<Place, (u64, Option<String>)>,
-    /// What was told, or would have been if this worker were the leader, a short while ago.
-    recent: VecDeque<(Instant, Told)>,
+    /// What the broker keeps of places that are not told of anything any more.
+    fades: Fades,
+    /// That services are deleted, until the broker has taken it.
+    farewells: BTreeMap<Place, Notice>,
+    /// What others tell, or nobody, as long as this worker does not know that it was told.
+    missed: Missed,
     defaults_problem: Option<String>,
     /// The worker's own configuration.
     own: Option<Own>,
@@ -201,7 +132,10 @@ impl Engine {
             look_at: now + LOOK,
             stream: None,
             reason: None,
-            is_leader: false,
+            leads: None,
+            tells: false,
+            noted: None,
+            shown: None,
             flushed: None,
             flush_at: None,
             settle_at: None,
@@ -210,7 +144,9 @@ impl Engine {
             keyed: BTreeMap::new(),
             has_swept: false,
             unnoted: BTreeMap::new(),
-            recent: VecDeque::new(),
+            fades: Fades::default(),
+            farewells: BTreeMap::new(),
+            missed: Missed::default(),
             defaults_problem: None,
             own: None,
             counts: Counts::default(),
@@ -244,6 +180,8 @@ impl Engine {
             tracing::error!(%error, "the copy is not used");
         }
         self.lacks_texts = lacks_texts(self.replica.state());
+        self.fade_from_notes();
+        self.note_services([Kind::Service]);
         self.flush_at = Some(now);
         // The one of the copies that is behind the other catches up.
         self.keep(Changed::Keys(Vec::new()));
@@ -251,7 +189,9 @@ impl Engine {
 
     /// Works until `stop`.
     pub async fn run(mut self, mut inputs: Inputs, stop: CancellationToken) {
-        self.is_leader = *inputs.leader.borrow_and_update();
+        self.noted = inputs.noted.borrow_and_update().clone();
+        let term = *inputs.leader.borrow_and_update();
+        self.lead(term);
         self.take_defaults(&inputs.defaults.borrow_and_update().clone());
         loop {
             let flush_at = self.flush_at;
@@ -261,11 +201,19 @@ impl Engine {
                 () = stop.cancelled() => return,
                 () = sleep_until(flush_at.unwrap_or_else(Instant::now)), if flush_at.is_some() => self.flush(),
                 Some(query) = inputs.queries.recv() => self.answer_query(query),
-                Ok(()) = inputs.leader.changed() => {
-                    let is_leader = *inputs.leader.borrow_and_update();
-                    self.lead(is_leader);
+                // Before the term that it is of: whoever takes over tells what others have not.
+                Ok(()) = inputs.noted.changed() => {
+                    let mark = inputs.noted.borrow_and_update().clone();
+                    self.note_told(mark);
                 }
-                () = sleep_until(self.look_at) => self.look_at_signs(),
+                Ok(()) = inputs.leader.changed() => {
+                    let term = *inputs.leader.borrow_and_update();
+                    self.lead(term);
+                }
+                () = sleep_until(self.look_at) => {
+                    self.look_at_signs();
+                    self.look_at_fading();
+                }
                 Some(event) = inputs.sync.recv() => self.on_sync(event),
                 Some(sign) = inputs.signs.recv() => self.on_sign(sign),
                 Some(request) = inputs.gets.recv() => self.on_get(&request),
@@ -299,6 +247,7 @@ impl Engine {
                         self.counts.changes += 1;
                         self.wants_all = false;
                         self.served.apply(&change);
+                        self.note_services(change.keys.iter().map(Key::kind));
                         self.note_texts(&change);
                         self.keep(Changed::Keys(change.keys));
                         self.flush_soon();
@@ -361,6 +310,7 @@ impl Engine {
                 "source of configurations"
             );
         }
+        self.begin_telling();
         self.acknowledge_soon();
     }
 
@@ -420,6 +370,7 @@ impl Engine {
         }
         // What came from the main service or a copy of it is better.
         if self.served.load(state, Source::File).is_ok() {
+            self.note_services([Kind::Service]);
             self.flush_soon();
         }
     }

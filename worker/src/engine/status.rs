@@ -24,6 +24,8 @@ pub struct Status {
     pub documents: usize,
     /// Canaries that are not judged, because there are too many.
     pub unwatched: usize,
+    /// Places that others tell, or nobody, as long as it is not known that they were told.
+    pub unconfirmed: usize,
     /// Why the mounted file is not used.
     pub defaults_problem: Option<String>,
     /// Why there is no stream.
@@ -52,7 +54,7 @@ impl Engine {
             "layer": site.layer.as_str(),
             "node": node.map(NodeName::as_str),
             "worker_id": self.identity.worker_id,
-            "leader": self.is_leader,
+            "leader": self.is_leader(),
             "source": self.served.source().map(Source::as_str),
             "connected": self.stream.is_some(),
             "revision": revision,
@@ -67,6 +69,7 @@ impl Engine {
             json,
             counts: Counts {
                 left_out: self.signs.left_out(),
+                missed: self.missed.dropped(),
                 ..self.counts
             },
             is_ready: self.served.is_ready(),
@@ -74,6 +77,7 @@ impl Engine {
             revision,
             documents: self.replica.state().len(),
             unwatched: self.gate.unwatched(),
+            unconfirmed: self.missed.len(),
             defaults_problem: self.defaults_problem.clone(),
             reason: self.reason.clone(),
         }

@@ -4,57 +4,51 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
+use blaze_brokers::KeyedMessage;
 use blaze_domain::config::effective::At;
 use blaze_domain::config::secret;
-use blaze_domain::names::ChannelName;
 use blaze_domain::{DocumentName, InstanceName};
 use bytes::Bytes;
 use tokio::time::Instant;
 
-use super::{Engine, SETTLE, TOGETHER, lacks_texts, now};
+use super::fade::record_key;
+use super::{Engine, TOGETHER, lacks_texts, now};
 use crate::copy::{Notes, Told as Noted, lacks_text};
 use crate::core::messages::{self, Delivery, GetRequest};
 use crate::core::{Change, Flushed, Notice, Place, Site, Standing, Told as ServedTold};
-use crate::serve::Told;
+use crate::serve::{Told, changed};
 
-/// How long ago a notice may be that a new leader tells once more, because the one before may have died over it.
-const RECENT: Duration = Duration::from_secs(15);
 /// How long after the texts of secrets came everybody with secrets gets a whole answer: each asks within this time.
 const TEXTS: Duration = Duration::from_secs(180);
-/// Notices that are remembered for that.
-const MAX_RECENT: usize = 10_000;
 
 /// What an earlier life told, from its notes.
 pub(super) fn told_of(notes: &Notes) -> Vec<(Place, ServedTold)> {
-    let place = |at: &At| {
-        Some(Place {
-            service: at.service.clone()?,
-            instance: at.instance.as_ref().map(InstanceName::from),
-            node: at.node.clone(),
-        })
-    };
     let told = |noted: &Noted| ServedTold {
         revision: noted.revision,
         hash: noted.hash.as_ref().map(ToString::to_string),
     };
     let all = notes
         .all_told()
-        .filter_map(|(at, noted)| Some((place(at)?, told(noted))));
+        .filter_map(|(at, noted)| Some((place_of(at)?, told(noted))));
     all.collect()
 }
 
-fn at(place: &Place, site: &Site) -> At {
+/// The place of a note.
+pub(super) fn place_of(at: &At) -> Option<Place> {
+    Some(Place {
+        service: at.service.clone()?,
+        instance: at.instance.as_ref().map(InstanceName::from),
+        node: at.node.clone(),
+    })
+}
+
+pub(super) fn at(place: &Place, site: &Site) -> At {
     At {
         service: Some(place.service.clone()),
         instance: place.instance.as_ref().map(DocumentName::from),
         layer: Some(site.layer.clone()),
         node: place.node.clone(),
     }
-}
-
-fn channel(notice: &Notice) -> Option<ChannelName> {
-    // A name of a service is always part of a good one.
-    format!("blaze/config/changed/{}", notice.place.service).parse().ok()
 }
 
 impl Engine {
@@ -75,20 +69,29 @@ impl Engine {
             untracked,
         } = self.served.flush(instant.into_std());
         self.counts.notices += notices.len() as u64;
+        self.shown = self.mark();
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
         // First what goes: an instance that moves has the same key there.
         for place in &untracked {
-            self.unnoted.remove(place);
-            self.notes.forget(&at(place, &self.identity.site));
+            let noted = at(place, &self.identity.site);
+            if !self.fade(place, &noted) {
+                self.unnoted.remove(place);
+                self.notes.forget(&noted);
+            }
+            self.missed.forget(place);
             told.extend(self.without_key(place));
         }
+        self.serve_channels();
         let is_gone = |notice: &&Notice| notice.hash.is_none();
         for notice in notices
             .iter()
             .filter(is_gone)
             .chain(notices.iter().filter(|notice| !is_gone(notice)))
         {
-            told.extend(self.of_notice(notice));
+            match self.tells {
+                true => told.extend(self.of_notice(notice)),
+                false => self.missed.note(notice, self.shown.clone(), instant),
+            }
             if !untracked.contains(&notice.place) {
                 self.note(&notice.place, notice.revision, notice.hash.clone());
             }
@@ -105,11 +108,13 @@ impl Engine {
                 told.extend(self.of_standing(place, &standing));
             }
         }
-        self.tell(told, instant);
-        if is_first && self.is_leader {
+        self.tell(told);
+        if is_first && self.tells {
             self.outputs.speaker.sweep_keys();
         }
         self.tell_own();
+        self.begin_telling();
+        self.settle_soon();
         // After the notices: only what was told can go well or badly.
         self.follow_rollouts();
         if self.served.has_pending() {
@@ -117,7 +122,7 @@ impl Engine {
         }
     }
 
-    fn places(&self) -> Vec<Place> {
+    pub(super) fn places(&self) -> Vec<Place> {
         self.served.told().map(|(place, _)| place.clone()).collect()
     }
 
@@ -147,45 +152,13 @@ impl Engine {
                 has_secrets.then(|| self.of_standing(place, &standing)).flatten()
             })
             .collect();
-        self.tell(told, Instant::now());
+        self.tell(told);
     }
 
-    fn tell(&mut self, told: Vec<Told>, at: Instant) {
-        if self.is_leader {
+    /// Keys that nobody is told now are written when this worker begins to tell.
+    pub(super) fn tell(&mut self, told: Vec<Told>) {
+        if self.tells {
             self.outputs.speaker.tell(told);
-            return;
-        }
-        self.recent.extend(told.into_iter().map(|told| (at, told)));
-        while self.recent.len() > MAX_RECENT || self.recent.front().is_some_and(|(then, _)| at - *then > RECENT) {
-            self.recent.pop_front();
-        }
-    }
-
-    /// This worker answers and notifies from now on, or does not any more.
-    pub(super) fn lead(&mut self, is_leader: bool) {
-        if self.is_leader == is_leader {
-            return;
-        }
-        self.is_leader = is_leader;
-        tracing::info!(is_leader, "the lease of the layer");
-        if !is_leader {
-            // What waits is the other one's to tell, and may be old by the time the broker takes it.
-            self.outputs.speaker.clear();
-            return;
-        }
-        let now = Instant::now();
-        let recent = std::mem::take(&mut self.recent);
-        let recent = recent.into_iter().filter(|(then, _)| now - *then <= RECENT);
-        self.outputs.speaker.tell(recent.map(|(_, told)| told));
-        // Keys may be those of an older state.
-        let all: Vec<Told> = self
-            .places()
-            .iter()
-            .filter_map(|place| self.of_standing(place, &self.served.standing_of(place)?))
-            .collect();
-        self.outputs.speaker.tell(all);
-        if self.served.is_ready() {
-            self.outputs.speaker.sweep_keys();
         }
     }
 
@@ -203,12 +176,12 @@ impl Engine {
         if let Some(standing) = self.served.standing_of(&place) {
             self.note(&place, standing.revision, Some(standing.hash.clone()));
             let told = self.of_standing(&place, &standing);
-            self.tell(told.into_iter().collect(), Instant::now());
+            self.tell(told.into_iter().collect());
         }
     }
 
     /// A notice, and the key with it.
-    fn of_notice(&mut self, notice: &Notice) -> Option<Told> {
+    pub(super) fn of_notice(&mut self, notice: &Notice) -> Option<Told> {
         let delivery = self.identity.delivery;
         let text = messages::notice(notice, delivery, now()).inspect_err(|error| {
             tracing::error!(place = %notice.place, %error, "nobody is told of a configuration that is too large");
@@ -217,19 +190,31 @@ impl Engine {
             Some(standing) => self.key(&notice.place, &standing),
             None => self.key_to_go(&notice.place),
         };
+        if notice.hash.is_none() {
+            self.farewells.insert(notice.place.clone(), notice.clone());
+        }
         Some(Told {
             place: notice.place.to_string(),
             key,
-            notice: Some((channel(notice)?, Bytes::from(text.ok()?))),
+            notice: Some(KeyedMessage {
+                channel: changed(&notice.place.service)?,
+                key: record_key(&notice.place),
+                value: Some(Bytes::from(text.ok()?)),
+            }),
+            revision: self.shown.as_ref().map_or(0, |shown| shown.revision),
         })
     }
 
     /// The key alone; `None` if the place has none.
-    fn of_standing(&mut self, place: &Place, standing: &Standing) -> Option<Told> {
+    pub(super) fn of_standing(&mut self, place: &Place, standing: &Standing) -> Option<Told> {
+        if !self.tells {
+            return None;
+        }
         Some(Told {
             place: place.to_string(),
             key: Some(self.key(place, standing)?),
             notice: None,
+            revision: 0,
         })
     }
 
@@ -239,6 +224,7 @@ impl Engine {
             place: place.to_string(),
             key: Some(self.key_to_go(place)?),
             notice: None,
+            revision: 0,
         })
     }
 
@@ -268,7 +254,7 @@ impl Engine {
     }
 
     /// Has it noted what a place is told, once the broker has taken it: whoever dies before tells it again in the next life.
-    fn note(&mut self, place: &Place, revision: u64, hash: Option<String>) {
+    pub(super) fn note(&mut self, place: &Place, revision: u64, hash: Option<String>) {
         let known = self.notes.told(&at(place, &self.identity.site));
         let is_known =
             known.is_some_and(|known| known.revision == revision && known.hash.as_deref() == hash.as_deref());
@@ -276,27 +262,23 @@ impl Engine {
             return;
         }
         self.unnoted.insert(place.clone(), (revision, hash));
-        self.settle_at.get_or_insert(Instant::now() + SETTLE);
+        self.settle_soon();
     }
 
-    /// Notes what the broker has taken meanwhile.
-    pub(super) fn settle(&mut self) {
-        let speaker = &self.outputs.speaker;
-        // What others tell is theirs to note; for this one it is told.
-        let is_taken = |place: &Place| !self.is_leader || !speaker.is_waiting(&place.to_string());
-        let taken: Vec<Place> = self.unnoted.keys().filter(|place| is_taken(place)).cloned().collect();
-        for place in &taken {
-            if let Some((revision, hash)) = self.unnoted.remove(place) {
+    /// Notes what places were told.
+    pub(super) fn note_all(&mut self, told: BTreeSet<Place>) {
+        let has_some = !told.is_empty();
+        for place in told {
+            if let Some((revision, hash)) = self.unnoted.remove(&place) {
                 let told = Noted {
                     revision,
                     hash: hash.map(Arc::from),
                 };
-                self.notes.tell(at(place, &self.identity.site), told);
+                self.notes.tell(at(&place, &self.identity.site), told);
             }
         }
-        if !taken.is_empty() {
+        if has_some {
             self.keep_notes();
         }
-        self.settle_at = (!self.unnoted.is_empty()).then(|| Instant::now() + SETTLE);
     }
 }

@@ -1,33 +1,50 @@
 //! The engine between a main service, a broker and a lease that the test plays.
 
+#[path = "fade_tests.rs"]
+mod fade;
 #[path = "hear_tests.rs"]
 mod hear;
+#[path = "lead_tests.rs"]
+mod lead;
 
 use async_trait::async_trait;
+use blaze_brokers::KeyedMessage;
 use blaze_brokers::redis::KeyChange;
 use blaze_domain::config::Document;
+use blaze_domain::names::ChannelName;
+use bytes::Bytes;
 use serde_json::{Value, json};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinSet;
 
 use super::*;
+use crate::copy::Copies;
+use crate::core::Site;
+use crate::core::messages::Delivery;
 use crate::core::testing::document;
 use crate::core::{Edit, Incoming, Op};
-use crate::serve::{Outlet, OutletError};
+use crate::lease::Term;
+use crate::serve::{Channels, Outlet, OutletError, Speaker};
 
 /// What services see.
 #[derive(Debug, Clone, PartialEq)]
 enum Seen {
     Key(String, Option<Value>),
     Notice(String, Value),
+    TakenAway(String, String),
 }
 
 struct Board {
     seen: mpsc::Sender<Seen>,
+    is_up: watch::Receiver<bool>,
 }
 
 #[async_trait]
 impl Outlet for Board {
-    async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+    async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
+        if !*self.is_up.borrow() {
+            return Err(OutletError::Away("switched off".to_owned()));
+        }
         for change in changes {
             let seen = match change {
                 KeyChange::Put { key, value } => Seen::Key(key.clone(), Some(parse(value))),
@@ -36,11 +53,12 @@ impl Outlet for Board {
             };
             self.seen.send(seen).await.unwrap();
         }
-        for (channel, text) in messages {
-            self.seen
-                .send(Seen::Notice(channel.to_string(), parse(text)))
-                .await
-                .unwrap();
+        for message in messages {
+            let seen = match &message.value {
+                Some(text) => Seen::Notice(message.channel.to_string(), parse(text)),
+                None => Seen::TakenAway(message.channel.to_string(), message.key.clone()),
+            };
+            self.seen.send(seen).await.unwrap();
         }
         Ok(())
     }
@@ -80,7 +98,11 @@ struct World {
     sync: mpsc::Sender<SyncEvent>,
     gets: mpsc::Sender<Bytes>,
     signs: mpsc::Sender<Sign>,
-    leader: watch::Sender<bool>,
+    leader: watch::Sender<Option<u64>>,
+    noted: watch::Sender<Option<Mark>>,
+    told: watch::Receiver<Option<Mark>>,
+    /// Whether the broker takes anything.
+    up: watch::Sender<bool>,
     defaults: watch::Sender<defaults::Status>,
     queries: mpsc::Sender<Query>,
     answers: mpsc::Receiver<(String, Value)>,
@@ -94,11 +116,24 @@ fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
 }
 
 fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) -> World {
+    world_on(start, is_leader, copies, None)
+}
+
+/// The same on a broker where channels are to be made.
+fn world_on(
+    start: Option<Loaded>,
+    is_leader: bool,
+    copies: Option<Copies>,
+    channels: Option<Arc<dyn Channels>>,
+) -> World {
     let (sync, sync_in) = mpsc::channel(64);
     let (gets, gets_in) = mpsc::channel(64);
     let (signs, signs_in) = mpsc::channel(64);
     let (queries, queries_in) = mpsc::channel(64);
-    let (leader, leader_in) = watch::channel(is_leader);
+    let (leader, leader_in) = watch::channel(is_leader.then_some(1));
+    let (noted, noted_in) = watch::channel(None);
+    let (told_out, told) = watch::channel(None);
+    let (up, is_up) = watch::channel(true);
     let (defaults, defaults_in) = watch::channel(defaults::Status::default());
     let (answer, answers) = mpsc::channel(64);
     let (see, seen) = mpsc::channel(64);
@@ -112,12 +147,15 @@ fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) ->
         worker_id: "w-1".to_owned(),
         delivery: Delivery::Text,
     };
-    let speaker = Speaker::default();
+    let speaker = Speaker::new(Term::always());
     let outputs = Outputs {
         replies: Arc::new(Answers(answer)),
         speaker: speaker.clone(),
+        channels,
         copies,
         acks: acks_out,
+        term: Term::always(),
+        told: told_out,
     };
     let inputs = Inputs {
         sync: sync_in,
@@ -125,16 +163,20 @@ fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) ->
         signs: signs_in,
         defaults: defaults_in,
         leader: leader_in,
+        noted: noted_in,
         queries: queries_in,
     };
     let mut tasks = JoinSet::new();
-    tasks.spawn(speaker.run(Arc::new(Board { seen: see })));
+    tasks.spawn(speaker.run(Arc::new(Board { seen: see, is_up })));
     tasks.spawn(Engine::new(identity, outputs, start).run(inputs, CancellationToken::new()));
     World {
         sync,
         gets,
         signs,
         leader,
+        noted,
+        told,
+        up,
         defaults,
         queries,
         answers,
@@ -285,7 +327,7 @@ async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
                 assert_eq!(value["config"]["rate_hz"], 10);
                 Some(key.as_str())
             }
-            Seen::Key(_, None) | Seen::Notice(..) => None,
+            Seen::Key(_, None) | Seen::Notice(..) | Seen::TakenAway(..) => None,
         })
         .collect();
     assert_eq!(keys, ["blaze:config:slam", "blaze:config:slam:0"]);
@@ -316,7 +358,7 @@ async fn what_comes_together_is_told_once_and_the_last_state_always() {
         .iter()
         .filter_map(|seen| match seen {
             Seen::Notice(_, notice) => notice["config"]["rate_hz"].as_u64(),
-            Seen::Key(..) => None,
+            Seen::Key(..) | Seen::TakenAway(..) => None,
         })
         .collect();
     assert_eq!(rates.last(), Some(&52));
@@ -367,29 +409,6 @@ async fn the_main_service_is_told_what_is_here() {
         (&json!(true), &json!(true))
     );
     assert!(status.is_ready && status.in_sync);
-}
-
-#[tokio::test(start_paused = true)]
-async fn only_the_leader_answers_and_a_new_one_tells_what_the_last_may_have_left() {
-    let mut w = world_from(None, false);
-    w.opens(documents(30), 2).await;
-    w.rest().await;
-    let changed = document("Service/slam", 3, json!({ "config": { "rate_hz": 10 } }));
-    w.says(commit(3, 2, vec![(Op::Update, changed)])).await;
-    let request = json!({ "id": "1", "service": "slam", "reply_to": "blaze/reply/t" });
-    w.gets.send(Bytes::from(request.to_string())).await.unwrap();
-    assert_eq!(w.rest().await, []);
-    assert!(w.answers.try_recv().is_err());
-    w.leader.send_replace(true);
-    let (channel, notice) = loop {
-        let (channel, notice) = w.notice().await;
-        if notice["revision"] == 3 {
-            break (channel, notice);
-        }
-    };
-    assert_eq!(channel, "blaze/config/changed/slam");
-    assert_eq!(notice["config"]["rate_hz"], 10);
-    assert_eq!(w.slam().await["config"]["rate_hz"], 10);
 }
 
 #[tokio::test(start_paused = true)]

@@ -7,6 +7,7 @@
 
 pub mod outlet;
 pub mod speaker;
+mod waiting;
 
-pub use outlet::{BrokerOutlet, Outlet, OutletError};
+pub use outlet::{BrokerOutlet, Channels, Outlet, OutletError, changed};
 pub use speaker::{Speaker, SpeakerCounts, Told};

@@ -1,11 +1,18 @@
 //! Where keys and notices go: a broker, and a Redis for the keys where there is one.
+//!
+//! A notice counts as told when the server has it where the broker can tell (Redis that is the broker's own, Kafka), else when
+//! the broker's client has taken it.
 
+use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use blaze_brokers::redis::{KeyChange, KeyError, RedisKeys};
-use blaze_brokers::{Broker, BrokerError, Health, PublishOutcome, Publisher, PublisherOptions};
+use blaze_brokers::redis::{KeyChange, KeyError, RedisKeys, RedisLock};
+use blaze_brokers::{
+    Broker, BrokerError, Health, KeyedMessage, PublishOutcome, Publisher, PublisherOptions, WorkerSide, WriteError,
+};
+use blaze_domain::ServiceName;
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 use lru::LruCache;
@@ -32,6 +39,9 @@ pub enum OutletError {
     /// The broker cannot have such a channel.
     #[error(transparent)]
     Broker(#[from] BrokerError),
+    /// Another worker of the layer leads by now.
+    #[error("another worker has the lease")]
+    Led,
     /// The server of the keys does not do it.
     #[error(transparent)]
     Keys(#[from] KeyError),
@@ -47,7 +57,16 @@ impl OutletError {
                 BrokerError::Name { .. } | BrokerError::Collision { .. } => true,
                 BrokerError::Closed | BrokerError::Away(_) | BrokerError::TooManyChannels(_) => false,
             },
-            Self::Away(_) | Self::Keys(KeyError::Away { .. }) => false,
+            Self::Away(_) | Self::Led | Self::Keys(KeyError::Away { .. }) => false,
+        }
+    }
+}
+
+impl From<WriteError> for OutletError {
+    fn from(error: WriteError) -> Self {
+        match error {
+            WriteError::Broker(error) => Self::Broker(error),
+            WriteError::TooLarge { bytes, .. } => Self::TooLarge { bytes },
         }
     }
 }
@@ -59,7 +78,7 @@ pub trait Outlet: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`OutletError`]: some of it may have been done; doing all of it again does no harm.
-    async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError>;
+    async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError>;
 
     /// Whether keys are kept at all.
     fn has_keys(&self) -> bool;
@@ -74,6 +93,18 @@ pub trait Outlet: Send + Sync + 'static {
     async fn keys_lost(&self);
 }
 
+/// Channels that are there before anybody listens, on brokers where they are to be made.
+pub trait Channels: Send + Sync + 'static {
+    /// These services, and no others, are told of changes from now on. Does not wait.
+    fn serve(&self, services: BTreeSet<ServiceName>);
+}
+
+/// The channel on which a service is told; `None` never happens, as a name of a service is part of a good one.
+#[must_use]
+pub fn changed(service: &ServiceName) -> Option<ChannelName> {
+    format!("blaze/config/changed/{service}").parse().ok()
+}
+
 /// Whether a value of a key is one's own.
 type IsOwn = Box<dyn Fn(&[u8]) -> bool + Send + Sync>;
 
@@ -82,6 +113,9 @@ pub struct BrokerOutlet {
     broker: Arc<dyn Broker>,
     keys: Option<Keys>,
     publishers: Mutex<LruCache<ChannelName, Arc<dyn Publisher>>>,
+    /// What the broker does for workers alone, and the services whose channels it was asked for.
+    side: Option<Arc<dyn WorkerSide>>,
+    served: Mutex<BTreeSet<ServiceName>>,
     /// Whether a value is one that a worker of this place writes.
     is_own: IsOwn,
 }
@@ -90,6 +124,20 @@ struct Keys {
     client: Arc<RedisKeys>,
     /// It is the broker's own server: keys and notices go in one transaction.
     is_broker: bool,
+    /// The lease, where it lies on the same server: the server changes nothing for whoever has not got it.
+    lock: Option<RedisLock>,
+}
+
+impl Keys {
+    async fn apply(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+        match &self.lock {
+            None => Ok(self.client.apply(changes, messages).await?),
+            Some(lock) => match self.client.apply_if_held(lock, changes, messages).await? {
+                true => Ok(()),
+                false => Err(OutletError::Led),
+            },
+        }
+    }
 }
 
 impl BrokerOutlet {
@@ -97,6 +145,8 @@ impl BrokerOutlet {
     #[must_use]
     pub fn new(broker: Arc<dyn Broker>) -> Self {
         Self {
+            side: broker.worker_side(),
+            served: Mutex::default(),
             broker,
             keys: None,
             publishers: Mutex::new(LruCache::new(PUBLISHERS)),
@@ -113,8 +163,27 @@ impl BrokerOutlet {
         is_broker: bool,
         is_own: impl Fn(&[u8]) -> bool + Send + Sync + 'static,
     ) -> Self {
-        self.keys = Some(Keys { client, is_broker });
+        self.keys = Some(Keys {
+            client,
+            is_broker,
+            lock: None,
+        });
         self.is_own = Box::new(is_own);
+        self
+    }
+
+    /// Whether channels are to be made, and keep what was said last on them.
+    #[must_use]
+    pub fn makes_channels(&self) -> bool {
+        self.side.is_some()
+    }
+
+    /// The same for one of several workers, whose lease lies on the Redis of the keys.
+    #[must_use]
+    pub fn while_held(mut self, lock: Option<RedisLock>) -> Self {
+        if let Some(keys) = &mut self.keys {
+            keys.lock = lock;
+        }
         self
     }
 
@@ -158,21 +227,23 @@ impl BrokerOutlet {
 
 #[async_trait]
 impl Outlet for BrokerOutlet {
-    async fn deliver(&self, changes: &[KeyChange], messages: &[(ChannelName, Bytes)]) -> Result<(), OutletError> {
+    async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
         match &self.keys {
             Some(keys) if keys.is_broker => {
-                keys.client.apply(changes, messages).await?;
-                return Ok(());
+                let messages: Vec<_> = said(messages).map(|(to, text)| (to.clone(), text.clone())).collect();
+                return keys.apply(changes, &messages).await;
             }
-            Some(keys) => keys.client.apply(changes, &[]).await?,
+            Some(keys) => keys.apply(changes, &[]).await?,
             None => {}
         }
-        if !messages.is_empty() {
-            self.check_up()?;
+        if messages.is_empty() {
+            return Ok(());
         }
-        messages
-            .iter()
-            .try_for_each(|(channel, payload)| self.publish(channel, payload))
+        if let Some(side) = &self.side {
+            return Ok(side.write(messages).await?);
+        }
+        self.check_up()?;
+        said(messages).try_for_each(|(to, text)| self.publish(to, text))
     }
 
     fn has_keys(&self) -> bool {
@@ -191,5 +262,29 @@ impl Outlet for BrokerOutlet {
             Some(keys) => keys.client.restarted().await,
             None => std::future::pending().await,
         }
+    }
+}
+
+/// What is said: where nothing is kept, nothing is taken away.
+fn said(messages: &[KeyedMessage]) -> impl Iterator<Item = (&ChannelName, &Bytes)> {
+    messages
+        .iter()
+        .filter_map(|message| Some((&message.channel, message.value.as_ref()?)))
+}
+
+impl Channels for BrokerOutlet {
+    fn serve(&self, services: BTreeSet<ServiceName>) {
+        let Some(side) = &self.side else { return };
+        let mut served = self.served.lock();
+        for service in services.difference(&served) {
+            let Some(channel) = changed(service) else { continue };
+            if let Err(error) = side.prepare(&channel) {
+                tracing::error!(%error, %service, "it cannot be told of changes; it is answered when it asks");
+            }
+        }
+        for channel in served.difference(&services).filter_map(changed) {
+            side.release(&channel);
+        }
+        *served = services;
     }
 }

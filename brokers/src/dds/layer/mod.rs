@@ -24,6 +24,7 @@ mod seen;
 mod send;
 mod shared;
 mod slot;
+mod worker_side;
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
@@ -43,11 +44,13 @@ use super::DdsError;
 use super::reader::StoppableThread;
 use crate::outbox::{Body, Lane};
 use crate::port::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, Health, Later, PublishOutcome, Publisher, PublisherOptions,
+    Broker, BrokerError, BrokerKind, BrokerStatus, Later, PublishOutcome, Publisher, PublisherOptions,
     SubscribeOptions, Subscription,
 };
+use crate::worker_side::WorkerSide;
 use send::Target;
 use shared::Shared;
+use worker_side::DdsWorkerSide;
 
 pub use channel::MAX_CHANNELS;
 pub use shared::MAX_QUEUE_BYTES;
@@ -84,6 +87,7 @@ pub struct DdsCounts {
 /// A participant of the layer's DDS domain.
 pub struct DdsBroker {
     shared: Arc<Shared>,
+    worker: Arc<DdsWorkerSide>,
     threads: Mutex<Vec<StoppableThread>>,
 }
 
@@ -118,6 +122,7 @@ impl DdsBroker {
             channel::start(&shared, true)?,
         ];
         Ok(Self {
+            worker: Arc::new(DdsWorkerSide::new(&shared)),
             shared,
             threads: Mutex::new(threads),
         })
@@ -144,11 +149,10 @@ impl DdsBroker {
         if self.is_closing() {
             return Err(BrokerError::Closed);
         }
-        let status = self.shared.status.borrow();
-        if status.health == Health::Up {
+        if self.shared.is_up() {
             Ok(())
         } else {
-            Err(BrokerError::Away(status.detail.clone()))
+            Err(self.shared.away())
         }
     }
 }
@@ -189,6 +193,10 @@ impl Broker for DdsBroker {
             Ok(Err(_)) => Err(BrokerError::Closed),
             Err(_) => Err(BrokerError::Away("RustDDS made no reader in time".to_owned())),
         }
+    }
+
+    fn worker_side(&self) -> Option<Arc<dyn WorkerSide>> {
+        Some(Arc::clone(&self.worker) as Arc<dyn WorkerSide>)
     }
 
     async fn close(&self) {

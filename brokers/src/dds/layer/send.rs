@@ -53,8 +53,7 @@ pub(super) struct Target {
 
 impl Target {
     pub(super) fn new(shared: &Arc<Shared>, topic: Arc<str>, options: PublisherOptions) -> Self {
-        static IDS: AtomicU64 = AtomicU64::new(0);
-        let depth = u16::try_from(options.depth.min(MAX_DEPTH)).unwrap_or(u16::MAX);
+        let depth = depth_of(options.depth);
         let key = SlotKey {
             topic,
             reliable: options.reliable || depth > 0,
@@ -62,12 +61,34 @@ impl Target {
             depth: 0,
             origin: None,
         };
+        let target = Self::with_writer(shared, key);
+        Self {
+            key: SlotKey { depth, ..target.key },
+            slot: target.slot.filter(|_| depth == 0),
+            ..target
+        }
+    }
+
+    /// One writer for all that is published, which keeps the last `depth` for late joiners, whoever wrote them.
+    pub(super) fn keeping(shared: &Arc<Shared>, topic: Arc<str>, depth: u32) -> Self {
+        let key = SlotKey {
+            topic,
+            reliable: true,
+            large: false,
+            depth: depth_of(depth),
+            origin: None,
+        };
+        Self::with_writer(shared, key)
+    }
+
+    fn with_writer(shared: &Arc<Shared>, key: SlotKey) -> Self {
+        static IDS: AtomicU64 = AtomicU64::new(0);
         let slot = shared.slots.get(key.clone());
         shared.wake_lifecycle();
         Self {
             id: IDS.fetch_add(1, Ordering::Relaxed),
-            key: SlotKey { depth, ..key },
-            slot: Some(slot).filter(|_| depth == 0),
+            key,
+            slot: Some(slot),
             origins: Mutex::new(LruCache::unbounded()),
         }
     }
@@ -104,6 +125,10 @@ impl Target {
         shared.wake_lifecycle();
         slot
     }
+}
+
+fn depth_of(depth: u32) -> u16 {
+    u16::try_from(depth.min(MAX_DEPTH)).unwrap_or(u16::MAX)
 }
 
 pub(super) fn start(shared: &Arc<Shared>) -> Result<StoppableThread, DdsError> {

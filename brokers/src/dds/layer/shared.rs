@@ -19,7 +19,7 @@ use super::slot::Slots;
 use crate::dds::EndpointId;
 use crate::dds::writer::participant_of;
 use crate::outbox::{Outbox, OutboxLimits};
-use crate::port::{BrokerStatus, Health};
+use crate::port::{BrokerError, BrokerStatus, Health};
 
 /// Most bytes that wait for the network, of one publisher and of all together.
 pub const MAX_QUEUE_BYTES: usize = 64 * 1024 * 1024;
@@ -159,6 +159,15 @@ impl Shared {
 
     pub(super) fn is_up(&self) -> bool {
         self.status.borrow().health == Health::Up
+    }
+
+    /// Why nothing can be written or read now.
+    pub(super) fn away(&self) -> BrokerError {
+        let status = self.status.borrow();
+        match status.health {
+            Health::Closed => BrokerError::Closed,
+            Health::Connecting | Health::Up | Health::Down | Health::InUse => BrokerError::Away(status.detail.clone()),
+        }
     }
 
     /// Whether what is published is dropped at once. While it starts for the first time or is built anew, messages wait.

@@ -30,9 +30,10 @@ pub(in crate::kafka) enum Delivery {
         /// Ends with the last message of the batch.
         batch: Arc<Batch>,
     },
-    /// A value of a key; told whether the server has it.
+    /// A value of a key; told what became of it.
     Keyed {
-        done: oneshot::Sender<bool>,
+        done: oneshot::Sender<Fate>,
+        topic: Arc<Topic>,
         sent: Instant,
         batch: Arc<Batch>,
     },
@@ -119,11 +120,16 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
             }
             Delivery::Keyed {
                 done,
+                topic,
                 sent,
                 batch: _batch,
             } => {
+                let fate = match result {
+                    Ok(_) => Fate::Delivered,
+                    Err((error, _)) => self.0.failed(error, &topic),
+                };
                 // Nobody waits any more when the broker is closed.
-                let _ = done.send(result.is_ok());
+                let _ = done.send(fate);
                 sent
             }
         };

@@ -5,6 +5,7 @@ mod crowd;
 mod gone;
 mod plain;
 mod support;
+mod worker;
 
 /// The rules for all adapters, each in a domain of its own.
 mod conformance {

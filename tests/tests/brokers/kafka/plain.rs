@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use blaze_tests::servers::KafkaServer;
 use rdkafka::ClientConfig;
-use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, TopicReplication};
+use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, ResourceSpecifier, TopicReplication};
 use rdkafka::client::DefaultClientContext;
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
 use rdkafka::message::{Header, OwnedHeaders};
@@ -32,6 +32,16 @@ pub(crate) async fn make_topic(server: &KafkaServer, name: &str, partitions: i32
         .await
         .unwrap();
     assert_eq!(made, [Ok(name.to_owned())]);
+}
+
+/// A setting of a topic.
+pub(crate) async fn topic_setting(server: &KafkaServer, topic: &str, name: &str) -> String {
+    let found = admin(server)
+        .describe_configs([&ResourceSpecifier::Topic(topic)], &AdminOptions::new())
+        .await
+        .unwrap();
+    let config = found.into_iter().next().unwrap().unwrap();
+    config.get(name).unwrap().value.clone().unwrap()
 }
 
 /// Whether the server has a topic.

@@ -1,39 +1,12 @@
 //! What a service says about the configuration that it got.
 
+use blaze_domain::config::AckStatus;
 use blaze_domain::{InstanceName, NodeName, ServiceName};
 
 use super::fields::{check_depth, need, object, parsed, text, whole};
 
 const MAX_DETAIL_BYTES: usize = 4 * 1024;
 const MAX_HASH_BYTES: usize = 128;
-
-/// How a service gets on with its configuration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum AckStatus {
-    /// It runs with it.
-    Applied,
-    /// It does not take it, and goes on with the one before.
-    Rejected,
-    /// It runs with it, and not well.
-    Unhealthy,
-    /// It runs well again.
-    Healthy,
-}
-
-impl AckStatus {
-    const ALL: [Self; 4] = [Self::Applied, Self::Rejected, Self::Unhealthy, Self::Healthy];
-
-    /// The word in messages.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Applied => "applied",
-            Self::Rejected => "rejected",
-            Self::Unhealthy => "unhealthy",
-            Self::Healthy => "healthy",
-        }
-    }
-}
 
 /// An acknowledgement of a configuration.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -63,8 +36,7 @@ impl ConfigAck {
         let members = object(bytes).map_err(|detail| format!("the message: {detail}"))?;
         check_depth(&members)?;
         let word = need(text(&members, "status", MAX_HASH_BYTES)?, "status")?;
-        let status = AckStatus::ALL.into_iter().find(|status| status.as_str() == word);
-        let status = status.ok_or("status: must be applied, rejected, unhealthy or healthy")?;
+        let status = AckStatus::from_word(word).ok_or("status: must be applied, rejected, unhealthy or healthy")?;
         let detail = text(&members, "detail", MAX_DETAIL_BYTES)?.unwrap_or_default();
         Ok(Self {
             service: need(parsed(&members, "service")?, "service")?,

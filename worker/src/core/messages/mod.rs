@@ -18,7 +18,7 @@ mod keys;
 mod watchdog;
 mod write;
 
-pub use ack::{AckStatus, ConfigAck};
+pub use ack::ConfigAck;
 pub use fields::MAX_MESSAGE_BYTES;
 pub use get::{ErrorCode, GetRequest, RefusedRequest, RequestError};
 pub use keys::{config_key, lease_key, watchdog_key};

@@ -1,0 +1,135 @@
+//! What a worker of BlazeConfig does on its Kafka, beside messages: topics, and notices that stay in them, one per key.
+//!
+//! A notice is a record with a key, whose value is the payload as it is; a record without a value takes it away. It counts as
+//! written when the server has acknowledged it. What it has not within some seconds is given up, so that the newest takes its
+//! place.
+
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use blaze_domain::names::ChannelName;
+use blaze_domain::{DropReason, MAX_PAYLOAD_BYTES};
+use tokio::sync::oneshot;
+
+use super::admin::Purpose;
+use super::inner::{Inner, MAX_CHANNELS};
+use super::maker::Maker;
+use super::names::{Names, OF_WORKER};
+use super::producer::Producer;
+use super::settings::Lot;
+use super::topics::Topic;
+use crate::outbox::Fate;
+use crate::port::BrokerError;
+use crate::worker_side::{KeyedMessage, WorkerSide, WriteError};
+
+/// The worker's part of a broker.
+pub(super) struct WorkerState {
+    pub(super) maker: Maker,
+}
+
+impl WorkerState {
+    pub(super) fn new(names: &Names) -> Self {
+        let needed = OF_WORKER
+            .iter()
+            .map(|channel| (names.reserved(channel), Purpose::Messages));
+        Self {
+            maker: Maker::new(needed.collect()),
+        }
+    }
+}
+
+/// What the worker is given.
+pub(super) struct KafkaWorkerSide {
+    pub(super) inner: Arc<Inner>,
+    pub(super) state: Arc<WorkerState>,
+}
+
+impl KafkaWorkerSide {
+    /// The topic of a message; `None`: there is nothing to be written.
+    fn topic_of(&self, message: &KeyedMessage) -> Result<Option<Arc<Topic>>, BrokerError> {
+        let name = self.inner.names.topic(&message.channel)?;
+        let refuse = |reason: String| {
+            Err(BrokerError::Name {
+                channel: message.channel.to_string(),
+                reason,
+            })
+        };
+        match self.state.maker.with(&name, |prepared| Arc::clone(&prepared.topic)) {
+            Some(topic) if topic.partitions().is_some() => Ok(Some(topic)),
+            Some(_) => match self.state.maker.refusal(&name) {
+                Some(code) => refuse(format!("the server does not make its topic {name}: {code}")),
+                None => Err(BrokerError::Away(format!("topic {name} is being made"))),
+            },
+            None if message.value.is_none() => Ok(None),
+            None => refuse("it was not prepared, or its topic has the name of another one".to_owned()),
+        }
+    }
+
+    fn producer(&self) -> Result<Arc<Producer>, BrokerError> {
+        self.inner.producer(Lot::default())
+    }
+}
+
+fn bytes_of(message: &KeyedMessage) -> usize {
+    message.value.as_ref().map_or(0, bytes::Bytes::len)
+}
+
+fn too_large(message: &KeyedMessage) -> WriteError {
+    WriteError::TooLarge {
+        channel: message.channel.clone(),
+        bytes: bytes_of(message),
+    }
+}
+
+#[async_trait]
+impl WorkerSide for KafkaWorkerSide {
+    fn prepare(&self, channel: &ChannelName) -> Result<(), BrokerError> {
+        let maker = &self.state.maker;
+        if maker.count() >= MAX_CHANNELS {
+            return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
+        }
+        maker.prepare(&self.inner, channel, Purpose::Notices, 1)
+    }
+
+    fn release(&self, channel: &ChannelName) {
+        if let Ok(name) = self.inner.names.topic(channel) {
+            self.state.maker.release(&name);
+        }
+    }
+
+    async fn write(&self, messages: &[KeyedMessage]) -> Result<(), WriteError> {
+        if self.inner.is_closed() {
+            return Err(BrokerError::Closed.into());
+        }
+        if !self.inner.gate.is_open() {
+            return Err(BrokerError::Away(self.inner.status.borrow().detail.clone()).into());
+        }
+        let producer = self.producer()?;
+        let mut ready = Vec::with_capacity(messages.len());
+        // Nothing is written before all can be, so that what is tried again keeps its order.
+        for message in messages {
+            if bytes_of(message) > MAX_PAYLOAD_BYTES {
+                return Err(too_large(message));
+            }
+            ready.extend(self.topic_of(message)?.map(|topic| (message, topic)));
+        }
+        let mut answers = Vec::with_capacity(ready.len());
+        for (message, topic) in ready {
+            let (done, answer) = oneshot::channel();
+            producer.send_keyed(&topic, None, &message.key, message.value.as_ref(), done);
+            answers.push((message, answer));
+        }
+        let mut written = Ok(());
+        for (message, answer) in answers {
+            let error = match answer.await {
+                Ok(Fate::Delivered) => continue,
+                Ok(Fate::Dropped(DropReason::TooLarge)) => too_large(message),
+                Ok(Fate::Dropped(_)) | Err(_) => {
+                    BrokerError::Away(format!("{}: the server did not acknowledge it", message.channel)).into()
+                }
+            };
+            written = written.and(Err(error));
+        }
+        written
+    }
+}

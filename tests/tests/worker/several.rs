@@ -1,0 +1,223 @@
+//! Two workers of one layer: one serves, and when it is killed, stopped or ended the other one does.
+
+use std::time::{Duration, Instant};
+
+use blaze_tests::process::Signal;
+use blaze_tests::servers::{KafkaOptions, KafkaServer, MongoOptions, MongoServer};
+use serde_json::{Value, json};
+
+use super::stage::{PATIENCE, Stage, Worker};
+
+/// `worker.lease_ms`, unless set.
+const LEASE: Duration = Duration::from_secs(5);
+/// Between two looks at the status, and what a look may take on a machine that does much else.
+const LOOK: Duration = Duration::from_millis(250);
+/// The broker tells those who wait of a change with the next heartbeat, and is told that they know it.
+const REBALANCE: Duration = Duration::from_secs(2);
+
+/// Two workers of a layer whose further sections these are, one of which leads: that one first.
+async fn two(stage: &Stage, sections: &Value) -> (Worker, Worker) {
+    let (one, other) = (
+        stage.layer_worker("fog-1", sections),
+        stage.layer_worker("fog-2", sections),
+    );
+    stage.equal(&one, PATIENCE).await;
+    stage.equal(&other, PATIENCE).await;
+    let start = Instant::now();
+    loop {
+        match (one.leads().await, other.leads().await) {
+            (Some(true), Some(false)) => return (one, other),
+            (Some(false), Some(true)) => return (other, one),
+            (Some(true), Some(true)) => panic!("two lead"),
+            _ => assert!(
+                start.elapsed() < PATIENCE,
+                "none leads: {} {}",
+                one.tail(),
+                other.tail()
+            ),
+        }
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+/// How long until it leads, from an instant on.
+async fn until_it_leads(worker: &Worker, since: Instant) -> Duration {
+    while worker.leads().await != Some(true) {
+        assert!(since.elapsed() < PATIENCE, "it does not take over: {}", worker.tail());
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    since.elapsed()
+}
+
+/// The leader is killed, stopped, goes on, and is ended; each time the other one takes over within `lost` or, where it
+/// could say so, `given`.
+async fn takeovers(name: &str, stage: &Stage, sections: &Value, lost: Duration, given: Duration) {
+    let (leader, other) = two(stage, sections).await;
+    let since = Instant::now();
+    leader.kill();
+    let killed = until_it_leads(&other, since).await;
+
+    // It has been the follower's turn; the one that was killed is there again.
+    let leader = other;
+    let other = stage.layer_worker("fog-3", sections);
+    stage.equal(&other, PATIENCE).await;
+    assert_eq!(other.leads().await, Some(false));
+    let since = Instant::now();
+    leader.signal(Signal::STOP);
+    let stopped = until_it_leads(&other, since).await;
+    leader.signal(Signal::CONT);
+    let since = Instant::now();
+    while since.elapsed() < LEASE {
+        if let Some(leads) = leader.leads().await {
+            assert!(!leads, "it was stopped and has lost the lease: {}", leader.tail());
+        }
+        assert_ne!(other.leads().await, Some(false), "it has the lease: {}", other.tail());
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert_eq!((leader.leads().await, other.leads().await), (Some(false), Some(true)));
+
+    let since = Instant::now();
+    other.stop();
+    let ended = until_it_leads(&leader, since).await;
+    println!("{name}: taken over {killed:?} after a kill, {stopped:?} after a stop, {ended:?} after an end");
+    assert!(killed <= lost, "after a kill {killed:?}, not {lost:?}");
+    assert!(stopped <= lost, "after a stop {stopped:?}, not {lost:?}");
+    assert!(ended <= given, "after an end {ended:?}, not {given:?}");
+    leader.stop();
+}
+
+async fn stage() -> (Stage, blaze_tests::process::Process) {
+    let stage = Stage::new();
+    let main = stage.main();
+    stage.robot().await;
+    (stage, main)
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn with_redis_another_worker_takes_over_within_a_lease() {
+    let (stage, _main) = stage().await;
+    let sections = json!({ "cache": { "redis": { "url": stage.redis.url() } } });
+    // From the signal to the end of the process, and the next look.
+    let given = Duration::from_secs(1);
+    takeovers("Redis", &stage, &sections, LEASE + LOOK, given).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn with_mongodb_another_worker_takes_over_within_a_lease() {
+    let (stage, _main) = stage().await;
+    let server = MongoServer::start(MongoOptions::default()).unwrap();
+    let sections = json!({ "database": { "mongodb": { "uri": server.uri(), "database": "blaze" } } });
+    takeovers("MongoDB", &stage, &sections, LEASE + LOOK, Duration::from_secs(1)).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn with_kafka_another_worker_takes_over_within_the_least_session_of_the_broker() {
+    let (stage, _main) = stage().await;
+    let server = KafkaServer::start(KafkaOptions::default()).unwrap();
+    let sections = json!({ "brokers": { "layer": { "kafka": { "bootstrap": [server.bootstrap()] } } } });
+    let lost = Duration::from_secs(6) + REBALANCE;
+    takeovers("Kafka", &stage, &sections, lost, Duration::from_secs(1) + REBALANCE).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn with_a_kafka_that_allows_it_another_worker_takes_over_within_a_lease() {
+    let (stage, _main) = stage().await;
+    let options = KafkaOptions {
+        extra: vec!["group.min.session.timeout.ms=1000".to_owned()],
+        ..KafkaOptions::default()
+    };
+    let server = KafkaServer::start(options).unwrap();
+    let sections = json!({ "brokers": { "layer": { "kafka": { "bootstrap": [server.bootstrap()] } } } });
+    takeovers(
+        "Kafka with short sessions",
+        &stage,
+        &sections,
+        LEASE + LOOK,
+        Duration::from_secs(1) + LOOK,
+    )
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn whoever_was_stopped_writes_nothing_older_over_what_the_next_one_wrote() {
+    let (stage, _main) = stage().await;
+    let sections = json!({
+        "cache": { "redis": { "url": stage.redis.url() } },
+        "worker": { "state_dir": stage.path("shared-by-none"), "lease_ms": 1000 },
+    });
+    let sections_of = |node: &str| {
+        let mut sections = sections.clone();
+        sections["worker"]["state_dir"] = json!(stage.path(node));
+        sections
+    };
+    let leader = stage.layer_worker("fog-1", &sections_of("fog-1"));
+    stage.equal(&leader, PATIENCE).await;
+    until_it_leads(&leader, Instant::now()).await;
+    let other = stage.layer_worker("fog-2", &sections_of("fog-2"));
+    stage.equal(&other, PATIENCE).await;
+    for round in 1..=3_u64 {
+        // It is stopped with a change on its way.
+        stage
+            .put(
+                "/services/slam",
+                json!({ "config": { "camera": { "rate_hz": round } } }),
+            )
+            .await;
+        leader.signal(Signal::STOP);
+        until_it_leads(&other, Instant::now()).await;
+        let revision = stage
+            .put(
+                "/services/slam",
+                json!({ "config": { "camera": { "rate_hz": round + 100 } } }),
+            )
+            .await;
+        let key = async || {
+            let key = stage.keys().get("blaze:config:slam:0").await.unwrap();
+            key.map(|key| serde_json::from_slice::<Value>(&key).unwrap())
+        };
+        let start = Instant::now();
+        while key().await.is_none_or(|key| key["revision"] != revision) {
+            assert!(start.elapsed() < PATIENCE, "{:?}; {}", key().await, other.tail());
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        leader.signal(Signal::CONT);
+        let start = Instant::now();
+        let mut answers = 0;
+        while start.elapsed() < Duration::from_secs(2) {
+            answers += u32::from(leader.leads().await == Some(false));
+            let key = key().await.expect("the key is there");
+            assert_eq!(key["revision"], revision, "an older one was written: {}", leader.tail());
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        assert!(answers > 0, "it goes on");
+        // The other one leads the next round, too, so it makes way.
+        other.signal(Signal::STOP);
+        until_it_leads(&leader, Instant::now()).await;
+        other.signal(Signal::CONT);
+        stage.equal(&other, PATIENCE).await;
+        assert_eq!(other.leads().await, Some(false));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_nobody_told_for_long_is_in_the_keys_and_the_mark_once_somebody_leads() {
+    let (stage, _main) = stage().await;
+    let sections = json!({ "cache": { "redis": { "url": stage.redis.url() } } });
+    let worker = stage.layer_worker("fog-1", &sections);
+    stage.equal(&worker, PATIENCE).await;
+    until_it_leads(&worker, Instant::now()).await;
+    let mark = async || {
+        let mark = stage.keys().get("blaze:lease:worker:edge:told").await.unwrap();
+        mark.map(|mark| serde_json::from_slice::<Value>(&mark).unwrap())
+    };
+    let status = worker.status().await;
+    let start = Instant::now();
+    while mark().await.is_none_or(|mark| mark["revision"] != status["revision"]) {
+        assert!(start.elapsed() < PATIENCE, "{:?}; {}", mark().await, worker.tail());
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    let owner = stage.keys().get("blaze:lease:worker:edge").await.unwrap().unwrap();
+    assert_eq!(owner, status["worker_id"].as_str().unwrap());
+    worker.stop();
+    assert_eq!(stage.keys().get("blaze:lease:worker:edge").await.unwrap(), None);
+}

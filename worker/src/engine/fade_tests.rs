@@ -1,0 +1,131 @@
+//! What a broker keeps of services that are gone, or that nobody asks for any more.
+
+use std::collections::BTreeSet;
+
+use blaze_domain::ServiceName;
+use parking_lot::Mutex;
+
+use super::*;
+use crate::copy::Told as Noted;
+
+/// Longer than anything stays.
+const LONG: Duration = Duration::from_secs(900);
+
+#[derive(Default)]
+struct Made(Mutex<Vec<BTreeSet<ServiceName>>>);
+
+impl Channels for Made {
+    fn serve(&self, services: BTreeSet<ServiceName>) {
+        self.0.lock().push(services);
+    }
+}
+
+impl Made {
+    fn last(&self) -> Vec<String> {
+        let all = self.0.lock();
+        let last = all.last().into_iter().flatten();
+        last.map(ToString::to_string).collect()
+    }
+}
+
+fn world(start: Option<Loaded>) -> (World, Arc<Made>) {
+    let made = Arc::<Made>::default();
+    let world = world_on(start, true, None, Some(Arc::clone(&made) as Arc<dyn Channels>));
+    (world, made)
+}
+
+fn taken_away(seen: &[Seen]) -> Vec<(&str, &str)> {
+    let taken_away = |seen: &'_ Seen| matches!(seen, Seen::TakenAway(..));
+    let all = seen.iter().filter(|seen| taken_away(seen));
+    all.filter_map(|seen| match seen {
+        Seen::TakenAway(channel, key) => Some((channel.as_str(), key.as_str())),
+        Seen::Key(..) | Seen::Notice(..) => None,
+    })
+    .collect()
+}
+
+#[tokio::test(start_paused = true)]
+async fn channels_are_there_before_anything_is_said_and_what_is_over_is_taken_away_later() {
+    let (mut w, made) = world(None);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    assert_eq!(made.last(), ["nav", "slam"]);
+    let late = document("Service/late", 3, json!({}));
+    w.says(commit(3, 2, vec![(Op::Create, late.clone())])).await;
+    w.rest().await;
+    assert_eq!(made.last(), ["late", "nav", "slam"]);
+
+    w.slam().await;
+    w.says(commit(4, 3, vec![(Op::Delete, late)])).await;
+    let seen = w.rest().await;
+    assert!(
+        matches!(&seen[..], [.., Seen::Notice(channel, notice)] if channel.ends_with("/late") && notice["deleted"] == true),
+        "{seen:?}"
+    );
+    assert!(taken_away(&seen).is_empty());
+    assert_eq!(
+        made.last(),
+        ["late", "nav", "slam"],
+        "whoever comes late hears of the end"
+    );
+    tokio::time::sleep(LONG).await;
+    let seen = w.rest().await;
+    // The instance asked once and not again.
+    let mut gone = taken_away(&seen);
+    gone.sort_unstable();
+    assert_eq!(
+        gone,
+        [("blaze/config/changed/late", ""), ("blaze/config/changed/slam", "0")]
+    );
+    assert_eq!(made.last(), ["nav", "slam"]);
+    tokio::time::sleep(LONG).await;
+    assert!(taken_away(&w.rest().await).is_empty(), "once");
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_comes_back_meanwhile_is_not_taken_away() {
+    let (mut w, made) = world(None);
+    w.opens(documents(30), 2).await;
+    let nav = document("Service/nav", 3, json!({ "config": { "speed": 1 } }));
+    w.says(commit(3, 2, vec![(Op::Delete, nav.clone())])).await;
+    w.rest().await;
+    tokio::time::sleep(Duration::from_secs(300)).await;
+    w.says(commit(4, 3, vec![(Op::Create, nav)])).await;
+    tokio::time::sleep(LONG).await;
+    assert!(taken_away(&w.rest().await).is_empty());
+    assert_eq!(made.last(), ["nav", "slam"]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_worker_that_is_restarted_takes_away_what_was_over_before() {
+    let mut notes = Notes::default();
+    let at = blaze_domain::config::effective::At {
+        service: Some("old".parse().unwrap()),
+        instance: Some("7".parse().unwrap()),
+        layer: Some("edge".parse().unwrap()),
+        node: Some("robot-1".parse().unwrap()),
+    };
+    notes.tell(
+        at,
+        Noted {
+            revision: 1,
+            hash: None,
+        },
+    );
+    let loaded = Loaded {
+        position: Position {
+            store_id: "s".to_owned(),
+            layer: "edge".parse().unwrap(),
+            revision: 2,
+            as_of: Timestamp::default(),
+        },
+        documents: documents(30).into_iter().map(Arc::new).collect(),
+        notes: Arc::new(notes),
+    };
+    let (mut w, made) = world(Some(loaded));
+    w.rest().await;
+    assert_eq!(made.last(), ["nav", "old", "slam"]);
+    tokio::time::sleep(LONG).await;
+    assert_eq!(taken_away(&w.rest().await), [("blaze/config/changed/old", "7")]);
+    assert_eq!(made.last(), ["nav", "slam"]);
+}

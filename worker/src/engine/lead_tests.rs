@@ -1,0 +1,282 @@
+//! Who tells, and what a new leader makes up for.
+
+use super::*;
+use crate::serve::SpeakerCounts;
+
+fn mark(revision: u64) -> Mark {
+    Mark {
+        store_id: "s".to_owned(),
+        revision,
+    }
+}
+
+fn slam(revision: u64, rate: u64) -> Incoming {
+    let changed = document("Service/slam", revision, json!({ "config": { "rate_hz": rate } }));
+    commit(revision, revision - 1, vec![(Op::Update, changed)])
+}
+
+/// Notices among what was seen: revision and rate.
+fn notices(seen: &[Seen]) -> Vec<(u64, u64)> {
+    let of_slam = seen.iter().filter_map(|seen| match seen {
+        Seen::Notice(channel, notice) if channel.ends_with("/slam") => Some((
+            notice["revision"].as_u64().unwrap(),
+            notice["config"]["rate_hz"].as_u64().unwrap_or_default(),
+        )),
+        Seen::Notice(..) | Seen::Key(..) => None,
+    });
+    of_slam.collect()
+}
+
+fn key_of_slam(seen: &[Seen]) -> Option<u64> {
+    let keys = seen.iter().rev().find_map(|seen| match seen {
+        Seen::Key(key, Some(value)) if key == "blaze:config:slam" => value["config"]["rate_hz"].as_u64(),
+        Seen::Key(..) | Seen::Notice(..) => None,
+    });
+    keys
+}
+
+#[tokio::test(start_paused = true)]
+async fn only_the_leader_answers_and_a_new_one_tells_what_the_last_may_have_left() {
+    let mut w = world_from(None, false);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    let changed = document("Service/slam", 3, json!({ "config": { "rate_hz": 10 } }));
+    w.says(commit(3, 2, vec![(Op::Update, changed)])).await;
+    let request = json!({ "id": "1", "service": "slam", "reply_to": "blaze/reply/t" });
+    w.gets.send(Bytes::from(request.to_string())).await.unwrap();
+    assert_eq!(w.rest().await, []);
+    assert!(w.answers.try_recv().is_err());
+    w.leader.send_replace(Some(1));
+    let (channel, notice) = loop {
+        let (channel, notice) = w.notice().await;
+        if notice["revision"] == 3 {
+            break (channel, notice);
+        }
+    };
+    assert_eq!(channel, "blaze/config/changed/slam");
+    assert_eq!(notice["config"]["rate_hz"], 10);
+    assert_eq!(w.slam().await["config"]["rate_hz"], 10);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_nobody_told_for_long_is_told_by_whoever_leads_next() {
+    let mut w = world_from(None, false);
+    w.opens(documents(30), 2).await;
+    w.says(slam(3, 10)).await;
+    w.says(slam(4, 11)).await;
+    w.rest().await;
+    tokio::time::sleep(Duration::from_secs(600)).await;
+    w.leader.send_replace(Some(1));
+    let told = w.rest().await;
+    assert_eq!(notices(&told), [(4, 11)], "the last state, once");
+    let Some(Seen::Notice(_, notice)) = told
+        .iter()
+        .find(|seen| matches!(seen, Seen::Notice(channel, _) if channel.ends_with("/slam")))
+    else {
+        panic!("{told:?}");
+    };
+    assert_eq!(
+        notice["previous_hash"],
+        Value::Null,
+        "before the first documents there was nothing"
+    );
+    assert_eq!(key_of_slam(&told), Some(11));
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_others_have_told_is_not_told_again_unless_it_was_just_now() {
+    let mut w = world_from(None, false);
+    w.opens(documents(30), 2).await;
+    w.says(slam(3, 10)).await;
+    w.rest().await;
+    w.noted.send_replace(Some(mark(3)));
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    w.says(slam(4, 11)).await;
+    w.rest().await;
+    w.noted.send_replace(Some(mark(4)));
+    w.rest().await;
+    w.leader.send_replace(Some(1));
+    let told = w.rest().await;
+    assert_eq!(notices(&told), [(4, 11)], "the one before may have died over it");
+    w.leader.send_replace(None);
+    w.rest().await;
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    w.leader.send_replace(Some(2));
+    let told = w.rest().await;
+    assert_eq!(notices(&told), []);
+    assert_eq!(key_of_slam(&told), Some(11), "keys are written by every new leader");
+}
+
+#[tokio::test(start_paused = true)]
+async fn only_the_paths_that_changed_since_it_was_told_are_told() {
+    let mut w = world_from(None, false);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.noted.send_replace(Some(mark(2)));
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    w.says(slam(3, 10)).await;
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    w.leader.send_replace(Some(1));
+    let (_, notice) = w.notice().await;
+    assert_eq!(
+        (&notice["paths"], &notice["scopes"]),
+        (&json!(["/rate_hz"]), &json!(["service"]))
+    );
+    assert!(notice["previous_hash"].is_string());
+}
+
+#[tokio::test(start_paused = true)]
+async fn that_a_service_was_deleted_is_told_as_well() {
+    let mut w = world_from(None, false);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.noted.send_replace(Some(mark(2)));
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    let gone = document("Service/slam", 2, json!({ "config": { "rate_hz": 30 } }));
+    w.says(commit(3, 2, vec![(Op::Delete, gone)])).await;
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    w.leader.send_replace(Some(1));
+    let (channel, notice) = w.notice().await;
+    assert_eq!(
+        (channel.as_str(), &notice["deleted"]),
+        ("blaze/config/changed/slam", &json!(true))
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn whoever_leads_leaves_how_far_the_broker_has_taken_it() {
+    let mut w = world_from(None, true);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    assert_eq!(*w.told.borrow(), Some(mark(2)));
+    w.up.send_replace(false);
+    w.says(slam(3, 10)).await;
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    assert_eq!(*w.told.borrow(), Some(mark(2)), "the broker has not taken it");
+    w.up.send_replace(true);
+    w.rest().await;
+    assert_eq!(*w.told.borrow(), Some(mark(3)));
+    // A commit that concerns nobody moves the mark on all the same.
+    let same = document(
+        "Service/slam",
+        4,
+        json!({ "config": { "rate_hz": 10 }, "description": "new" }),
+    );
+    w.says(commit(4, 3, vec![(Op::Update, same)])).await;
+    w.rest().await;
+    assert_eq!(*w.told.borrow(), Some(mark(4)));
+    w.leader.send_replace(None);
+    w.rest().await;
+    assert_eq!(*w.told.borrow(), None, "who does not lead leaves nothing");
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_waited_when_the_lease_was_lost_is_told_when_it_is_had_again() {
+    let mut w = world_from(None, true);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    w.up.send_replace(false);
+    w.says(slam(3, 10)).await;
+    let gone = document("Service/nav", 1, json!({ "config": { "speed": 1 } }));
+    w.says(commit(4, 3, vec![(Op::Delete, gone)])).await;
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    w.leader.send_replace(None);
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    w.up.send_replace(true);
+    assert_eq!(w.rest().await, [], "it is for others to tell, if there are any");
+    w.leader.send_replace(Some(2));
+    let told = w.rest().await;
+    assert_eq!(notices(&told), [(3, 10)]);
+    let is_nav = |seen: &&Seen| matches!(seen, Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true);
+    assert_eq!(told.iter().filter(is_nav).count(), 1, "{told:?}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn between_two_terms_nothing_is_carried_over_and_everything_told_anew() {
+    let mut w = world_from(None, true);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.up.send_replace(false);
+    w.says(slam(3, 10)).await;
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    // It was stopped for a while, others led, and it leads again: it sees only that it is another term.
+    w.noted.send_replace(Some(mark(9)));
+    w.leader.send_replace(Some(2));
+    let closed = SyncEvent::Closed {
+        reason: "away".to_owned(),
+        is_unreadable: false,
+    };
+    w.sync.send(closed).await.unwrap();
+    w.up.send_replace(true);
+    assert_eq!(
+        w.rest()
+            .await
+            .iter()
+            .filter(|seen| matches!(seen, Seen::Notice(..)))
+            .count(),
+        0
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn whoever_knows_less_than_was_told_answers_and_tells_nothing_until_it_knows() {
+    let mut w = world_from(None, false);
+    let stream = w.opens(documents(30), 2).await;
+    w.rest().await;
+    drop(stream);
+    let closed = SyncEvent::Closed {
+        reason: "away".to_owned(),
+        is_unreadable: false,
+    };
+    w.sync.send(closed).await.unwrap();
+    w.noted.send_replace(Some(mark(5)));
+    w.leader.send_replace(Some(1));
+    assert_eq!(w.rest().await, [], "neither notices nor keys");
+    assert_eq!(w.slam().await["config"]["rate_hz"], 30);
+    assert_eq!(*w.told.borrow(), None, "and no mark");
+    w.opens(documents(11), 5).await;
+    let told = w.rest().await;
+    assert_eq!(key_of_slam(&told), Some(11));
+    assert!(notices(&told).iter().all(|notice| *notice == (5, 11)), "{told:?}");
+    assert_eq!(*w.told.borrow(), Some(mark(5)));
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_speaker_says_nothing_after_its_term() {
+    let (mut holder, leadership) = crate::lease::leadership();
+    let speaker = Speaker::new(leadership.term.clone());
+    let (see, mut seen) = mpsc::channel(64);
+    let (_up, is_up) = watch::channel(true);
+    let mut tasks = JoinSet::new();
+    tasks.spawn(speaker.clone().run(Arc::new(Board { seen: see, is_up })));
+    let told = |text: &'static str| crate::serve::Told {
+        place: "slam".to_owned(),
+        key: Some(("blaze:config:slam".to_owned(), Some(Bytes::from(text)))),
+        notice: Some(KeyedMessage {
+            channel: "blaze/config/changed/slam".parse().unwrap(),
+            key: String::new(),
+            value: Some(Bytes::from(text)),
+        }),
+        revision: 3,
+    };
+    speaker.tell([told("1")]);
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    assert!(seen.try_recv().is_err());
+    assert_eq!(speaker.untold(), Some(3));
+    holder.lead(Some(Instant::now() + Duration::from_secs(5)));
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert!(matches!(seen.recv().await, Some(Seen::Key(..))));
+    assert!(matches!(seen.recv().await, Some(Seen::Notice(..))));
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    // Nobody has said yet that it is over.
+    speaker.tell([told("2")]);
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    assert!(seen.try_recv().is_err());
+    let SpeakerCounts { waiting, .. } = speaker.counts();
+    assert!(waiting <= 1);
+    speaker.clear();
+    holder.lead(Some(Instant::now() + Duration::from_secs(5)));
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    assert!(seen.try_recv().is_err(), "also what was on its way is forgotten");
+}

@@ -1,0 +1,231 @@
+//! The speaker in front of a broker that is away, refuses, or has forgotten.
+
+use async_trait::async_trait;
+use blaze_brokers::redis::KeyChange;
+use tokio::sync::{mpsc, watch};
+
+use super::super::waiting::BATCH_BYTES;
+use super::*;
+
+type Delivered = (Vec<KeyChange>, Vec<KeyedMessage>);
+
+/// A broker that can be away and can lose its keys.
+struct Fake {
+    is_up: watch::Receiver<bool>,
+    lost: Arc<Notify>,
+    delivered: mpsc::Sender<Delivered>,
+    own: Vec<String>,
+    /// A channel that it refuses.
+    refused: Option<&'static str>,
+}
+
+#[async_trait]
+impl Outlet for Fake {
+    async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
+        if !*self.is_up.borrow() {
+            return Err(OutletError::Away("switched off".to_owned()));
+        }
+        if messages
+            .iter()
+            .any(|message| Some(message.channel.as_str()) == self.refused)
+        {
+            return Err(OutletError::TooLarge { bytes: 1 });
+        }
+        self.delivered
+            .send((changes.to_vec(), messages.to_vec()))
+            .await
+            .unwrap();
+        Ok(())
+    }
+
+    fn has_keys(&self) -> bool {
+        true
+    }
+
+    async fn keys_lost(&self) {
+        self.lost.notified().await;
+    }
+
+    async fn own_keys(&self) -> Result<Vec<String>, OutletError> {
+        Ok(self.own.clone())
+    }
+}
+
+struct World {
+    speaker: Speaker,
+    up: watch::Sender<bool>,
+    lost: Arc<Notify>,
+    delivered: mpsc::Receiver<Delivered>,
+    _run: tokio::task::JoinSet<()>,
+}
+
+fn world(is_up: bool) -> World {
+    let (up, seen) = watch::channel(is_up);
+    let (send, delivered) = mpsc::channel(64);
+    let (speaker, lost) = (Speaker::new(Term::always()), Arc::new(Notify::new()));
+    let outlet = Arc::new(Fake {
+        is_up: seen,
+        lost: Arc::clone(&lost),
+        delivered: send,
+        own: vec!["blaze:config:old".to_owned(), "blaze:config:slam".to_owned()],
+        refused: Some("blaze/config/changed/refused"),
+    });
+    let mut run = tokio::task::JoinSet::new();
+    run.spawn(speaker.clone().run(outlet));
+    World {
+        speaker,
+        up,
+        lost,
+        delivered,
+        _run: run,
+    }
+}
+
+fn told(place: &str, text: &'static str) -> Told {
+    Told {
+        place: place.to_owned(),
+        key: Some((format!("blaze:config:{place}"), Some(Bytes::from(text)))),
+        notice: Some(KeyedMessage {
+            channel: format!("blaze/config/changed/{place}").parse().unwrap(),
+            key: String::new(),
+            value: Some(Bytes::from(text)),
+        }),
+        revision: text.parse().unwrap_or_default(),
+    }
+}
+
+fn texts(delivered: &Delivered) -> Vec<Bytes> {
+    let said = delivered.1.iter().filter_map(|message| message.value.clone());
+    said.collect()
+}
+
+#[tokio::test(start_paused = true)]
+async fn of_what_waits_the_newest_of_each_place_is_told_once() {
+    let mut w = world(false);
+    w.speaker.tell([told("slam", "1"), told("nav", "1")]);
+    w.speaker.tell([told("slam", "2")]);
+    while w.speaker.counts().failures < 3 {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    w.speaker.tell([told("slam", "3")]);
+    w.up.send_replace(true);
+    let first = w.delivered.recv().await.unwrap();
+    assert_eq!(
+        texts(&first),
+        ["1", "3"],
+        "a newer one comes after what was told meanwhile"
+    );
+    assert_eq!(first.0.len(), 2);
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    assert!(w.delivered.is_empty());
+    let counts = w.speaker.counts();
+    assert_eq!((counts.notices, counts.replaced, counts.waiting), (2, 2, 0));
+}
+
+#[tokio::test(start_paused = true)]
+async fn keys_that_the_server_has_lost_are_written_again_without_a_notice() {
+    let mut w = world(true);
+    w.speaker.tell([told("slam", "1"), told("nav", "1")]);
+    w.delivered.recv().await.unwrap();
+    w.speaker.tell([Told {
+        key: Some(("blaze:config:nav".to_owned(), None)),
+        ..told("nav", "gone")
+    }]);
+    let gone = w.delivered.recv().await.unwrap();
+    assert_eq!(
+        gone.0,
+        [KeyChange::Delete {
+            key: "blaze:config:nav".to_owned()
+        }]
+    );
+    w.lost.notify_one();
+    let again = w.delivered.recv().await.unwrap();
+    let old = KeyChange::Delete {
+        key: "blaze:config:old".to_owned(),
+    };
+    let slam = KeyChange::Put {
+        key: "blaze:config:slam".to_owned(),
+        value: Bytes::from("1"),
+    };
+    assert_eq!(again, (vec![old, slam], Vec::new()), "and one that nobody wants goes");
+}
+
+#[test]
+fn what_came_meanwhile_is_newer_than_what_goes_back() {
+    let mut state = State::default();
+    state.put(told("slam", "1"));
+    let batch = state.take(BATCH);
+    state.put(told("slam", "2"));
+    state.put_back(batch);
+    let left = state.take(BATCH);
+    let texts: Vec<_> = left
+        .waiting
+        .iter()
+        .filter_map(|(_, waiting)| waiting.notice.value.clone())
+        .collect();
+    assert_eq!(texts, ["2"]);
+    assert_eq!(state.changes(&left.keys).len(), 1);
+    assert!(state.take(BATCH).is_empty());
+}
+
+#[test]
+fn of_two_places_with_one_key_the_last_word_counts() {
+    let mut state = State::default();
+    let moved = |place: &str, value: Option<&'static str>| Told {
+        key: Some(("blaze:config:slam:0".to_owned(), value.map(Bytes::from))),
+        ..told(place, "moved")
+    };
+    // The new place waits already when the old one goes and the new one changes again.
+    state.put(moved("slam-at-b", Some("1")));
+    state.put(moved("slam-at-a", None));
+    state.put(moved("slam-at-b", Some("2")));
+    let batch = state.take(BATCH);
+    let put = KeyChange::Put {
+        key: "blaze:config:slam:0".to_owned(),
+        value: Bytes::from("2"),
+    };
+    assert_eq!(state.changes(&batch.keys), [put]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn whom_the_broker_refuses_holds_up_nobody_else() {
+    let mut w = world(true);
+    w.speaker
+        .tell([told("nav", "1"), told("refused", "1"), told("slam", "1")]);
+    let mut heard = Vec::new();
+    while heard.len() < 2 {
+        heard.extend(texts(&w.delivered.recv().await.unwrap()));
+    }
+    while w.speaker.counts().waiting > 0 {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    let counts = w.speaker.counts();
+    assert_eq!((counts.notices, counts.dropped), (2, 1));
+}
+
+#[test]
+fn a_batch_is_bounded_in_bytes_but_never_empty() {
+    let mut state = State::default();
+    let large: &'static str = Box::leak("x".repeat(BATCH_BYTES).into_boxed_str());
+    state.put(told("a", large));
+    state.put(told("b", large));
+    state.put(told("c", "small"));
+    let counts: Vec<usize> = (0..3).map(|_| state.take(BATCH).waiting.len()).collect();
+    assert_eq!(counts, [1, 1, 1]);
+    assert!(state.take(BATCH).is_empty());
+}
+
+#[test]
+fn what_was_forgotten_does_not_come_back_and_is_not_missed() {
+    let mut state = State::default();
+    state.put(told("slam", "7"));
+    state.put(told("slam", "9"));
+    assert_eq!(state.untold(), Some(7), "whoever is told has heard of neither");
+    let batch = state.take(BATCH);
+    state.put(told("nav", "8"));
+    assert_eq!(state.untold(), Some(7), "also while it is on its way");
+    state.clear();
+    state.put_back(batch);
+    assert_eq!(state.untold(), None);
+    assert!(state.take(BATCH).is_empty());
+}

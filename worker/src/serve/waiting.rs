@@ -1,0 +1,187 @@
+//! What waits to be told: of each place the newest, and of each key how it should be.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use blaze_brokers::KeyedMessage;
+use blaze_brokers::redis::KeyChange;
+use bytes::Bytes;
+
+use super::Told;
+
+/// Bytes of one transaction, unless one place alone has more (1 MiB): a large one over a slow connection would not be done in
+/// the time that a call may take, and be tried again for ever.
+pub(super) const BATCH_BYTES: usize = 1024 * 1024;
+
+/// A notice that waits.
+pub(super) struct Waiting {
+    /// The key that must be written no later.
+    key: Option<String>,
+    pub(super) notice: KeyedMessage,
+    /// The lowest revision that whoever is told may not have heard of.
+    since: u64,
+}
+
+#[derive(Default)]
+pub(super) struct State {
+    /// All keys as they should be, to be written again when the server has lost them.
+    wanted: BTreeMap<String, Bytes>,
+    /// Keys that are not as they should be; those that are not wanted are to go.
+    dirty: BTreeSet<String>,
+    /// Places in the order in which they are told of; each stands here once.
+    pub(super) order: BTreeMap<i64, String>,
+    pub(super) waiting: BTreeMap<String, (i64, Waiting)>,
+    /// Of the last that was put at the end, and of the first.
+    ends: (i64, i64),
+    /// Keys of before are to be looked for: those of this worker that are not wanted are to go.
+    pub(super) sweep: bool,
+    /// What is being told just now: the lowest revisions of its places.
+    pub(super) on_the_way: BTreeMap<String, u64>,
+    /// How often everything was forgotten.
+    pub(super) cleared: u64,
+}
+
+/// What is told at once.
+pub(super) struct Batch {
+    pub(super) keys: BTreeSet<String>,
+    pub(super) waiting: Vec<(String, Waiting)>,
+    /// How often everything had been forgotten when it was taken.
+    cleared: u64,
+}
+
+impl Batch {
+    pub(super) fn is_empty(&self) -> bool {
+        self.keys.is_empty() && self.waiting.is_empty()
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.keys.len() + self.waiting.len()
+    }
+}
+
+impl State {
+    /// Takes in what is newer than what waits of the same place; it is told at the end, so that the notices of a service come
+    /// in the order of their revisions. Returns whether a notice gave way.
+    pub(super) fn put(&mut self, told: Told) -> bool {
+        let Told {
+            place,
+            key,
+            notice,
+            revision,
+        } = told;
+        let name = key.map(|(name, value)| {
+            match value {
+                Some(value) => self.wanted.insert(name.clone(), value),
+                None => self.wanted.remove(&name),
+            };
+            self.dirty.insert(name.clone());
+            name
+        });
+        let Some(notice) = notice else { return false };
+        let old = self.waiting.remove(&place);
+        if let Some((at, _)) = &old {
+            self.order.remove(at);
+        }
+        // Until it is told, whoever is told has not heard of the one that gives way either.
+        let since = old.as_ref().map_or(revision, |(_, old)| old.since.min(revision));
+        self.ends.1 += 1;
+        self.order.insert(self.ends.1, place.clone());
+        let waiting = Waiting {
+            key: name,
+            notice,
+            since,
+        };
+        self.waiting.insert(place, (self.ends.1, waiting));
+        old.is_some()
+    }
+
+    /// The first that wait, at most so many and, but for the first, so many bytes.
+    pub(super) fn take(&mut self, most: usize) -> Batch {
+        let mut batch = Batch {
+            keys: BTreeSet::new(),
+            waiting: Vec::new(),
+            cleared: self.cleared,
+        };
+        let mut bytes = 0;
+        while batch.waiting.len() < most
+            && (bytes < BATCH_BYTES || batch.is_empty())
+            && let Some((_, place)) = self.order.pop_first()
+        {
+            let Some((_, waiting)) = self.waiting.remove(&place) else {
+                continue;
+            };
+            bytes += waiting.notice.value.as_ref().map_or(0, Bytes::len);
+            if let Some(key) = waiting.key.as_ref().and_then(|key| self.dirty.take(key)) {
+                bytes += self.wanted.get(&key).map_or(0, Bytes::len);
+                batch.keys.insert(key);
+            }
+            batch.waiting.push((place, waiting));
+        }
+        while batch.len() < most
+            && (bytes < BATCH_BYTES || batch.is_empty())
+            && let Some(key) = self.dirty.pop_first()
+        {
+            bytes += self.wanted.get(&key).map_or(0, Bytes::len);
+            batch.keys.insert(key);
+        }
+        let places = batch.waiting.iter();
+        self.on_the_way = places.map(|(place, waiting)| (place.clone(), waiting.since)).collect();
+        batch
+    }
+
+    /// The lowest revision that somebody may not have heard of.
+    pub(super) fn untold(&self) -> Option<u64> {
+        let waiting = self.waiting.values().map(|(_, waiting)| waiting.since);
+        waiting.chain(self.on_the_way.values().copied()).min()
+    }
+
+    /// Everything is forgotten, also what is on its way and comes back.
+    pub(super) fn clear(&mut self) {
+        *self = Self {
+            cleared: self.cleared + 1,
+            ..Self::default()
+        };
+    }
+
+    /// Keys as they should be now.
+    pub(super) fn changes(&self, keys: &BTreeSet<String>) -> Vec<KeyChange> {
+        let change = |key: &String| match self.wanted.get(key) {
+            Some(value) => KeyChange::Put {
+                key: key.clone(),
+                value: value.clone(),
+            },
+            None => KeyChange::Delete { key: key.clone() },
+        };
+        keys.iter().map(change).collect()
+    }
+
+    /// What could not be told goes back to the front; what has come meanwhile is newer.
+    pub(super) fn put_back(&mut self, batch: Batch) {
+        self.on_the_way.clear();
+        if batch.cleared != self.cleared {
+            return;
+        }
+        self.dirty.extend(batch.keys);
+        for (place, waiting) in batch.waiting.into_iter().rev() {
+            match self.waiting.get_mut(&place) {
+                Some((_, newer)) => newer.since = newer.since.min(waiting.since),
+                None => {
+                    self.ends.0 -= 1;
+                    self.order.insert(self.ends.0, place.clone());
+                    self.waiting.insert(place, (self.ends.0, waiting));
+                }
+            }
+        }
+    }
+
+    /// All keys are to be written again, and those that came back are to go.
+    pub(super) fn write_all(&mut self) {
+        self.dirty.extend(self.wanted.keys().cloned());
+        self.sweep = true;
+    }
+
+    /// Of the keys that are there, those that should not be.
+    pub(super) fn drop_unwanted(&mut self, found: Vec<String>) {
+        let unwanted = found.into_iter().filter(|key| !self.wanted.contains_key(key));
+        self.dirty.extend(unwanted);
+    }
+}
