@@ -7,13 +7,15 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_brokers::memory::MemoryHub;
-use blaze_brokers::{Broker, OpenError, Role, check_layer, open_layer, open_node};
-use blaze_domain::node_file::{Fault, LayerBroker as LayerSection, NodeBroker, NodeFile};
-use blaze_flow::flow::settings::{FlowSettings, LiveSettings};
+use blaze_brokers::{Broker, Role, open_layer, open_node};
+use blaze_domain::node_file::{LayerBroker as LayerSection, NodeBroker, NodeFile};
+use blaze_flow::flow::node_file::{follow_node_file, schema};
+use blaze_flow::flow::service::FlowService;
+use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, LayerBroker, RunningFlow};
 use blaze_flow::world::LayerScopeId;
-use blaze_runtime::admin::{CheckStatus, Readiness};
-use blaze_runtime::config::{Current, Loaded, Schema, Sources, WatchSettings, load_typed, parse_override, watch};
+use blaze_runtime::admin::Readiness;
+use blaze_runtime::config::{Loaded, Sources, WatchSettings, load_typed, parse_override, watch_with};
 use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
 use blaze_runtime::{logs, ready_line, say, state};
@@ -74,48 +76,29 @@ fn main() -> ExitCode {
     }
 }
 
-/// The node file as this program reads it.
-fn schema() -> Schema<NodeFile> {
-    let remark = |fault: Fault| (fault.path, fault.detail);
-    Arc::new(move |value| match NodeFile::read(value) {
-        Ok((file, warnings)) => {
-            let mut faults = file.check_for_flow();
-            faults.extend(broker_fault(&file));
-            if faults.is_empty() {
-                Ok((file, warnings.into_iter().map(remark).collect()))
-            } else {
-                Err(faults.into_iter().map(remark).collect())
-            }
-        }
-        Err(faults) => Err(faults.into_iter().map(remark).collect()),
-    })
-}
-
-/// What the adapter has against the section of the layer scope. What was not built in is told beside that.
-fn broker_fault(file: &NodeFile) -> Option<Fault> {
-    match check_layer(file.brokers.layer.as_ref()?) {
-        Err(OpenError::Setting { key, reason }) => Some(Fault {
-            path: format!("brokers.layer.{key}"),
-            detail: reason,
-        }),
-        Ok(()) | Err(OpenError::NotBuilt { .. } | OpenError::InProcess) => None,
-    }
-}
-
 async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
     let supervisor = Supervisor::new("blaze-flow");
-    let flow = match start(&supervisor, &loaded.value).await {
+    let (flow, log, service) = match begin(&supervisor, &loaded.value).await {
         Ok(started) => started,
         Err(error) => {
             say(format_args!("blaze-flow failed: {error:#}"));
             return ExitCode::from(exit_code::FAILED);
         }
     };
-    let (flow, log) = flow;
-    let flow = Arc::new(flow);
-    let started = loaded.value.clone();
-    let reloads = watch(&supervisor, sources, schema(), loaded, WatchSettings::default());
-    let follow = follow(Arc::clone(&flow), started, reloads, log);
+    let program = service.as_ref().map(|service| service.program().clone());
+    let overlays = match &program {
+        Some(program) => program.overlays(),
+        None => tokio::sync::watch::channel(None).1,
+    };
+    let told = watch_with(
+        &supervisor,
+        sources,
+        schema(),
+        loaded,
+        WatchSettings::default(),
+        overlays,
+    );
+    let follow = follow_node_file(Arc::clone(&flow), told, Some(log), program);
     supervisor.spawn("reload", TaskPolicy::Essential, follow);
     let announced = Arc::clone(&flow);
     let stopping = supervisor.stopping_token();
@@ -128,8 +111,34 @@ async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
     let readiness: Readiness = flow.readiness().clone();
     let steps = ShutdownSteps::new(SHUTDOWN)
         .on(ShutdownPhase::NotReady, "readiness", async move { readiness.stop() })
-        .on(ShutdownPhase::Drain, "flow", async move { flow.drain().await });
+        .on(ShutdownPhase::Drain, "flow", async move {
+            if let Some(service) = service {
+                service.stop().await;
+            }
+            flow.drain().await;
+        });
     supervisor.run(steps).await
+}
+
+/// Starts the flow, and makes it a service where others could be on the same broker.
+async fn begin(
+    supervisor: &Supervisor,
+    file: &NodeFile,
+) -> anyhow::Result<(Arc<RunningFlow>, LogHandle, Option<FlowService>)> {
+    let (flow, log) = start(supervisor, file).await?;
+    let local = (&file.brokers.node, &file.brokers.layer);
+    // In memory there is nobody but the flow itself.
+    let is_alone = matches!(
+        local,
+        (Some(NodeBroker::Memory), _) | (None, Some(LayerSection::Memory))
+    );
+    let service = match is_alone {
+        true => None,
+        false => FlowService::start(&flow, file.cache_redis().cloned(), supervisor)
+            .await
+            .context("as a service of its node")?,
+    };
+    Ok((Arc::new(flow), log, service))
 }
 
 async fn start(supervisor: &Supervisor, file: &NodeFile) -> anyhow::Result<(RunningFlow, LogHandle)> {
@@ -205,86 +214,4 @@ fn this_host() -> String {
     let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
     let namespace = std::fs::read_link("/proc/self/ns/net").unwrap_or_default();
     format!("{}|{}", boot.trim(), namespace.display())
-}
-
-/// What is said of a file that was reloaded in part.
-const WAITS: &str = "the node file has changes that need a restart";
-
-/// Whether a file differs from the one of the start in more than what changes while the process runs.
-fn needs_restart(started: &NodeFile, file: &NodeFile) -> bool {
-    let mut same = started.clone();
-    same.flow.bandwidth = file.flow.bandwidth.clone();
-    same.flow.compression = file.flow.compression;
-    same.flow.pool_threads = file.flow.pool_threads;
-    same.flow.topics.clone_from(&file.flow.topics);
-    same.flow.access.clone_from(&file.flow.access);
-    same.log.level.clone_from(&file.log.level);
-    same != *file
-}
-
-/// Takes over what may change while the process runs; a faulty file changes nothing and shows on `/readyz`.
-async fn follow(
-    flow: Arc<RunningFlow>,
-    started: NodeFile,
-    mut reloads: tokio::sync::watch::Receiver<Current<NodeFile>>,
-    log: LogHandle,
-) {
-    while reloads.changed().await.is_ok() {
-        let current = reloads.borrow_and_update().clone();
-        match &current.faults {
-            Some(faults) => {
-                for fault in faults.iter() {
-                    tracing::error!("{fault}");
-                }
-                let first = faults.first().map(ToString::to_string).unwrap_or_default();
-                flow.readiness().set("config", CheckStatus::Failed, first);
-            }
-            None => {
-                let file = &current.loaded.value;
-                flow.reload(LiveSettings::from(&file.flow));
-                if let Err(error) = log.set_level(file.log.level.as_str()) {
-                    tracing::error!(%error, "log.level");
-                }
-                let waits = needs_restart(&started, file);
-                if waits {
-                    tracing::warn!("{WAITS}");
-                }
-                flow.readiness()
-                    .set("config", CheckStatus::Ok, if waits { WAITS } else { "" });
-                tracing::info!(limit_mbps = file.flow.bandwidth.limit_mbps, "configuration reloaded");
-            }
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use serde_json::json;
-
-    fn file(rest: serde_json::Value) -> NodeFile {
-        let mut tree = json!({
-            "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "a"}, "brokers": {"layer": {"memory": {}}}
-        });
-        let serde_json::Value::Object(rest) = rest else {
-            unreachable!("an object")
-        };
-        tree.as_object_mut().unwrap().extend(rest);
-        NodeFile::read(&tree).unwrap().0
-    }
-
-    #[test]
-    fn only_what_changes_while_it_runs_needs_no_restart() {
-        let started = file(json!({}));
-        let live = json!({
-            "flow": {"bandwidth": {"limit_mbps": 7}, "compression": {"level": 1}, "pool_threads": 1}, "log": {"level": "debug"},
-        });
-        assert!(!needs_restart(&started, &file(live)));
-        for other in [
-            json!({"admin": {"flow": "127.0.0.1:9999"}}),
-            json!({"flow": {"gateway": true}}),
-        ] {
-            assert!(needs_restart(&started, &file(other.clone())), "{other}");
-        }
-    }
 }

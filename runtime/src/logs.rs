@@ -82,6 +82,18 @@ pub fn init(level: &str, format: LogFormat) -> Result<LogHandle, LogError> {
     Ok(handle)
 }
 
+/// Whether the log takes a level or directives.
+///
+/// # Errors
+/// In words that name no other text than the part that is wrong.
+pub fn check_level(level: &str) -> Result<(), String> {
+    match filter("log.level", level) {
+        Ok(_) => Ok(()),
+        Err(LogError::Level { detail, .. }) => Err(detail),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
 fn build<W>(
     level: &str,
     from_environment: Option<&str>,

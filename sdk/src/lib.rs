@@ -64,7 +64,7 @@ pub use cache::{
 };
 pub use config::{
     AckStatus, BaseConfiguration, BaseSource, ConfigChange, ConfigCounts, ConfigError, ConfigListener, ConfigManager,
-    ConfigScope, ConfigSource,
+    ConfigScope, ConfigSource, ProgramConfig,
 };
 pub use flow::{
     Advertise, FlowError, FlowEvent, FlowEventKind, FlowEvents, FlowManager, Lease, LeaseState, OriginFilter,

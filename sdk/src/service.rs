@@ -11,7 +11,7 @@ use blaze_runtime::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy};
 
 use crate::broker::LocalBroker;
 use crate::cache::{CacheError, CacheManager, ServiceState, Store};
-use crate::config::ConfigManager;
+use crate::config::{ConfigManager, ProgramConfig};
 use crate::flow::FlowManager;
 use crate::options::ServiceOptions;
 use crate::pool::Pool;
@@ -230,6 +230,12 @@ impl ServiceManager {
     pub fn config(&self) -> &ConfigManager {
         self.config.want();
         &self.config
+    }
+
+    /// The service's configuration, for a program that has a node file besides. Begins to ask for it; one is enough.
+    #[must_use]
+    pub fn program_config(&self) -> ProgramConfig {
+        ProgramConfig::start(self.config(), &self.shared.supervisor)
     }
 
     /// Says that the service lives, waits for others, keeps values.

@@ -18,8 +18,15 @@ const ALLOWED: &[(&str, &[&str])] = &[
     ),
     ("blaze-brokers", &["blaze-domain", "blaze-proto", "blaze-runtime"]),
     (
+        // A flow is a service of its node, too.
         "blaze-flow",
-        &["blaze-domain", "blaze-proto", "blaze-runtime", "blaze-brokers"],
+        &[
+            "blaze-domain",
+            "blaze-proto",
+            "blaze-runtime",
+            "blaze-brokers",
+            "blaze-sdk",
+        ],
     ),
     (
         "blaze-worker",

@@ -58,6 +58,7 @@ impl Shown {
         );
         readiness.add("main service", Gate::Shows, CheckStatus::Failed, "not connected yet");
         readiness.add("mounted file", Gate::Shows, CheckStatus::Ok, "");
+        readiness.add("config", Gate::Shows, CheckStatus::Ok, "");
         loop {
             if let Some(worker) = self.worker()
                 && let Some(status) = worker.status().await

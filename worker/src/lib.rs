@@ -14,6 +14,7 @@ pub mod core;
 pub mod engine;
 mod hearing;
 pub mod lease;
+pub mod own;
 pub mod running;
 pub mod serve;
 pub mod settings;

@@ -10,8 +10,10 @@ use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, OpenError, Role, check_layer, open_layer, open_node};
 use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
-use blaze_runtime::admin::{AdminServer, CheckStatus, Readiness};
-use blaze_runtime::config::{Current, Loaded, Schema, Sources, WatchSettings, load_typed, parse_override, watch};
+use blaze_runtime::admin::{AdminServer, Readiness};
+use blaze_runtime::config::{
+    Current, Follower, Keys, Loaded, Schema, Sources, WatchSettings, follow, load_typed, parse_override, watch_with,
+};
 use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
 use blaze_runtime::{logs, ready_line, say, state};
@@ -78,6 +80,10 @@ fn schema() -> Schema<NodeFile> {
         Ok((file, warnings)) => {
             let mut faults = WorkerSettings::of(&file).err().unwrap_or_default();
             faults.extend(broker_fault(&file));
+            faults.extend(logs::check_level(&file.log.level).err().map(|detail| Fault {
+                path: "log.level".to_owned(),
+                detail,
+            }));
             if faults.is_empty() {
                 Ok((file, warnings.into_iter().map(remark).collect()))
             } else {
@@ -140,11 +146,18 @@ async fn start(
     spawn(supervisor, "look", shown.clone().look(readiness.clone()));
     let worker = Arc::new(begin(settings, file, supervisor).await?);
     shown.set(Arc::clone(&worker));
-    let started = file.clone();
-    let reloads = watch(supervisor, sources, schema(), loaded, WatchSettings::default());
-    let (reloaded, ready) = (Arc::clone(&worker), readiness.clone());
-    let follow = follow(reloaded, started, reloads, log, readiness.clone());
+    let overlays = worker.own().overlays();
+    let told = watch_with(
+        supervisor,
+        sources,
+        schema(),
+        loaded,
+        WatchSettings::default(),
+        overlays,
+    );
+    let follow = follow_node_file(Arc::clone(&worker), told, log, readiness.clone());
     supervisor.spawn("reload", TaskPolicy::Essential, follow);
+    let ready = readiness.clone();
     spawn(supervisor, "ready line", async move {
         ready.ready().await;
         // Without a reader of stdout there is nobody to tell.
@@ -188,43 +201,46 @@ async fn begin(settings: WorkerSettings, file: &NodeFile, supervisor: &Superviso
     RunningWorker::start(options, supervisor).await
 }
 
-/// What is said of a file that was reloaded in part.
-const WAITS: &str = "the node file has changes that need a restart";
+/// What the worker reads of the file, and what of it changes while it runs.
+const KEYS: Keys = Keys {
+    read: &[
+        "layer",
+        "node",
+        "brokers.node",
+        "brokers.layer",
+        "admin.worker",
+        "cache",
+        "config",
+        "database",
+        "log",
+        "state_dir",
+        "worker",
+    ],
+    live: &["config.server", "config.ca_file", "config.token_file", "log.level"],
+};
 
-/// Takes over what may change while the process runs; a faulty file changes nothing and shows on `/readyz`.
-async fn follow(
+/// Takes over what may change while the process runs; what is faulty changes nothing and shows on `/readyz`.
+async fn follow_node_file(
     worker: Arc<RunningWorker>,
-    started: NodeFile,
-    mut reloads: tokio::sync::watch::Receiver<Current<NodeFile>>,
+    told: tokio::sync::watch::Receiver<Current<NodeFile>>,
     log: LogHandle,
     readiness: Readiness,
 ) {
-    while reloads.changed().await.is_ok() {
-        let current = reloads.borrow_and_update().clone();
-        match &current.faults {
-            Some(faults) => {
-                for fault in faults.iter() {
-                    tracing::error!("{fault}");
-                }
-                let first = faults.first().map(ToString::to_string).unwrap_or_default();
-                readiness.set("config", CheckStatus::Failed, first);
-            }
-            None => {
-                let file = &current.loaded.value;
-                if let Ok(WorkerSettings { main: Some(main), .. }) = WorkerSettings::of(file) {
-                    worker.set_main(main);
-                }
-                if let Err(error) = log.set_level(file.log.level.as_str()) {
-                    tracing::error!(%error, "log.level");
-                }
-                let waits = needs_restart(&started, file);
-                if waits {
-                    tracing::warn!("{WAITS}");
-                }
-                readiness.set("config", CheckStatus::Ok, if waits { WAITS } else { "" });
-            }
+    let follower = Follower {
+        told,
+        readiness,
+        keys: KEYS,
+        needs_restart,
+    };
+    let take = |loaded: &Loaded<NodeFile>| {
+        if let Ok(WorkerSettings { main: Some(main), .. }) = WorkerSettings::of(&loaded.value) {
+            worker.set_main(main);
         }
-    }
+        if let Err(error) = log.set_level(loaded.value.log.level.as_str()) {
+            tracing::error!(%error, "log.level");
+        }
+    };
+    follow(follower, take, |verdict, besides| worker.own().judged(verdict, besides)).await;
 }
 
 /// Whether a file differs from the one of the start in more than what changes while the process runs.
@@ -235,5 +251,8 @@ fn needs_restart(started: &NodeFile, file: &NodeFile) -> bool {
     if before.main.is_some() && after.main.is_some() {
         (before.main, after.main) = (None, None);
     }
-    before != after || started.admin.worker != file.admin.worker || started.state_dir != file.state_dir
+    before != after
+        || started.admin.worker != file.admin.worker
+        || started.state_dir != file.state_dir
+        || started.log.format != file.log.format
 }

@@ -27,6 +27,7 @@ use crate::core::Site;
 use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
 use crate::hearing::{ACK, GET, WATCHDOG, listen, notice_deafness, scan};
 use crate::lease::{self, Holder, Leadership, Lease};
+use crate::own::{OwnConfig, say_again};
 use crate::serve::{BrokerOutlet, Channels, Speaker, SpeakerCounts};
 use crate::settings::WorkerSettings;
 use crate::sync::{MainService, follow};
@@ -61,6 +62,7 @@ pub struct RunningWorker {
     copies: Option<Copies>,
     lease: Option<LeaseEnd>,
     main: watch::Sender<MainService>,
+    own: OwnConfig,
 }
 
 /// How the task that keeps the lease is ended, and says that it has.
@@ -153,7 +155,9 @@ impl RunningWorker {
                 }
             });
         };
-        let engine = Engine::new(identity, outputs, start.loaded);
+        let (own, said_of_own, own_acks) = OwnConfig::new(&settings.node)?;
+        spawn("own state", Box::pin(say_again(own_acks, said.clone())));
+        let engine = Engine::new(identity, outputs, start.loaded).with_own(said_of_own);
         spawn("engine", Box::pin(engine.run(inputs, stop.clone())));
         spawn("notices", Box::pin(speaker.clone().run(outlet)));
         spawn(
@@ -200,6 +204,7 @@ impl RunningWorker {
             copies,
             lease,
             main: main_sender,
+            own,
         })
     }
 
@@ -228,6 +233,12 @@ impl RunningWorker {
         if is_another {
             self.main.send_replace(main);
         }
+    }
+
+    /// Its own configuration.
+    #[must_use]
+    pub fn own(&self) -> &OwnConfig {
+        &self.own
     }
 
     /// Leaves everything as the next life wants to find it: copies that are up to date, no lease.

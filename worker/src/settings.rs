@@ -3,9 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use blaze_domain::node_file::{
-    AutoBool, CacheSection, DatabaseSection, Fault, LayerBroker, NodeBroker, NodeFile, RedisBroker,
-};
+use blaze_domain::node_file::{AutoBool, DatabaseSection, Fault, LayerBroker, NodeBroker, NodeFile, RedisBroker};
 
 use crate::core::Site;
 use crate::core::messages::Delivery;
@@ -82,11 +80,7 @@ impl WorkerSettings {
             return Err(faults);
         };
         let is_node_scope = matches!(broker, LocalBroker::Node(_));
-        let keys = match (&file.cache, &brokers.node) {
-            (Some(CacheSection::Redis(redis)), _) => Some(redis.clone()),
-            (None, Some(NodeBroker::Redis(redis))) => Some(redis.clone()),
-            (None, Some(NodeBroker::Memory) | None) => None,
-        };
+        let keys = file.cache_redis().cloned();
         Ok(Self {
             site: Site {
                 layer: layer.name.clone(),

@@ -239,7 +239,7 @@ fn is_quoted(text: &str) -> bool {
 fn in_file(mut fault: LocatedFault, name: &str) -> LocatedFault {
     let line = match fault.place {
         Place::File { line, .. } | Place::Line(line) => line,
-        Place::Nowhere | Place::Environment(_) | Place::Override(_) => 0,
+        Place::Nowhere | Place::Overlay { .. } | Place::Environment(_) | Place::Override(_) => 0,
     };
     fault.place = Place::File {
         file: Arc::from(name),

@@ -11,6 +11,7 @@
 //! | transport threads | transport → link engine → message path → brokers | 3 readers and DDS's own |
 //! | compression threads | a payload from the message path → LZ4 → message path | as many as processors |
 //! | codec task | ends these with the process | 1 |
+//! | service | its configuration from BlazeConfig, its sign of life: `service.rs` | 1 where it is one |
 //! | admin task | `/livez`, `/readyz`, `/metrics`, `/v1/…` | 1 and one per connection |
 
 mod admin;
@@ -20,11 +21,13 @@ mod epochs;
 mod health;
 mod inter;
 mod metrics;
+pub mod node_file;
 pub mod pacing;
 mod peers_task;
 pub mod plane;
 mod routes;
 mod scope_task;
+pub mod service;
 pub mod settings;
 mod why;
 

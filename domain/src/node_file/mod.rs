@@ -225,6 +225,15 @@ impl NodeFile {
         faults
     }
 
+    /// The Redis for values and signs of life: that of `cache`, else that of `brokers.node`.
+    #[must_use]
+    pub fn cache_redis(&self) -> Option<&RedisBroker> {
+        match (&self.cache, &self.brokers.node) {
+            (Some(CacheSection::Redis(redis)), _) | (None, Some(NodeBroker::Redis(redis))) => Some(redis),
+            (None, Some(NodeBroker::Memory) | None) => None,
+        }
+    }
+
     /// The identity of the flow of this node, if layer and node are given.
     #[must_use]
     pub fn flow_id(&self) -> Option<FlowId> {

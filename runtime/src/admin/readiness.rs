@@ -145,6 +145,12 @@ impl Readiness {
         self.change(|checks| checks.stopping = true);
     }
 
+    /// Whether the process is stopping.
+    #[must_use]
+    pub fn is_stopping(&self) -> bool {
+        self.shared.checks.lock().stopping
+    }
+
     fn change(&self, change: impl FnOnce(&mut Checks)) {
         // The lock is held until all are told, so that they are told in the order of the changes.
         let mut checks = self.shared.checks.lock();

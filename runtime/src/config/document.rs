@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use serde_json::{Map, Value};
 
+use super::overlay::{self, Overlay};
 use super::place::{LocatedFault, Place, Places, join};
 use super::yaml::{self, MAX_DEPTH, Origin};
 use crate::environment;
@@ -17,7 +18,7 @@ const PREFIX: &str = "BLAZE__";
 /// Name and content of a file.
 pub(super) type NamedText = (Arc<str>, Arc<str>);
 
-/// Where a configuration comes from. Precedence: overrides > environment > file > defaults of the schema.
+/// Where a configuration comes from. Precedence: overrides > environment > [overlay](Overlay) > file > defaults of the schema.
 #[derive(Debug, Clone, Default)]
 pub struct Sources {
     /// The file that was asked for (`--config`, else `BLAZE_CONFIG`). It must exist.
@@ -160,16 +161,20 @@ impl Document {
     #[must_use]
     pub fn load_with_faults(sources: &Sources) -> (Option<Self>, Vec<LocatedFault>) {
         match sources.read_file() {
-            Ok(text) => Self::from_text(sources, text),
+            Ok(text) => Self::from_text(sources, text, None),
             Err(fault) => {
-                let (_, mut faults) = Self::from_text(sources, None);
+                let (_, mut faults) = Self::from_text(sources, None, None);
                 faults.insert(0, fault);
                 (None, faults)
             }
         }
     }
 
-    pub(super) fn from_text(sources: &Sources, text: Option<NamedText>) -> (Option<Self>, Vec<LocatedFault>) {
+    pub(super) fn from_text(
+        sources: &Sources,
+        text: Option<NamedText>,
+        over: Option<&Overlay>,
+    ) -> (Option<Self>, Vec<LocatedFault>) {
         let parsed = match &text {
             Some((name, text)) => yaml::parse(text, &Origin::File(Arc::clone(name)), ""),
             None => yaml::parse("", &Origin::Single(Place::Nowhere), ""),
@@ -182,6 +187,9 @@ impl Document {
             file: text.as_ref().map(|(name, _)| PathBuf::from(&**name)),
             text: text.map(|(_, text)| text),
         };
+        if let Some(over) = over {
+            overlay::merge(&mut document.value, &mut document.places, &over.tree, &over.place());
+        }
         for (path, place, value) in overrides(sources, &mut faults) {
             if let Err(fault) = document.put(&path, &place, value) {
                 faults.extend(fault);

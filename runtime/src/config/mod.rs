@@ -1,15 +1,22 @@
 //! The configuration of a process: from files, environment and options to a typed value, and again when it changes.
 //!
 //! ```text
-//! file ─┐
+//! file ─────┐
+//! overlay ──┤
 //! BLAZE__… ─┼─▶ Document (tree + place of every value) ──[schema]──▶ Loaded<T>  or  every fault, each FILE:LINE
-//! --set ─┘                                                   ▲
-//!                 directory events, SIGHUP, polling ──[watch]─┘ a faulty change changes nothing
+//! --set ────┘                                                ▲  │
+//!                 directory events, SIGHUP, polling ──[watch]─┤  └─[follow]─▶ the program, `/readyz`, the log
+//!                 another overlay ────────────────────────────┘ a faulty change changes nothing
 //! ```
 //!
 //! This module knows no key of any section: the schema is a function that its caller brings.
 
+mod compose;
+#[cfg(test)]
+mod compose_tests;
 mod document;
+mod follow;
+mod overlay;
 mod place;
 mod scalar;
 #[cfg(test)]
@@ -24,8 +31,10 @@ use std::sync::Arc;
 use serde_json::Value;
 
 pub use document::{Document, MAX_FILE_BYTES, Sources, parse_override};
+pub use follow::{Follower, Keys, follow};
+pub use overlay::{Overlay, Verdict};
 pub use place::{LocatedFault, Place};
-pub use watch::{Current, WatchSettings, watch};
+pub use watch::{Current, WatchSettings, watch, watch_with};
 pub use yaml::yaml_documents;
 
 /// A path and what is to be said of it.

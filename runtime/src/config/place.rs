@@ -21,6 +21,13 @@ pub enum Place {
     },
     /// A line of a text that is no file, counted from 1.
     Line(usize),
+    /// A tree that counts over the file.
+    Overlay {
+        /// Who gives it.
+        origin: Arc<str>,
+        /// Which state of it.
+        revision: u64,
+    },
     /// A variable of the environment.
     Environment(Arc<str>),
     /// An override on the command line: its path, without the value.
@@ -34,6 +41,7 @@ impl fmt::Display for Place {
             Self::File { file, line: 0 } => f.write_str(file),
             Self::File { file, line } => write!(f, "{file}:{line}"),
             Self::Line(line) => write!(f, "line {line}"),
+            Self::Overlay { origin, revision } => write!(f, "{origin} revision {revision}"),
             Self::Environment(name) => write!(f, "environment {name}"),
             Self::Override(path) => write!(f, "--set {path}"),
         }

@@ -1,7 +1,7 @@
-//! Reads the configuration again when its file changes.
+//! Reads the configuration again when its file or the overlay changes.
 //!
-//! Three triggers, each enough alone: events of the file's directory (a Kubernetes ConfigMap swaps a symlink there, so
-//! the file itself is never written), SIGHUP, and a slow poll of the content that repairs what an event missed.
+//! Of the file there are three triggers, each enough alone: events of its directory (a Kubernetes ConfigMap swaps a symlink
+//! there, so the file itself is never written), SIGHUP, and a slow poll of the content that repairs what an event missed.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::MetadataExt;
@@ -11,12 +11,11 @@ use std::time::Duration;
 
 use notify::event::{AccessKind, AccessMode, EventKind};
 use notify::{RecommendedWatcher, RecursiveMode, Watcher};
-use serde_json::Value;
 use tokio::sync::{mpsc, watch as channel};
 use tokio::time::{Instant, MissedTickBehavior};
 
-use super::document::NamedText;
-use super::{Document, Loaded, LocatedFault, Schema, Sources, judge};
+use super::compose::Composition;
+use super::{Loaded, LocatedFault, Overlay, Schema, Sources, Verdict};
 use crate::supervisor::{Supervisor, TaskPolicy};
 
 /// How changes are noticed.
@@ -46,10 +45,14 @@ impl Default for WatchSettings {
 /// The configuration that holds now.
 #[derive(Debug)]
 pub struct Current<T> {
+    /// What the program began with.
+    pub started: Arc<Loaded<T>>,
     /// The last one without faults.
     pub loaded: Arc<Loaded<T>>,
     /// Why what the file says now does not hold; `None`: it does.
     pub faults: Option<Arc<[LocatedFault]>>,
+    /// What became of the overlay; `None`: there is none.
+    pub overlay: Option<Verdict>,
     /// Counts the readings that were told, from 0 for the first.
     pub serial: u64,
 }
@@ -57,8 +60,10 @@ pub struct Current<T> {
 impl<T> Clone for Current<T> {
     fn clone(&self) -> Self {
         Self {
+            started: Arc::clone(&self.started),
             loaded: Arc::clone(&self.loaded),
             faults: self.faults.clone(),
+            overlay: self.overlay.clone(),
             serial: self.serial,
         }
     }
@@ -74,58 +79,73 @@ pub fn watch<T: Send + Sync + 'static>(
     initial: Loaded<T>,
     settings: WatchSettings,
 ) -> channel::Receiver<Current<T>> {
-    let seen = Ok(initial
-        .document
-        .file()
-        .zip(initial.document.text())
-        .map(|(file, text)| (Arc::from(file.display().to_string()), Arc::clone(text))));
+    let (_, nothing) = channel::channel(None);
+    watch_with(supervisor, sources, schema, initial, settings, nothing)
+}
+
+/// As [`watch`], with a tree over the file that changes while the program runs. A change of either is told once. What one of
+/// them says wrongly changes nothing and keeps the other from nothing; where both are good apart and faulty together, the
+/// later one does not count.
+#[must_use]
+pub fn watch_with<T: Send + Sync + 'static>(
+    supervisor: &Supervisor,
+    sources: Sources,
+    schema: Schema<T>,
+    initial: Loaded<T>,
+    settings: WatchSettings,
+    overlays: channel::Receiver<Option<Overlay>>,
+) -> channel::Receiver<Current<T>> {
+    let composition = Composition::new(sources, schema, &initial.document);
+    let initial = Arc::new(initial);
     let (tell, told) = channel::channel(Current {
-        loaded: Arc::new(initial),
+        started: Arc::clone(&initial),
+        loaded: initial,
         faults: None,
+        overlay: None,
         serial: 0,
     });
     let stop = supervisor.shutdown_token();
-    let task = Task {
-        sources,
-        schema,
-        tell,
-        seen,
-    };
+    let task = Task { composition, tell };
     supervisor.spawn("configuration watch", TaskPolicy::Essential, async move {
         tokio::select! {
-            () = task.run(settings) => {}
+            () = task.run(settings, overlays) => {}
             () = stop.cancelled() => {}
         }
     });
     told
 }
 
-/// Name and text of the file, or why it could not be read.
-type Seen = Result<Option<NamedText>, LocatedFault>;
-
 struct Task<T> {
-    sources: Sources,
-    schema: Schema<T>,
+    composition: Composition<T>,
     tell: channel::Sender<Current<T>>,
-    seen: Seen,
 }
 
 impl<T: Send + Sync + 'static> Task<T> {
-    async fn run(mut self, settings: WatchSettings) {
+    async fn run(mut self, settings: WatchSettings, mut overlays: channel::Receiver<Option<Overlay>>) {
         let (events, mut changed) = mpsc::channel(1);
         let mut directories = Directories::new(settings.directory_events.then(|| events.clone()));
         let mut hangup = Hangup::new(settings.hangup);
         let mut poll = tokio::time::interval(settings.poll);
         poll.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        // What is there before the first change counts too.
+        overlays.mark_changed();
         loop {
             let mut forced = false;
             tokio::select! {
+                // Without a sender it stays as it is.
+                Ok(()) = overlays.changed() => {
+                    let overlay = overlays.borrow_and_update().clone();
+                    if self.composition.lay_over(overlay) {
+                        self.reload();
+                    }
+                    continue;
+                }
                 Some(()) = changed.recv() => quiet(&mut changed, settings.debounce).await,
                 () = hangup.recv() => forced = true,
                 // The first tick comes at once: what changed since the first reading is found.
                 _ = poll.tick() => {}
             }
-            let sources = self.sources.clone();
+            let sources = self.composition.sources().clone();
             let looked = tokio::task::spawn_blocking(move || {
                 // Watched before it is read, so that no change falls between.
                 if let Some(file) = sources.resolve_file() {
@@ -136,38 +156,22 @@ impl<T: Send + Sync + 'static> Task<T> {
             // The blocking task ends early only when the runtime goes away.
             let Ok((seen, back)) = looked.await else { return };
             directories = back;
-            if forced || seen != self.seen {
-                self.seen = seen;
+            if self.composition.see(seen) || forced {
                 self.reload();
             }
         }
     }
 
     fn reload(&mut self) {
-        let read = match &self.seen {
-            Ok(text) => self.judge(text.clone()),
-            Err(fault) => Err(vec![fault.clone()]),
-        };
+        let judgement = self.composition.judge();
         self.tell.send_modify(|current| {
             current.serial += 1;
-            match read {
-                Ok(loaded) => {
-                    current.loaded = Arc::new(loaded);
-                    current.faults = None;
-                }
-                Err(faults) => current.faults = Some(faults.into()),
+            if let Some(loaded) = judgement.loaded {
+                current.loaded = Arc::new(loaded);
             }
+            current.faults = judgement.faults;
+            current.overlay = judgement.overlay;
         });
-    }
-
-    fn judge(&self, text: Option<NamedText>) -> Result<Loaded<T>, Vec<LocatedFault>> {
-        // A file that is being written is empty for a moment. It would be valid and reset everything to its default.
-        let emptied = text.as_ref().is_some_and(|(_, text)| text.trim().is_empty());
-        let before = &self.tell.borrow().loaded.document;
-        if emptied && *before.value() != Value::Null {
-            return Err(vec![before.fault("", "has become empty")]);
-        }
-        judge(Document::from_text(&self.sources, text), &self.schema)
     }
 }
 

@@ -5,6 +5,7 @@
 //!       │                                                     ◄─ reply channel, blaze/config/changed/<service>
 //!       └─► listeners ─► callbacks on the pool
 //! BaseConfiguration: the mounted file, and over it what the worker says
+//! ProgramConfig: the same for a program that has a node file
 //! ```
 
 mod base;
@@ -12,6 +13,9 @@ mod book;
 mod change;
 mod driver;
 mod listeners;
+mod program;
+#[cfg(test)]
+mod program_tests;
 #[cfg(test)]
 mod tests;
 mod typed;
@@ -38,6 +42,7 @@ pub(crate) use change::Held;
 pub use change::{ConfigChange, ConfigScope, ConfigSource};
 pub use listeners::ConfigListener;
 use listeners::Listeners;
+pub use program::ProgramConfig;
 
 use crate::SdkError;
 use crate::pool::PoolHandle;
@@ -257,7 +262,22 @@ impl ConfigManager {
     /// # Errors
     /// [`SdkError::Broker`], when the broker cannot carry it at all. One that is away drops it, which is an outcome.
     pub fn ack(&self, status: AckStatus, detail: &str) -> Result<PublishOutcome, SdkError> {
-        let text = wire::ack(&self.shared.identity, self.shared.shown.borrow().held(), status, detail);
+        let held = self.held(|held| (held.revision, held.hash.clone()));
+        self.ack_of(
+            held.as_ref().map(|(revision, hash)| (*revision, hash.as_str())),
+            status,
+            detail,
+        )
+    }
+
+    /// The same of a configuration that may not be the newest any more: its revision and hash.
+    pub(crate) fn ack_of(
+        &self,
+        of: Option<(u64, &str)>,
+        status: AckStatus,
+        detail: &str,
+    ) -> Result<PublishOutcome, SdkError> {
+        let text = wire::ack(&self.shared.identity, of, status, detail);
         let publisher = {
             let mut acks = self.shared.acks.lock();
             match &*acks {

@@ -18,17 +18,17 @@ use serde_json::{Value, json};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
-const LONG: Duration = Duration::from_secs(300);
+pub(super) const LONG: Duration = Duration::from_secs(300);
 const PERIOD: Duration = Duration::from_secs(60);
 
-struct PlayedWorker {
+pub(super) struct PlayedWorker {
     broker: MemoryBroker,
     requests: Subscription,
-    acks: Subscription,
+    pub(super) acks: Subscription,
 }
 
 impl PlayedWorker {
-    async fn start(hub: &MemoryHub) -> Self {
+    pub(super) async fn start(hub: &MemoryHub) -> Self {
         let broker = hub.broker();
         let requests = listen(&broker, "blaze/config/get").await;
         let acks = listen(&broker, "blaze/config/ack").await;
@@ -36,12 +36,12 @@ impl PlayedWorker {
     }
 
     /// The next request and when it came.
-    async fn asked(&mut self) -> (Instant, Value) {
+    pub(super) async fn asked(&mut self) -> (Instant, Value) {
         let request = next(&mut self.requests).await;
         (Instant::now(), request)
     }
 
-    fn say(&self, channel: &str, value: &Value) {
+    pub(super) fn say(&self, channel: &str, value: &Value) {
         let channel: ChannelName = channel.parse().unwrap();
         let publisher = self.broker.publisher(&channel, PublisherOptions::default()).unwrap();
         publisher.publish_bare(&Bytes::from(value.to_string()), None);
@@ -53,14 +53,14 @@ impl PlayedWorker {
         self.say(request["reply_to"].as_str().unwrap(), &answer);
     }
 
-    fn give(&self, request: &Value, revision: u64, config: &Value) {
+    pub(super) fn give(&self, request: &Value, revision: u64, config: &Value) {
         let rest = json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1", "revision": revision,
             "hash": hash(config), "config": config, "source": "main", "as_of": "2026-11-21T07:01:12.345Z", "age_s": 0.1,
             "rollout": null});
         self.answer(request, rest);
     }
 
-    fn tell(&self, revision: u64, config: &Value, scope: &str) {
+    pub(super) fn tell(&self, revision: u64, config: &Value, scope: &str) {
         let notice = json!({"service": "slam", "instance": "0", "layer": "edge", "node": "robot-1", "revision": revision,
             "hash": hash(config), "previous_hash": null, "paths": ["/rate_hz"], "scopes": [scope], "config": config,
             "source": "main", "time": "2026-11-21T07:01:12.345Z"});
@@ -73,7 +73,7 @@ async fn listen(broker: &MemoryBroker, channel: &str) -> Subscription {
     broker.subscribe(&channel, SubscribeOptions::default()).await.unwrap()
 }
 
-async fn next(subscription: &mut Subscription) -> Value {
+pub(super) async fn next(subscription: &mut Subscription) -> Value {
     let mut batch = Vec::new();
     let wait = subscription.receive(&mut batch, 1);
     tokio::time::timeout(LONG, wait).await.expect("a message");
@@ -93,7 +93,7 @@ fn options(hub: &MemoryHub, name: &str) -> ServiceOptions {
     options.on_node("robot-1".parse().unwrap())
 }
 
-async fn slam(hub: &MemoryHub) -> ServiceManager {
+pub(super) async fn slam(hub: &MemoryHub) -> ServiceManager {
     ServiceManager::start(options(hub, "slam")).await.unwrap()
 }
 

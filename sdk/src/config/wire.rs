@@ -160,8 +160,8 @@ pub(super) fn request(identity: &Identity, id: &str, reply_to: &str, hash: Optio
     Value::Object(out).to_string()
 }
 
-/// An acknowledgement. A detail that is too long is cut, and control characters become spaces: a worker reads neither.
-pub(super) fn ack(identity: &Identity, held: Option<&Held>, status: AckStatus, detail: &str) -> String {
+/// An acknowledgement of a revision and its hash. A detail that is too long is cut, and control characters become spaces: a worker reads neither.
+pub(super) fn ack(identity: &Identity, of: Option<(u64, &str)>, status: AckStatus, detail: &str) -> String {
     let mut end = detail.len().min(MAX_DETAIL_BYTES);
     while !detail.is_char_boundary(end) {
         end -= 1;
@@ -170,9 +170,9 @@ pub(super) fn ack(identity: &Identity, held: Option<&Held>, status: AckStatus, d
     // A control character may be longer than the space that replaces it, never shorter.
     let detail: String = detail[..end].chars().map(plain).collect();
     let mut out = begin(identity);
-    if let Some(held) = held {
-        out.insert("revision".to_owned(), held.revision.into());
-        out.insert("hash".to_owned(), held.hash.as_str().into());
+    if let Some((revision, hash)) = of {
+        out.insert("revision".to_owned(), revision.into());
+        out.insert("hash".to_owned(), hash.into());
     }
     out.insert("status".to_owned(), status.as_str().into());
     out.insert("detail".to_owned(), json!(detail));

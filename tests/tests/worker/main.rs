@@ -6,6 +6,8 @@
 //! stage    a main service, a broker and workers of one layer
 //! serving  what services are told, and whether only those it concerns
 //! outages  the main service, the broker and the worker away, in turns and together
+//! flow     BlazeFlow's own settings: what counts, what is refused, who else hears
+//! flow_live  the same while messages flow, in a roll-out, and whatever starts first
 //! layer    one worker for a whole layer, on Kafka and on DDS
 //! kafka    what is special to Kafka
 //! leases   the suite of leases on real servers
@@ -19,6 +21,8 @@
     reason = "the helpers of a test fail like the test"
 )]
 
+mod flow;
+mod flow_live;
 #[cfg(feature = "kafka")]
 mod kafka;
 mod layer;

@@ -442,3 +442,10 @@ pub(crate) async fn rest(notices: &mut Subscription) -> Vec<Value> {
     let _ = tokio::time::timeout(Duration::from_millis(1), notices.receive(&mut batch, 10_000)).await;
     batch.iter().map(|received| text(&received.content)).collect()
 }
+
+impl Stage {
+    /// Where workers reach the main service.
+    pub(crate) fn grpc(&self) -> SocketAddr {
+        self.grpc
+    }
+}

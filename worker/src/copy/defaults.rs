@@ -111,7 +111,7 @@ fn parse(text: &str, name: &str) -> Result<BTreeMap<Key, Document>, DefaultsErro
     let values = yaml_documents(text, MAX_DOCUMENTS).map_err(|faults| {
         let place = |place: &Place| match place {
             Place::Line(line) | Place::File { line, .. } => format!("{name}:{line}"),
-            Place::Nowhere | Place::Environment(_) | Place::Override(_) => name.to_owned(),
+            Place::Nowhere | Place::Overlay { .. } | Place::Environment(_) | Place::Override(_) => name.to_owned(),
         };
         let told = faults.iter().take(MAX_FAULTS).map(|fault| {
             let path = if fault.path.is_empty() {

@@ -366,6 +366,14 @@ impl Served {
         Some(self.standing(place.at(&self.site), told.revision, hash, sources))
     }
 
+    /// The configuration of a place, without counting it as one that asked; `None`: nothing is there, or no such service.
+    #[must_use]
+    pub fn look_up(&self, place: &Place) -> Option<Standing> {
+        let sources = self.shown.at(&self.site, place).filter(|_| self.is_ready())?;
+        let hash = sources.hash();
+        Some(self.standing(place.at(&self.site), self.floor, hash, sources))
+    }
+
     /// The configuration of a layer, or of a node of it, without any service.
     pub(super) fn standing_at(&self, at: At) -> Standing {
         let sources = self.shown.sources(&at);

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use blaze_domain::ServiceName;
 use blaze_domain::config::Key;
 use blaze_domain::config::effective::{At, Sources};
+use blaze_domain::config::spec::PROGRAMS;
 use blaze_domain::config::state::State;
 
 use super::place::{Place, Site};
@@ -25,8 +26,9 @@ impl World {
         Sources::at_where(&self.state, at, |rollout| !self.failed.contains(&rollout.uid))
     }
 
+    /// Programs are there also without a document: what layers and nodes say of them counts.
     pub(super) fn has_service(&self, service: &ServiceName) -> bool {
-        self.state.get(&Key::service(service)).is_some()
+        PROGRAMS.contains(&service.as_str()) || self.state.get(&Key::service(service)).is_some()
     }
 
     /// The documents that count at a place; `None` if its service is not there.

@@ -15,6 +15,7 @@ mod fade;
 mod hear;
 mod lead;
 mod missed;
+mod own;
 mod ports;
 mod status;
 mod tell;
@@ -40,6 +41,7 @@ use fade::Fades;
 use missed::Missed;
 
 pub use hear::Sign;
+pub use own::Own;
 pub use ports::{Counts, Identity, Inputs, Outputs, Query, Replies};
 pub use status::Status;
 
@@ -109,6 +111,8 @@ pub struct Engine {
     /// What others tell, or nobody, as long as this worker does not know that it was told.
     missed: Missed,
     defaults_problem: Option<String>,
+    /// The worker's own configuration.
+    own: Option<Own>,
     counts: Counts,
 }
 
@@ -147,6 +151,7 @@ impl Engine {
             farewells: BTreeMap::new(),
             missed: Missed::default(),
             defaults_problem: None,
+            own: None,
             counts: Counts::default(),
             identity,
             outputs,

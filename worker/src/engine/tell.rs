@@ -112,6 +112,7 @@ impl Engine {
         if is_first && self.tells {
             self.outputs.speaker.sweep_keys();
         }
+        self.tell_own();
         self.begin_telling();
         self.settle_soon();
         // After the notices: only what was told can go well or badly.

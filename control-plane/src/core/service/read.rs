@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use blaze_domain::config::{Code, Document, Key, Kind, Problem};
-use blaze_domain::{DocumentName, LayerName};
+use blaze_domain::{DocumentName, LayerName, ServiceName};
 use serde_json::Value;
 
 use super::super::committer::unavailable;
@@ -17,6 +17,7 @@ use super::{ConfigService, WAIT_FOR_REVISION, not_found, selector};
 use crate::auth::Right;
 use blaze_domain::config::effective::{At, Sources};
 use blaze_domain::config::placement::{Placement, placement};
+use blaze_domain::config::spec::PROGRAMS;
 use blaze_domain::config::state::{State, redacted};
 
 /// Entries of a page unless it is said.
@@ -324,11 +325,13 @@ impl ConfigService {
             layer: asked.layer.clone(),
             node: asked.node.clone(),
         };
-        let service = asked
-            .service
-            .as_ref()
-            .map(|service| exists(Key::service(service)))
-            .transpose()?;
+        // Programs are there also without a document, as for workers.
+        let has_no_document =
+            |service: &ServiceName| PROGRAMS.contains(&service.as_str()) && state.get(&Key::service(service)).is_none();
+        let service = match &asked.service {
+            Some(service) if !has_no_document(service) => Some(exists(Key::service(service))?),
+            Some(_) | None => None,
+        };
         if let Some(layer) = &asked.layer {
             exists(Key::layer(layer))?;
         }

@@ -1,0 +1,177 @@
+//! The node file as BlazeFlow reads it: at the start, and while it runs.
+
+use std::sync::Arc;
+
+use blaze_brokers::{OpenError, check_layer};
+use blaze_domain::node_file::{Fault, NodeFile};
+use blaze_runtime::config::{Current, Follower, Keys, Schema, follow};
+use blaze_runtime::logs::{self, LogHandle};
+use blaze_sdk::ProgramConfig;
+use tokio::sync::watch;
+
+use super::RunningFlow;
+use super::settings::LiveSettings;
+
+/// What a flow reads of the file, and what of it changes while it runs.
+pub const KEYS: Keys = Keys {
+    read: &[
+        "layer",
+        "node",
+        "brokers.node",
+        "brokers.layer",
+        "brokers.inter",
+        "admin.flow",
+        "cache",
+        "flow",
+        "log",
+        "state_dir",
+    ],
+    live: &[
+        "flow.bandwidth",
+        "flow.topics",
+        "flow.compression",
+        "flow.pool_threads",
+        "flow.access",
+        "log.level",
+    ],
+};
+
+/// The node file as a flow reads it.
+#[must_use]
+pub fn schema() -> Schema<NodeFile> {
+    let remark = |fault: Fault| (fault.path, fault.detail);
+    Arc::new(move |value| match NodeFile::read(value) {
+        Ok((file, warnings)) => {
+            let mut faults = file.check_for_flow();
+            faults.extend(broker_fault(&file));
+            faults.extend(level_fault(&file));
+            if faults.is_empty() {
+                Ok((file, warnings.into_iter().map(remark).collect()))
+            } else {
+                Err(faults.into_iter().map(remark).collect())
+            }
+        }
+        Err(faults) => Err(faults.into_iter().map(remark).collect()),
+    })
+}
+
+/// What the adapter has against the section of the layer scope. What was not built in is told beside that.
+fn broker_fault(file: &NodeFile) -> Option<Fault> {
+    match check_layer(file.brokers.layer.as_ref()?) {
+        Err(OpenError::Setting { key, reason }) => Some(Fault {
+            path: format!("brokers.layer.{key}"),
+            detail: reason,
+        }),
+        Ok(()) | Err(OpenError::NotBuilt { .. } | OpenError::InProcess) => None,
+    }
+}
+
+fn level_fault(file: &NodeFile) -> Option<Fault> {
+    let detail = logs::check_level(&file.log.level).err()?;
+    Some(Fault {
+        path: "log.level".to_owned(),
+        detail,
+    })
+}
+
+/// Whether a file differs from the one of the start in what a flow reads then alone.
+fn needs_restart(started: &NodeFile, file: &NodeFile) -> bool {
+    let mut same = started.clone();
+    same.flow.bandwidth = file.flow.bandwidth.clone();
+    same.flow.compression = file.flow.compression;
+    same.flow.pool_threads = file.flow.pool_threads;
+    same.flow.topics.clone_from(&file.flow.topics);
+    same.flow.access.clone_from(&file.flow.access);
+    same.log.level.clone_from(&file.log.level);
+    // What other programs read.
+    same.admin.worker = file.admin.worker;
+    same.admin.monitor = file.admin.monitor;
+    same.brokers.plugins.clone_from(&file.brokers.plugins);
+    same.config.clone_from(&file.config);
+    same.database.clone_from(&file.database);
+    same.monitor.clone_from(&file.monitor);
+    same.worker.clone_from(&file.worker);
+    same.control_plane.clone_from(&file.control_plane);
+    same != *file
+}
+
+/// Takes over what may change while the flow runs, until the watch of its configuration ends. What is faulty changes nothing
+/// and shows on `/readyz`; what BlazeConfig said is acknowledged, where the flow is a service.
+pub async fn follow_node_file(
+    flow: Arc<RunningFlow>,
+    told: watch::Receiver<Current<NodeFile>>,
+    log: Option<LogHandle>,
+    program: Option<ProgramConfig>,
+) {
+    let follower = Follower {
+        told,
+        readiness: flow.readiness().clone(),
+        keys: KEYS,
+        needs_restart,
+    };
+    let take = |loaded: &blaze_runtime::config::Loaded<NodeFile>| {
+        let file = &loaded.value;
+        flow.reload(LiveSettings::from(&file.flow));
+        if let Some(Err(error)) = log.as_ref().map(|log| log.set_level(&file.log.level)) {
+            tracing::error!(%error, "log.level");
+        }
+        tracing::info!(limit_mbps = file.flow.bandwidth.limit_mbps, "configuration reloaded");
+    };
+    follow(follower, take, |verdict, besides| {
+        if let Some(program) = &program {
+            program.judged(verdict, besides);
+        }
+    })
+    .await;
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    fn tree(rest: Value) -> Value {
+        let mut tree = json!({
+            "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "a"}, "brokers": {"layer": {"memory": {}}}
+        });
+        let Value::Object(rest) = rest else {
+            unreachable!("an object")
+        };
+        tree.as_object_mut().unwrap().extend(rest);
+        tree
+    }
+
+    fn file(rest: Value) -> NodeFile {
+        NodeFile::read(&tree(rest)).unwrap().0
+    }
+
+    #[test]
+    fn only_what_changes_while_it_runs_needs_no_restart() {
+        let started = file(json!({}));
+        let live = json!({
+            "flow": {"bandwidth": {"limit_mbps": 7}, "compression": {"level": 1}, "pool_threads": 1}, "log": {"level": "debug"},
+        });
+        assert!(!needs_restart(&started, &file(live)));
+        let of_others = json!({
+            "admin": {"worker": "127.0.0.1:9999"}, "worker": {"lease_ms": 1000}, "config": {"server": "https://10.0.0.1:50051"},
+            "database": {"embedded": {"path": "/tmp/x"}}, "monitor": {"ping_period_s": 5},
+        });
+        assert!(!needs_restart(&started, &file(of_others)));
+        for other in [
+            json!({"admin": {"flow": "127.0.0.1:9999"}}),
+            json!({"flow": {"gateway": true}}),
+            json!({"cache": {"redis": {"url": "redis://127.0.0.1"}}}),
+        ] {
+            assert!(needs_restart(&started, &file(other.clone())), "{other}");
+        }
+    }
+
+    #[test]
+    fn directives_that_no_log_takes_are_a_fault() {
+        let faults = schema()(&tree(json!({"log": {"level": "blaze_flow[=info"}}))).unwrap_err();
+        assert_eq!(faults.len(), 1);
+        assert_eq!(faults[0].0, "log.level");
+        assert!(schema()(&tree(json!({"log": {"level": "info,blaze_flow=debug"}}))).is_ok());
+    }
+}

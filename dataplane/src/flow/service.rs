@@ -1,0 +1,181 @@
+//! The flow as a service of its node: `blaze-flow` has a configuration in BlazeConfig and shows that it lives.
+//!
+//! ```text
+//! worker ─► local broker ─► ProgramConfig ─► over the node file ─► follow_node_file
+//! /readyz ─► starting, ready, unhealthy, stopping ─► watchdog
+//! ```
+//!
+//! It waits for nobody: without a worker the node file alone counts.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use blaze_domain::node_file::RedisBroker;
+use blaze_domain::{Scope, ServiceName};
+use blaze_runtime::{Readiness, Supervisor, TaskPolicy};
+use blaze_sdk::{CacheManager, ProgramConfig, SdkError, ServiceManager, ServiceOptions, ServiceState};
+
+use super::RunningFlow;
+
+/// How long a flow that was ready is not, before others hear of it: a broker that comes back is met in steps.
+const UNHEALTHY_AFTER: Duration = Duration::from_secs(3);
+/// How long the end waits for the sign of life to be taken away.
+const LEAVE_WITHIN: Duration = Duration::from_secs(1);
+
+/// A flow as a service. Dropping it ends what it started.
+pub struct FlowService {
+    manager: ServiceManager,
+    program: ProgramConfig,
+}
+
+impl FlowService {
+    /// Makes the flow a service on its own broker, that of the node if there is one, else that of the layer. `None`: it has
+    /// neither. `cache` is where its sign of life goes; without it that is a message.
+    ///
+    /// # Errors
+    /// `BLAZE_INSTANCE` is no name, or the cache can never work.
+    pub async fn start(
+        flow: &RunningFlow,
+        cache: Option<RedisBroker>,
+        supervisor: &Supervisor,
+    ) -> Result<Option<Self>, SdkError> {
+        let shared = &flow.shared;
+        let local = [Scope::Node, Scope::Layer]
+            .into_iter()
+            .find_map(|scope| Some((scope, shared.brokers.of(scope)?)));
+        let Some((scope, broker)) = local else {
+            return Ok(None);
+        };
+        let Ok(name) = "blaze-flow".parse::<ServiceName>() else {
+            return Ok(None);
+        };
+        let options = ServiceOptions::new(shared.me.layer.clone(), name, Arc::clone(broker), scope)
+            .on_node(shared.me.node.clone())
+            .instance_of_environment()?;
+        let manager = ServiceManager::start(ServiceOptions {
+            // Nothing of a flow runs as a callback.
+            pool_threads: 1,
+            epoch: shared.epoch.load(Ordering::Relaxed),
+            supervisor: Some(supervisor.clone()),
+            cache,
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            ..options
+        })
+        .await?;
+        let (readiness, signs) = (shared.readiness.clone(), manager.cache().clone());
+        let stop = supervisor.shutdown_token();
+        supervisor.spawn("signs of life", TaskPolicy::MayEnd, async move {
+            tokio::select! {
+                () = show(&readiness, &signs) => {}
+                () = stop.cancelled() => {}
+            }
+        });
+        let program = manager.program_config();
+        Ok(Some(Self { manager, program }))
+    }
+
+    /// What BlazeConfig says.
+    #[must_use]
+    pub fn program(&self) -> &ProgramConfig {
+        &self.program
+    }
+
+    /// Takes the sign of life away. Before the flow's brokers are closed.
+    pub async fn stop(self) {
+        if tokio::time::timeout(LEAVE_WITHIN, self.manager.shutdown())
+            .await
+            .is_err()
+        {
+            tracing::debug!("the sign of life is left to vanish by itself");
+        }
+    }
+}
+
+/// Says how the flow is, as `/readyz` does.
+async fn show(readiness: &Readiness, signs: &CacheManager) {
+    let mut changed = readiness.changed();
+    let mut was_ready = false;
+    loop {
+        let is_ready = *changed.borrow_and_update();
+        was_ready |= is_ready;
+        let state = if readiness.is_stopping() {
+            ServiceState::Stopping
+        } else if is_ready {
+            ServiceState::Ready
+        } else if was_ready {
+            let comes_back = changed.wait_for(|is_ready| *is_ready || readiness.is_stopping());
+            if tokio::time::timeout(UNHEALTHY_AFTER, comes_back).await.is_ok() {
+                continue;
+            }
+            ServiceState::Unhealthy
+        } else {
+            ServiceState::Starting
+        };
+        signs.set_state(state);
+        if changed.changed().await.is_err() {
+            return;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use blaze_brokers::memory::MemoryHub;
+    use blaze_brokers::{Broker as _, Content, SubscribeOptions};
+    use blaze_runtime::{CheckStatus, Gate};
+    use serde_json::Value;
+
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_flow_is_unhealthy_when_it_is_not_ready_for_a_while_and_not_when_it_ends() {
+        let hub = MemoryHub::new("node");
+        let reader = hub.broker();
+        let mut beats = reader
+            .subscribe(&"blaze/watchdog".parse().unwrap(), SubscribeOptions::default())
+            .await
+            .unwrap();
+        let options = ServiceOptions::new(
+            "edge".parse().unwrap(),
+            "blaze-flow".parse().unwrap(),
+            Arc::new(hub.broker()),
+            Scope::Node,
+        );
+        let manager = ServiceManager::start(options.on_node("robot-1".parse().unwrap()))
+            .await
+            .unwrap();
+        let readiness = Readiness::new();
+        readiness.add("inter", Gate::Decides, CheckStatus::Failed, "");
+        let steps = async {
+            let pause = |seconds| tokio::time::sleep(Duration::from_secs(seconds));
+            pause(1).await;
+            readiness.set("inter", CheckStatus::Ok, "");
+            pause(1).await;
+            readiness.set("inter", CheckStatus::Failed, "a moment");
+            pause(1).await;
+            readiness.set("inter", CheckStatus::Ok, "");
+            pause(1).await;
+            readiness.set("inter", CheckStatus::Failed, "for long");
+            pause(20).await;
+            readiness.set("inter", CheckStatus::Ok, "");
+            pause(1).await;
+            readiness.stop();
+            pause(4).await;
+        };
+        tokio::select! {
+            () = steps => {}
+            () = show(&readiness, manager.cache()) => {}
+        }
+        let mut batch = Vec::new();
+        beats.receive(&mut batch, 1000).await;
+        let states = batch.iter().map(|received| match &received.content {
+            Content::Bare { payload, .. } => serde_json::from_slice::<Value>(payload).unwrap()["state"].clone(),
+            other => panic!("{other:?}"),
+        });
+        let mut states: Vec<Value> = states.collect();
+        states.dedup();
+        assert_eq!(states, ["starting", "ready", "unhealthy", "ready", "stopping"]);
+        manager.shutdown().await;
+    }
+}

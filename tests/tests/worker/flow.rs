@@ -1,0 +1,280 @@
+//! BlazeFlow takes its own settings from the worker of its node: what counts, what is refused, and who else hears.
+
+use std::time::{Duration, Instant};
+
+use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
+use blaze_tests::plain::{self, RedisReader};
+use blaze_tests::wait;
+use serde_json::{Value, json};
+
+use super::stage::{PATIENCE, Stage, Worker, next, rest};
+
+/// What is acknowledged to a user is in effect so soon.
+pub(crate) const SOON: Duration = Duration::from_secs(1);
+
+pub(crate) fn spec(stage: &Stage, node: &str) -> FlowSpec {
+    FlowSpec::new("edge", node).on_redis(&stage.redis.url(), "")
+}
+
+/// The layer as `Stage::robot` makes it, with overrides for the flow.
+pub(crate) fn layer(flow: &Value) -> Value {
+    json!({ "kind": "edge", "config": { "verbosity": "info" }, "overrides": { "blaze-flow": flow } })
+}
+
+pub(crate) fn limit(limit_mbps: f64) -> Value {
+    json!({ "flow": { "bandwidth": { "limit_mbps": limit_mbps } } })
+}
+
+/// Waits until `/v1/allocation` satisfies.
+pub(crate) fn allocates(flow: &FlowProcess, what: &str, within: Duration, is_so: impl Fn(&Value) -> bool) -> Duration {
+    let ask = || flow.admin().json("/v1/allocation").unwrap_or_default();
+    wait::until(what, within, || is_so(&ask()), || format!("{} {}", ask(), flow.tail())).unwrap()
+}
+
+pub(crate) fn has_limit(flow: &FlowProcess, limit_mbps: f64, within: Duration) -> Duration {
+    allocates(flow, &format!("limit {limit_mbps}"), within, |seen| {
+        seen["limit_mbps"] == limit_mbps
+            && seen["budget_bytes_per_s"].as_f64() == Some((limit_mbps * 131_072.0).floor())
+    })
+}
+
+/// Waits until the check `config` satisfies; a flow stays ready whatever it says.
+pub(crate) fn check(flow: &FlowProcess, what: &str, is_so: impl Fn(&str, &str) -> bool) {
+    let ask = || flow.admin().json("/readyz").unwrap_or_default();
+    let holds = || {
+        let seen = ask();
+        let config = &seen["checks"]["config"];
+        seen["status"] == "ready"
+            && is_so(
+                config["status"].as_str().unwrap_or_default(),
+                config["detail"].as_str().unwrap_or_default(),
+            )
+    };
+    wait::until(what, PATIENCE, holds, || format!("{} {}", ask(), flow.tail())).unwrap();
+}
+
+/// Acknowledgements of a flow, as anybody on the broker hears them.
+pub(crate) struct Acks(RedisReader);
+
+impl Acks {
+    pub(crate) fn new(stage: &Stage) -> Self {
+        Self(RedisReader::new(&stage.redis.url(), "blaze/config/ack").unwrap())
+    }
+
+    pub(crate) fn next(&mut self, status: &str) -> Value {
+        let start = Instant::now();
+        loop {
+            let ack = self.0.next_json(PATIENCE).unwrap();
+            if ack["service"] == "blaze-flow" && ack["status"] == status {
+                return ack;
+            }
+            assert!(start.elapsed() < PATIENCE, "{status}: {ack}");
+        }
+    }
+}
+
+/// Waits until the worker knows that the flow has its newest configuration.
+pub(crate) async fn is_configured(worker: &Worker) {
+    worker
+        .until("the flow has its configuration", |status| {
+            let mut rows = status["services"].as_array().into_iter().flatten();
+            rows.any(|row| {
+                row["service"] == "blaze-flow"
+                    && row["instance"] == "0"
+                    && row["state"] == "ready"
+                    && row["hash"].is_string()
+                    && row["hash"] == row["config_hash"]
+            })
+        })
+        .await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_limit_of_layer_or_node_is_in_effect_within_a_second_and_nobody_else_hears() {
+    let stage = Stage::new();
+    let _main = stage.main();
+    stage.robot().await;
+    let worker = stage.worker("robot-1");
+    stage.equal(&worker, PATIENCE).await;
+    let mut flow = FlowProcess::start(FlowSpec {
+        limit_mbps: 30.0,
+        ..spec(&stage, "robot-1")
+    })
+    .unwrap();
+    is_configured(&worker).await;
+    let record = stage
+        .keys()
+        .record("blaze:watchdog:blaze-flow:robot-1:0")
+        .await
+        .unwrap();
+    let record = record.expect("the flow shows that it lives");
+    assert_eq!((record["state"].as_str(), record["layer"].as_str()), ("ready", "edge"));
+
+    let service = stage.service().await;
+    let mut acks = Acks::new(&stage);
+    let (mut slam, mut nav) = (service.listen("slam").await, service.listen("nav").await);
+    let mut own = service.listen("blaze-flow").await;
+    // There is no document of the service `blaze-flow`: programs are there without one.
+    stage.put("/layers/edge", layer(&limit(12.0))).await;
+    let took = has_limit(&flow, 12.0, SOON);
+    let notice = next(&mut own).await;
+    assert_eq!(notice["paths"], json!(["/flow/bandwidth/limit_mbps"]));
+    let ack = acks.next("applied");
+    assert_eq!((&ack["hash"], &ack["node"]), (&notice["hash"], &json!("robot-1")));
+    stage
+        .put(
+            "/nodes/robot-1",
+            json!({ "layer": "edge", "overrides": { "blaze-flow": limit(9.5) } }),
+        )
+        .await;
+    let again = has_limit(&flow, 9.5, SOON);
+    eprintln!("a changed limit is in effect after {took:?} and {again:?}");
+    let effective = stage.get("/effective?service=blaze-flow&node=robot-1").await;
+    assert_eq!(effective["config"]["flow"]["bandwidth"]["limit_mbps"], 9.5);
+    // What is taken away gives the weaker value again, at last that of the file.
+    stage.put("/nodes/robot-1", json!({ "layer": "edge" })).await;
+    has_limit(&flow, 12.0, SOON);
+    stage.put("/layers/edge", layer(&json!({}))).await;
+    has_limit(&flow, 30.0, SOON);
+    next(&mut own).await;
+    let others = (rest(&mut slam).await, rest(&mut nav).await);
+    assert!(others.0.is_empty() && others.1.is_empty(), "{others:?}");
+
+    flow.terminate().unwrap();
+    assert_eq!(flow.exit(PATIENCE).unwrap(), Some(0), "{}", flow.tail());
+    let gone = stage
+        .keys()
+        .record("blaze:watchdog:blaze-flow:robot-1:0")
+        .await
+        .unwrap();
+    assert!(gone.is_none(), "a flow that ends takes its sign of life away: {gone:?}");
+    worker.stop();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_the_flow_cannot_take_changes_nothing_and_says_so() {
+    let stage = Stage::new();
+    let _main = stage.main();
+    stage.robot().await;
+    let worker = stage.worker("robot-1");
+    stage.equal(&worker, PATIENCE).await;
+    let domain = free_domain().unwrap();
+    let flow = FlowProcess::start(FlowSpec {
+        limit_mbps: 30.0,
+        ..spec(&stage, "robot-1").joined(domain)
+    })
+    .unwrap();
+    is_configured(&worker).await;
+    let mut acks = Acks::new(&stage);
+    stage.put("/layers/edge", layer(&limit(20.0))).await;
+    has_limit(&flow, 20.0, PATIENCE);
+    acks.next("applied");
+
+    // Directives that no log takes, and a domain that the node file has for something else: each part is good by itself, so the
+    // main service takes it. With it comes a limit, which must not count either.
+    let log = json!({ "flow": { "bandwidth": { "limit_mbps": 7 } }, "log": { "level": "blaze_flow[=info" } });
+    let dds = json!({ "flow": { "bandwidth": { "limit_mbps": 8 } },
+        "brokers": { "layer": { "dds": { "domain": domain, "interface": "127.0.0.1" } } } });
+    for (faulty, key) in [(log, "log.level"), (dds, "brokers.inter.dds.domain")] {
+        stage.put("/layers/edge", layer(&faulty)).await;
+        let ack = acks.next("rejected");
+        let detail = ack["detail"].as_str().unwrap();
+        assert!(detail.contains(key), "{detail}");
+        check(&flow, "it is shown", |status, detail| {
+            status == "failed" && detail.contains(key)
+        });
+        has_limit(&flow, 20.0, Duration::ZERO);
+    }
+    // It is said again, for whoever was away.
+    acks.next("rejected");
+    let status = worker.status().await;
+    assert!(status["connected"].as_bool().unwrap(), "{status}");
+
+    // What never comes from a main service: the flow looks at it all the same.
+    for (revision, faulty) in [
+        (1_000_001, json!({ "flow": { "bandwidth": { "limit_mbps": "fast" } } })),
+        (1_000_002, json!({ "flow": { "bandwidth": { "limit_mbps": -1 } } })),
+        (1_000_003, json!({ "flow": { "bandwidths": {} } })),
+        (1_000_004, json!({ "flow": 7 })),
+    ] {
+        let notice = json!({ "service": "blaze-flow", "instance": "0", "layer": "edge", "node": "robot-1", "revision": revision,
+            "hash": format!("sha256:{revision}"), "paths": [], "scopes": [], "config": faulty, "source": "main" });
+        plain::publish(
+            &stage.redis.url(),
+            "blaze/config/changed/blaze-flow",
+            notice.to_string().as_bytes(),
+        )
+        .unwrap();
+        let ack = loop {
+            let ack = acks.next("rejected");
+            if ack["revision"] == revision {
+                break ack;
+            }
+        };
+        assert!(ack["detail"].as_str().unwrap().contains("flow"), "{ack}");
+        has_limit(&flow, 20.0, Duration::ZERO);
+    }
+    worker.stop();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_node_file_and_blaze_config_change_apart_from_each_other() {
+    let stage = Stage::new();
+    let _main = stage.main();
+    stage.robot().await;
+    let worker = stage.worker("robot-1");
+    stage.equal(&worker, PATIENCE).await;
+    let mut flow = FlowProcess::start(FlowSpec {
+        limit_mbps: 30.0,
+        ..spec(&stage, "robot-1")
+    })
+    .unwrap();
+    is_configured(&worker).await;
+    stage.put("/layers/edge", layer(&limit(20.0))).await;
+    has_limit(&flow, 20.0, PATIENCE);
+    // The file says something else beside, which counts, and another limit, which does not.
+    flow.edit(|spec| {
+        spec.limit_mbps = 31.0;
+        spec.bandwidth = "share: fair".to_owned();
+    })
+    .unwrap();
+    allocates(&flow, "both count", PATIENCE, |seen| {
+        seen["share"] == "fair" && seen["limit_mbps"] == 20.0
+    });
+    // A faulty file keeps nobody from changing the limit.
+    flow.edit(|spec| spec.bandwidth = "share: nobody".to_owned()).unwrap();
+    check(&flow, "the file is faulty", |status, detail| {
+        status == "failed" && detail.contains("share")
+    });
+    stage.put("/layers/edge", layer(&limit(21.0))).await;
+    has_limit(&flow, 21.0, SOON);
+    check(&flow, "the file is still faulty", |status, detail| {
+        status == "failed" && detail.contains("share")
+    });
+    flow.edit(|spec| spec.bandwidth = "share: paper".to_owned()).unwrap();
+    allocates(&flow, "the file counts again", PATIENCE, |seen| {
+        seen["share"] == "paper" && seen["limit_mbps"] == 21.0
+    });
+    check(&flow, "all is well", |status, detail| {
+        status == "ok" && detail.is_empty()
+    });
+    // What does not change while a flow runs is named.
+    stage
+        .put("/layers/edge", layer(&json!({ "flow": { "gateway": true } })))
+        .await;
+    has_limit(&flow, 31.0, PATIENCE);
+    check(&flow, "it is named", |status, detail| {
+        status == "ok" && detail.contains("flow.gateway") && detail.contains("BlazeConfig")
+    });
+    // Without the main service and the worker it stays as it is.
+    stage.put("/layers/edge", layer(&limit(22.0))).await;
+    has_limit(&flow, 22.0, PATIENCE);
+    worker.kill();
+    flow.edit(|spec| spec.bandwidth = "share: fair".to_owned()).unwrap();
+    allocates(&flow, "without a worker", PATIENCE, |seen| {
+        seen["share"] == "fair" && seen["limit_mbps"] == 22.0
+    });
+    let _worker = stage.worker("robot-1");
+    stage.put("/layers/edge", layer(&json!({}))).await;
+    has_limit(&flow, 31.0, PATIENCE);
+}
