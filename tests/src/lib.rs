@@ -4,6 +4,7 @@ pub mod admin;
 pub mod flow;
 mod guard;
 pub mod ledger;
+mod memory;
 pub mod network;
 #[cfg(feature = "kafka")]
 pub mod plain;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::net::{SocketAddr, TcpListener};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -24,16 +24,16 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 
 /// What the processes of one test have in common.
 pub(crate) struct Stage {
-    folder: TempDir,
+    pub(super) folder: TempDir,
     pub(crate) redis: RedisServer,
-    rest: SocketAddr,
-    grpc: SocketAddr,
-    http: reqwest::Client,
+    pub(super) rest: SocketAddr,
+    pub(super) grpc: SocketAddr,
+    pub(super) http: reqwest::Client,
 }
 
 /// A running worker and where it is asked.
 pub(crate) struct Worker {
-    process: Process,
+    pub(super) process: Process,
     pub(crate) admin: SocketAddr,
 }
 
@@ -43,21 +43,30 @@ fn free() -> SocketAddr {
 
 fn launch(program: &str, node_file: &str) -> anyhow::Result<(Process, BTreeMap<String, SocketAddr>)> {
     let process = Process::start(program, &["--config", node_file], None)?;
+    let addresses = addresses(&process)?;
+    Ok((process, addresses))
+}
+
+/// Waits for the ready line, and gives what is in it.
+pub(super) fn addresses(process: &Process) -> anyhow::Result<BTreeMap<String, SocketAddr>> {
     let line = wait::until_some(
-        &format!("the ready line of {program}"),
+        "the ready line",
         START,
         || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
         || process.tail(),
     )?;
     let words = line.split(' ').filter_map(|word| word.split_once('='));
     let addresses = words.filter_map(|(name, address)| Some((name.to_owned(), address.parse().ok()?)));
-    Ok((process, addresses.collect()))
+    Ok(addresses.collect())
 }
 
 impl Stage {
     pub(crate) fn new() -> Self {
+        let folder = TempDir::new().unwrap();
+        let key = blaze_auth::generate_encryption_key().unwrap();
+        std::fs::write(folder.path().join("enc.key"), key.as_bytes()).unwrap();
         Self {
-            folder: TempDir::new().unwrap(),
+            folder,
             redis: RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap(),
             rest: free(),
             grpc: free(),
@@ -69,7 +78,7 @@ impl Stage {
         self.folder.path().join(name)
     }
 
-    fn write(&self, name: &str, file: &Value) -> String {
+    pub(super) fn write(&self, name: &str, file: &Value) -> String {
         let path = self.path(name);
         // JSON is YAML.
         std::fs::write(&path, file.to_string()).unwrap();
@@ -78,17 +87,28 @@ impl Stage {
 
     /// The main service, ready; after a start on the same store as before.
     pub(crate) fn main(&self) -> Process {
+        self.main_at("warn", None)
+    }
+
+    /// The same with a level of logs, which may all be written to a file.
+    pub(crate) fn main_at(&self, level: &str, log: Option<&Path>) -> Process {
         let file = self.write(
             "main.yaml",
             &json!({
-                "log": { "level": "warn" },
+                "log": { "level": level },
                 "control_plane": {
                     "rest": { "listen": self.rest }, "grpc": { "listen": self.grpc }, "admin": { "listen": "127.0.0.1:0" },
                     "store": { "sqlite": { "path": self.path("main.db") } },
+                    "encryption": { "keys": [{ "id": "e1", "file": self.path("enc.key") }] },
                 },
             }),
         );
-        let process = Process::start("blaze-config", &["--dev", "--config", &file], None).unwrap();
+        let arguments = ["--dev", "--config", &file];
+        let process = match log {
+            Some(log) => Process::start_logged("blaze-config", &arguments, log),
+            None => Process::start("blaze-config", &arguments, None),
+        }
+        .unwrap();
         wait::until_some(
             "the ready line of blaze-config",
             START,
@@ -176,36 +196,13 @@ impl Stage {
         .await
     }
 
-    fn section(&self) -> blaze_domain::node_file::RedisBroker {
-        let file = json!({ "brokers": { "node": { "redis": { "url": self.redis.url() } } } });
-        match NodeFile::read(&file).unwrap().0.brokers.node {
-            Some(NodeBroker::Redis(section)) => section,
-            other => panic!("{other:?}"),
-        }
-    }
-
     pub(crate) fn keys(&self) -> RedisKeys {
-        RedisKeys::open(&self.section()).unwrap()
+        RedisKeys::open(&section(&self.redis)).unwrap()
     }
 
     /// A service that knows only the broker.
     pub(crate) async fn service(&self) -> Service {
-        let broker = RedisBroker::open(&self.section(), &Role::Service).unwrap();
-        let mut status = broker.status();
-        let up = status.wait_for(|status| status.health == Health::Up);
-        tokio::time::timeout(PATIENCE, up)
-            .await
-            .expect("Redis answers")
-            .unwrap();
-        let subscription = broker
-            .subscribe(&"blaze/reply/test".parse().unwrap(), SubscribeOptions::default())
-            .await
-            .unwrap();
-        Service {
-            broker: Arc::new(broker),
-            replies: subscription,
-            asked: 0,
-        }
+        Service::on(&self.redis).await
     }
 
     /// Waits until the worker has what the main service has; gives the digest.
@@ -272,7 +269,35 @@ pub(crate) struct Service {
     asked: u64,
 }
 
+/// A Redis as a node file names it.
+pub(super) fn section(redis: &RedisServer) -> blaze_domain::node_file::RedisBroker {
+    let file = json!({ "brokers": { "node": { "redis": { "url": redis.url() } } } });
+    match NodeFile::read(&file).unwrap().0.brokers.node {
+        Some(NodeBroker::Redis(section)) => section,
+        other => panic!("{other:?}"),
+    }
+}
+
 impl Service {
+    pub(crate) async fn on(redis: &RedisServer) -> Self {
+        let broker = RedisBroker::open(&section(redis), &Role::Service).unwrap();
+        let mut status = broker.status();
+        let up = status.wait_for(|status| status.health == Health::Up);
+        tokio::time::timeout(PATIENCE, up)
+            .await
+            .expect("Redis answers")
+            .unwrap();
+        let subscription = broker
+            .subscribe(&"blaze/reply/test".parse().unwrap(), SubscribeOptions::default())
+            .await
+            .unwrap();
+        Service {
+            broker: Arc::new(broker),
+            replies: subscription,
+            asked: 0,
+        }
+    }
+
     /// Hears of changes of a service from now on.
     pub(crate) async fn listen(&self, service: &str) -> Subscription {
         let channel = format!("blaze/config/changed/{service}").parse().unwrap();
@@ -280,6 +305,15 @@ impl Service {
             .subscribe(&channel, SubscribeOptions::default())
             .await
             .unwrap()
+    }
+
+    /// Says something on a channel.
+    pub(crate) fn publish(&self, channel: &str, message: &Value) {
+        let publisher = self
+            .broker
+            .publisher(&channel.parse().unwrap(), PublisherOptions::default())
+            .unwrap();
+        publisher.publish_bare(&Bytes::from(message.to_string()), None);
     }
 
     /// Asks until it is answered, as often as a service may: each second.

@@ -58,10 +58,12 @@ fn channel(notice: &Notice) -> Option<ChannelName> {
 }
 
 impl Engine {
-    /// Has changes told: at once after a quiet while, else together with what comes until then.
+    /// Has changes told: at once after a quiet while, else together with what comes until then. What was missed in an outage
+    /// is told when it has all come.
     pub(super) fn flush_soon(&mut self) {
         let next = self.flushed.map_or_else(Instant::now, |last| last + TOGETHER);
-        self.flush_at.get_or_insert(next);
+        let next = self.catching_up.map_or(next, |until| until.max(next));
+        self.flush_at = Some(self.flush_at.map_or(next, |at| at.min(next)));
     }
 
     /// Tells what has changed.
@@ -78,6 +80,7 @@ impl Engine {
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
         // First what goes: an instance that moves has the same key there.
         for place in &untracked {
+            // Whether anything is still owed is seen when the rest settles.
             self.unnoted.remove(place);
             self.notes.forget(&at(place, &self.identity.site));
             told.extend(self.without_key(place));
@@ -109,6 +112,7 @@ impl Engine {
         if is_first && self.is_leader {
             self.outputs.speaker.sweep_keys();
         }
+        self.owe_notes();
         // After the notices: only what was told can go well or badly.
         self.follow_rollouts();
         if self.served.has_pending() {
@@ -276,6 +280,7 @@ impl Engine {
         }
         self.unnoted.insert(place.clone(), (revision, hash));
         self.settle_at.get_or_insert(Instant::now() + SETTLE);
+        self.owe_notes();
     }
 
     /// Notes what the broker has taken meanwhile.
@@ -297,5 +302,13 @@ impl Engine {
             self.keep_notes();
         }
         self.settle_at = (!self.unnoted.is_empty()).then(|| Instant::now() + SETTLE);
+        self.owe_notes();
+    }
+
+    /// Copies without the notes that are still to come do not count as current.
+    pub(super) fn owe_notes(&self) {
+        if let Some(copies) = &self.outputs.copies {
+            copies.owe(self.served.has_pending() || !self.unnoted.is_empty());
+        }
     }
 }

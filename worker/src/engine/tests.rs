@@ -1,5 +1,7 @@
 //! The engine between a main service, a broker and a lease that the test plays.
 
+#[path = "follow_tests.rs"]
+mod follow;
 #[path = "hear_tests.rs"]
 mod hear;
 
@@ -94,6 +96,10 @@ fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
 }
 
 fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) -> World {
+    world_as(start, is_leader, copies, Delivery::Text)
+}
+
+fn world_as(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>, delivery: Delivery) -> World {
     let (sync, sync_in) = mpsc::channel(64);
     let (gets, gets_in) = mpsc::channel(64);
     let (signs, signs_in) = mpsc::channel(64);
@@ -110,7 +116,7 @@ fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) ->
         },
         node: None,
         worker_id: "w-1".to_owned(),
-        delivery: Delivery::Text,
+        delivery,
     };
     let speaker = Speaker::default();
     let outputs = Outputs {

@@ -22,7 +22,8 @@ use super::gate::{self, Call};
 use super::{outgoing, status};
 use crate::api::limits::ApiLimits;
 use crate::core::{
-    Acknowledged, ConfigService, RolloutReport, Running, RunningState, SyncHello, SyncItem, SyncStream, WorkerSession,
+    Acknowledged, ConfigService, OLDEST_SYNC_PROTOCOL, RolloutReport, Running, RunningState, SYNC_PROTOCOL, SyncHello,
+    SyncItem, SyncStream, WorkerSession,
 };
 use crate::listen::Peer;
 use crate::metrics::ApiMetrics;
@@ -59,7 +60,12 @@ impl Service {
             return refuse("no Hello came within 10 s");
         };
         match first?.and_then(|request| request.msg) {
-            Some(Said::Hello(hello)) => read_hello(hello).map_err(|problem| self.refuse(call, &problem)),
+            Some(Said::Hello(hello)) => {
+                check_protocol(&hello).inspect_err(|status| {
+                    tracing::warn!(worker = hello.worker_id, version = hello.version, %status, "a worker is refused");
+                })?;
+                read_hello(hello).map_err(|problem| self.refuse(call, &problem))
+            }
             Some(Said::Ack(_)) | None => refuse("the first message must be Hello"),
         }
     }
@@ -207,7 +213,21 @@ fn read_hello(hello: v1::Hello) -> Result<SyncHello, Problem> {
         store_id: hello.store_id,
         revision: hello.revision,
         digest: hello.digest,
+        without_texts: hello.without_texts,
     })
+}
+
+/// A worker may be one version older, or one newer: that one speaks this version, too. Others could be misunderstood.
+fn check_protocol(hello: &v1::Hello) -> Result<(), Status> {
+    let (oldest, newest) = (OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL + 1);
+    if (oldest..=newest).contains(&hello.protocol) {
+        return Ok(());
+    }
+    Err(Status::failed_precondition(format!(
+        "version {} of the protocol of Sync is not spoken here, but those of workers from {oldest} to {newest}: update the \
+         older of the two",
+        hello.protocol
+    )))
 }
 
 /// What it says, without what has names that are none: a worker that is newer may know more.
