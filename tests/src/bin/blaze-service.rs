@@ -33,7 +33,7 @@ struct Options {
     #[arg(long)]
     instance: InstanceName,
     /// How long a sign of life counts
-    #[arg(long, default_value_t = 1_000)]
+    #[arg(long, default_value_t = 3_000)]
     watchdog_ms: u64,
     /// A larger `rate_hz` is rejected
     #[arg(long, default_value_t = u64::MAX)]

@@ -51,19 +51,35 @@ impl Last {
         let took = up.elapsed();
         assert!(took <= SERVED, "{what}: {took:?}");
         println!("{what}: answered {took:?} after the broker was back");
-        assert_eq!((&answer["hash"], &answer["source"]), (&json!(self.hash), &json!("copy")), "{what}");
+        assert_eq!(
+            (&answer["hash"], &answer["source"]),
+            (&json!(self.hash), &json!("copy")),
+            "{what}"
+        );
         assert_eq!(answer["config"]["camera"]["rate_hz"], 7, "{what}");
         let (oldest, newest) = self.revisions;
         let revision = answer["revision"].as_u64().unwrap();
-        assert!((oldest..=newest).contains(&revision), "{what}: {revision} of {oldest} to {newest}");
+        assert!(
+            (oldest..=newest).contains(&revision),
+            "{what}: {revision} of {oldest} to {newest}"
+        );
         let service = with_sdk(robot).await;
         service.config().ready(PATIENCE).await.unwrap();
         assert_eq!(service.config().hash().as_deref(), Some(self.hash.as_str()), "{what}");
         assert_eq!(service.config().source(), Some(ConfigSource::Copy), "{what}");
         service.shutdown().await;
         let gone = plain.ask(json!({ "service": "nav" }), PATIENCE).await;
-        assert_eq!(gone["error"]["code"], "not_found", "{what}: what was deleted stays deleted");
-        let key = robot.key("blaze:config:slam:0").await.expect("the key is there again");
+        assert_eq!(
+            gone["error"]["code"], "not_found",
+            "{what}: what was deleted stays deleted"
+        );
+        let key = loop {
+            match robot.key("blaze:config:slam:0").await {
+                Some(key) => break key,
+                None => assert!(up.elapsed() < PATIENCE, "{what}: the key is not there again"),
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        };
         assert_eq!(key["hash"], self.hash.as_str(), "{what}");
         assert_eq!(robot.key("blaze:config:nav").await, None, "{what}");
     }

@@ -90,7 +90,11 @@ impl<'a> Changes<'a> {
         self.count += 1;
         let instances = ROBOTS.map(|robot| (format!("{service}/{robot}"), json!({ "node": robot })));
         let mut documents = vec![("Service", service, json!({ "config": { "n": n } }))];
-        documents.extend(instances.iter().map(|(name, spec)| ("Instance", name.as_str(), spec.clone())));
+        documents.extend(
+            instances
+                .iter()
+                .map(|(name, spec)| ("Instance", name.as_str(), spec.clone())),
+        );
         self.stage.apply(&documents).await;
         self.is_there.insert(service, true);
     }
@@ -114,7 +118,10 @@ impl<'a> Changes<'a> {
                 let spec = json!({ "kind": "edge", "overrides": { service: { "all": n } } });
                 self.put("/layers/edge", spec).await;
             }
-            (_, true) => self.put(&format!("/services/{service}"), json!({ "config": { "n": n } })).await,
+            (_, true) => {
+                self.put(&format!("/services/{service}"), json!({ "config": { "n": n } }))
+                    .await
+            }
         }
     }
 
@@ -214,7 +221,9 @@ impl Watched {
                 assert_eq!((&hash, &key), (&None, &None), "{place:?} is back");
                 continue;
             }
-            let instance = instance.map(|instance| format!("&instance={instance}")).unwrap_or_default();
+            let instance = instance
+                .map(|instance| format!("&instance={instance}"))
+                .unwrap_or_default();
             let effective = stage
                 .get(&format!("/effective?service={name}&node={}{instance}", self.robot.node))
                 .await;
@@ -268,7 +277,10 @@ async fn change_all(stage: &Stage, mark: &str, gone: &[&'static str]) -> u64 {
         documents.push(("Service", (*service).to_owned(), json!({ "config": {} })));
         documents.extend(ROBOTS.map(|robot| ("Instance", format!("{service}/{robot}"), json!({ "node": robot }))));
     }
-    let documents: Vec<_> = documents.iter().map(|(kind, name, spec)| (*kind, name.as_str(), spec.clone())).collect();
+    let documents: Vec<_> = documents
+        .iter()
+        .map(|(kind, name, spec)| (*kind, name.as_str(), spec.clone()))
+        .collect();
     stage.apply(&documents).await
 }
 

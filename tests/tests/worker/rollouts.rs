@@ -51,7 +51,9 @@ fn blaze(stage: &Stage, arguments: &[&str]) -> Result<Value, (i32, String)> {
 }
 
 async fn grpc(stage: &Stage) -> ConfigServiceClient<Channel> {
-    ConfigServiceClient::connect(format!("http://{}", stage.grpc)).await.unwrap()
+    ConfigServiceClient::connect(format!("http://{}", stage.grpc))
+        .await
+        .unwrap()
 }
 
 fn rate(config: &Value) -> Option<u64> {
@@ -113,12 +115,17 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
 
     // The main service is gone before the service says what it thinks.
     main.kill().unwrap();
-    canary.until("nobody is there", |status| status["connected"] == false).await;
+    canary
+        .until("nobody is there", |status| status["connected"] == false)
+        .await;
     assert_eq!(a.seen().last().and_then(rate), Some(99));
     std::fs::write(&judges, "").unwrap();
     a.until("it is undone", has(FORMER));
     let failed = is_failed(&canary).await;
-    assert!(failed["reason"].as_str().unwrap().contains("rate_hz: at most 30"), "{failed}");
+    assert!(
+        failed["reason"].as_str().unwrap().contains("rate_hz: at most 30"),
+        "{failed}"
+    );
 
     // Neither does it come back in a new life of the canary's worker and broker.
     canary.has_kept_all(2).await;
@@ -132,7 +139,10 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
     let asks = json!({ "service": "slam", "instance": "a" });
     assert_eq!(plain.ask(asks.clone(), PATIENCE).await["config"]["rate_hz"], FORMER);
     let key = first.key("blaze:config:slam:a").await.unwrap();
-    assert_eq!((&key["config"]["rate_hz"], &key["rollout"]), (&json!(FORMER), &Value::Null));
+    assert_eq!(
+        (&key["config"]["rate_hz"], &key["rollout"]),
+        (&json!(FORMER), &Value::Null)
+    );
     let late = first.run("slam", "late", &judge);
     late.until("a new one has the former value", has(FORMER));
 
@@ -164,7 +174,10 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
     let after = &a.seen()[count..];
     assert!(after.iter().all(has(FORMER)), "it came back: {after:?}");
     let notices = rest(&mut heard).await;
-    assert!(notices.iter().all(|notice| notice["config"]["mark"] == 1), "{notices:?}");
+    assert!(
+        notices.iter().all(|notice| notice["config"]["mark"] == 1),
+        "{notices:?}"
+    );
     for process in [a, b, late] {
         process.kill();
     }
@@ -241,16 +254,23 @@ async fn a_good_one_is_promoted_and_others_are_undone() {
     canary.until("it is well again", is_well).await;
 
     // One that kills the service, which its watchdog does not say any more.
-    stage.send(Method::POST, "/rollouts", Some(&rollout("deadly", 40))).await;
+    stage
+        .send(Method::POST, "/rollouts", Some(&rollout("deadly", 40)))
+        .await;
     a.until("the canary tries it", has(40));
     let is_applied = |status: &Value| {
         let rollouts = status["rollouts"].as_array().unwrap();
-        rollouts.iter().any(|rollout| rollout["name"] == "deadly" && rollout["phase"] == "applied")
+        rollouts
+            .iter()
+            .any(|rollout| rollout["name"] == "deadly" && rollout["phase"] == "applied")
     };
     canary.until("it is judged", is_applied).await;
     a.kill();
     let failed = ends(stage, "deadly", "failed").await;
-    assert!(failed["reason"].as_str().unwrap().contains("lost its watchdog"), "{failed}");
+    assert!(
+        failed["reason"].as_str().unwrap().contains("lost its watchdog"),
+        "{failed}"
+    );
     let a = first.run("slam", "a", &judge);
     a.until("the next life has the former value", has(20));
 
@@ -264,7 +284,11 @@ async fn a_good_one_is_promoted_and_others_are_undone() {
     let reason = json!({ "reason": "enough" });
     stage.send(Method::POST, "/rollouts/none/abort", Some(&reason)).await;
     a.until("undone", has(45));
-    assert_eq!(rates(&b), BTreeSet::from([FORMER, 20, 45]), "the other robot had what was promoted");
+    assert_eq!(
+        rates(&b),
+        BTreeSet::from([FORMER, 20, 45]),
+        "the other robot had what was promoted"
+    );
     stage.equal(&canary, PATIENCE).await;
     stage.equal(&other, PATIENCE).await;
 }

@@ -43,7 +43,10 @@ fn clean(what: &str, text: &str) -> bool {
     for canary in encoded.chain([CANARY.to_owned()]) {
         if let Some(at) = text.find(&canary) {
             let from = text.floor_char_boundary(at.saturating_sub(300));
-            panic!("{what} holds the secret: {}", &text[from..text.ceil_char_boundary(at + 100)]);
+            panic!(
+                "{what} holds the secret: {}",
+                &text[from..text.ceil_char_boundary(at + 100)]
+            );
         }
     }
     text.contains(PLAIN)
@@ -86,7 +89,14 @@ fn keys(redis: &RedisServer) -> String {
 /// All that a database holds.
 fn dump(mongo: &MongoServer, database: &str) -> String {
     let ask = |command: &Value| mongo_command(&mongo.uri(), database, command).unwrap();
-    let batch = |answer: &bson::Document| answer.get_document("cursor").unwrap().get_array("firstBatch").unwrap().clone();
+    let batch = |answer: &bson::Document| {
+        answer
+            .get_document("cursor")
+            .unwrap()
+            .get_array("firstBatch")
+            .unwrap()
+            .clone()
+    };
     let tables = batch(&ask(&json!({ "listCollections": 1, "cursor": { "batchSize": 1000 } })));
     let rows = tables.iter().map(|table| {
         let name = table.as_document().unwrap().get_str("name").unwrap();
@@ -118,7 +128,11 @@ async fn everything(stage: &Stage, robot: &Robot, worker: &Worker, is_shown: boo
         assert_eq!(text.contains(CANARY), is_shown, "{what}: {text}");
         assert!(text.contains(PLAIN), "{what}: {text}");
     };
-    for request in [json!({ "service": "slam", "instance": "0" }), json!({ "service": "nav" }), json!({})] {
+    for request in [
+        json!({ "service": "slam", "instance": "0" }),
+        json!({ "service": "nav" }),
+        json!({}),
+    ] {
         is_right("the answer", &plain.ask(request, PATIENCE).await.to_string());
     }
     let spec = json!({ "config": config(30) });
@@ -131,7 +145,9 @@ async fn everything(stage: &Stage, robot: &Robot, worker: &Worker, is_shown: boo
         spec["config"]["number"] = json!(number);
         stage.put("/services/slam", spec).await;
     }
-    stage.put("/services/nav", json!({ "config": { "plain": PLAIN } })).await;
+    stage
+        .put("/services/nav", json!({ "config": { "plain": PLAIN } }))
+        .await;
     stage.put("/services/nav", json!({ "config": config(40) })).await;
     stage.send(Method::DELETE, "/services/nav", None).await;
     stage.equal(worker, PATIENCE).await;
@@ -151,7 +167,11 @@ async fn operator_sees_none(worker: &Worker, logs: &[&Path]) {
     for log in logs {
         let text = std::fs::read_to_string(log).unwrap();
         clean(&log.display().to_string(), &text);
-        assert!(text.lines().filter(|line| line.contains("TRACE")).count() > 50, "{}", log.display());
+        assert!(
+            text.lines().filter(|line| line.contains("TRACE")).count() > 50,
+            "{}",
+            log.display()
+        );
     }
 }
 
@@ -163,7 +183,11 @@ async fn what_services_are_not_told_is_nowhere() {
         ..MongoOptions::default()
     })
     .unwrap();
-    let (main_log, log, log_again) = (stage.path("main.log"), stage.path("worker.log"), stage.path("again.log"));
+    let (main_log, log, log_again) = (
+        stage.path("main.log"),
+        stage.path("worker.log"),
+        stage.path("again.log"),
+    );
     let main = stage.main_at("trace", Some(&main_log));
     documents(&stage).await;
     let robot = Robot::new(&stage, "robot-1").with(&json!({
@@ -183,15 +207,24 @@ async fn what_services_are_not_told_is_nowhere() {
     assert!(clean("the file", &content(&stage.path("robot-1"))));
     let in_memory = |worker: &Worker, text: &str| worker.process.count_in_memory(text.as_bytes()).unwrap();
     assert!(in_memory(&worker, PLAIN) > 0);
-    assert_eq!(in_memory(&worker, CANARY), 0, "the worker has the text of a secret in its memory");
-    println!("the main service has it {} times in its memory", main.count_in_memory(CANARY.as_bytes()).unwrap());
+    assert_eq!(
+        in_memory(&worker, CANARY),
+        0,
+        "the worker has the text of a secret in its memory"
+    );
+    println!(
+        "the main service has it {} times in its memory",
+        main.count_in_memory(CANARY.as_bytes()).unwrap()
+    );
 
     // A life that begins with the copies, and finds nobody.
     drop(main);
     worker.kill();
     let worker = robot.worker_logged(&stage, &log_again);
     let mut service = robot.service().await;
-    let answer = service.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
+    let answer = service
+        .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
+        .await;
     assert_eq!(answer["source"], "copy");
     assert!(clean("the answer", &answer.to_string()));
     let _main = stage.main_at("trace", Some(&main_log));
@@ -253,19 +286,27 @@ async fn copies(with_key: bool, database: Option<&MongoServer>) {
     everything(&stage, &robot, &worker, true).await;
     worker.has_kept_all(2).await;
     operator_sees_none(&worker, &[&main_log, &log]).await;
-    assert!(keys(&robot.redis).contains(CANARY), "services of this robot are to have it");
+    assert!(
+        keys(&robot.redis).contains(CANARY),
+        "services of this robot are to have it"
+    );
     // With a key the file is encrypted as a whole.
     let is_readable = clean("the copies", &content(&stage.path("robot-1")));
     assert!(is_readable || with_key);
     if let Some(mongo) = database {
         assert!(clean("the database", &dump(mongo, "copy")));
     }
-    println!("with texts the worker has it {} times in its memory", worker.process.count_in_memory(CANARY.as_bytes()).unwrap());
+    println!(
+        "with texts the worker has it {} times in its memory",
+        worker.process.count_in_memory(CANARY.as_bytes()).unwrap()
+    );
     main.kill().unwrap();
     worker.kill();
     let worker = robot.worker(&stage);
     let mut service = robot.service().await;
-    let answer = service.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
+    let answer = service
+        .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
+        .await;
     assert_eq!(answer["source"], "copy");
     assert_eq!(answer.to_string().contains(CANARY), with_key, "{answer}");
     let _main = stage.main();

@@ -104,7 +104,12 @@ fn with_unknown(bytes: &Bytes) -> Bytes {
 }
 
 /// Passes one stream on, both ways, and notes what passes, until either end ends it or `is_over` says so.
-async fn pass(number: usize, session: Session, main: SocketAddr, is_over: impl Fn(&[Recorded]) -> bool) -> Vec<Recorded> {
+async fn pass(
+    number: usize,
+    session: Session,
+    main: SocketAddr,
+    is_over: impl Fn(&[Recorded]) -> bool,
+) -> Vec<Recorded> {
     let Session { mut said, tell } = session;
     let mut recorded = Vec::new();
     let note = |by_worker: bool, bytes: &Bytes| Recorded {
@@ -137,10 +142,13 @@ fn count(recorded: &[Recorded], kind: &str) -> usize {
 
 /// The last revision and digest that a recording tells.
 fn last_digest(recorded: &[Recorded]) -> (u64, String) {
-    let digests = recorded.iter().filter(|one| !one.by_worker).filter_map(|one| match told(&one.bytes) {
-        Told::Bookmark(bookmark) if !bookmark.digest.is_empty() => Some((bookmark.revision, bookmark.digest)),
-        _ => None,
-    });
+    let digests = recorded
+        .iter()
+        .filter(|one| !one.by_worker)
+        .filter_map(|one| match told(&one.bytes) {
+            Told::Bookmark(bookmark) if !bookmark.digest.is_empty() => Some((bookmark.revision, bookmark.digest)),
+            _ => None,
+        });
     digests.last().unwrap()
 }
 
@@ -161,7 +169,9 @@ async fn documents(stage: &Stage) {
 async fn changes(stage: &Stage, robot: &Robot, worker: &Worker) -> u64 {
     stage.put("/services/slam", json!({ "config": { "n": 2 } })).await;
     stage.send(Method::DELETE, "/services/nav", None).await;
-    stage.put("/services/map", json!({ "config": { "n": 1 }, "layers": ["fog"] })).await;
+    stage
+        .put("/services/map", json!({ "config": { "n": 1 }, "layers": ["fog"] }))
+        .await;
     let rollout = json!({ "name": "faster", "spec": {
         "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "n": 3 } },
         "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 600, "max_unhealthy": 0 },
@@ -170,7 +180,13 @@ async fn changes(stage: &Stage, robot: &Robot, worker: &Worker) -> u64 {
     let ack = json!({ "service": "slam", "instance": "0", "node": "robot-1", "status": "applied" });
     let service = robot.service().await;
     service.publish("blaze/config/ack", &ack);
-    let is_known = |status: &Value| status["services"].as_array().unwrap().iter().any(|one| one["state"] == "ready");
+    let is_known = |status: &Value| {
+        status["services"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .any(|one| one["state"] == "ready")
+    };
     worker.until("the service is known", is_known).await;
     stage.get("/digest?layer=edge").await["revision"].as_u64().unwrap()
 }
@@ -197,7 +213,9 @@ async fn what_is_said_today_is_recorded() {
     };
     let passing = pass(0, session, stage.grpc, told_all);
     let changing = async {
-        worker.until("the worker is in sync", |status| status["source"] == "main").await;
+        worker
+            .until("the worker is in sync", |status| status["source"] == "main")
+            .await;
         changes(&stage, &robot, &worker).await
     };
     let (mut recorded, revision) = tokio::join!(passing, changing);
@@ -214,10 +232,13 @@ async fn what_is_said_today_is_recorded() {
     for kind in ["Hello", "Ack", "Welcome", "Snapshot", "Commit", "Bookmark", "GoAway"] {
         assert!(count(&recorded, kind) > 0, "no {kind}");
     }
-    let resumed = recorded.iter().filter(|one| one.stream == 1 && !one.by_worker).find_map(|one| match told(&one.bytes) {
-        Told::Welcome(welcome) => Some(welcome.resumed),
-        _ => None,
-    });
+    let resumed = recorded
+        .iter()
+        .filter(|one| one.stream == 1 && !one.by_worker)
+        .find_map(|one| match told(&one.bytes) {
+            Told::Welcome(welcome) => Some(welcome.resumed),
+            _ => None,
+        });
     assert_eq!(resumed, Some(true));
     if let Some(path) = blaze_runtime::environment::variable("BLAZE_RECORD_SYNC") {
         write(Path::new(&path), &recorded);
@@ -260,7 +281,10 @@ async fn is_served(stage: &Stage, recorded: &[Recorded], protocol: u32) {
     loop {
         let workers = stage.get("/workers").await;
         let items = workers["items"].as_array().unwrap();
-        let known = items.iter().find(|one| one["worker_id"] == greeting.worker_id.as_str()).unwrap();
+        let known = items
+            .iter()
+            .find(|one| one["worker_id"] == greeting.worker_id.as_str())
+            .unwrap();
         if known["revision"] == last.revision && known["digest"] == last.digest.as_str() {
             assert_eq!(
                 (&known["version"], &known["connected"]),
@@ -301,7 +325,11 @@ async fn replay(session: &Session, recorded: &[Recorded], stream: usize) {
     for one in recorded.iter().filter(|one| !one.by_worker && one.stream == stream) {
         session.tell.send(Ok(with_unknown(&one.bytes))).await.unwrap();
         // A message of a kind that nobody knows.
-        session.tell.send(Ok(Bytes::from_static(&[0xfa, 0x01, 0x00]))).await.unwrap();
+        session
+            .tell
+            .send(Ok(Bytes::from_static(&[0xfa, 0x01, 0x00])))
+            .await
+            .unwrap();
     }
 }
 
@@ -340,14 +368,20 @@ async fn the_worker_understands_main_services_that_were_recorded() {
         let has_all = |status: &Value| status["digest"] == digest.as_str() && status["revision"] == revision;
         worker.until("it has all that was recorded", has_all).await;
         let mut service = robot.service().await;
-        let answer = service.ask(json!({ "service": "slam", "instance": "0" }), PATIENCE).await;
+        let answer = service
+            .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
+            .await;
         assert_eq!(answer["config"]["n"], 3, "the roll-out counts: {answer}");
         for name in ["nav", "map"] {
             let answer = service.ask(json!({ "service": name }), PATIENCE).await;
             assert_eq!(answer["error"]["code"], "not_found", "{name}: {answer}");
         }
         drop(second);
-        let is_told = |status: &Value| status["reason"].as_str().is_some_and(|reason| reason.contains("ending"));
+        let is_told = |status: &Value| {
+            status["reason"]
+                .as_str()
+                .is_some_and(|reason| reason.contains("ending"))
+        };
         worker.until("why the stream ended", is_told).await;
         assert!(!worker.status().await.to_string().contains(CANARY));
     }
@@ -357,7 +391,11 @@ async fn the_worker_understands_main_services_that_were_recorded() {
 async fn says(worker: &Worker, words: &str) {
     let is_there = |status: &Value| status["reason"].as_str().is_some_and(|reason| reason.contains(words));
     worker.until(words, is_there).await;
-    assert!(worker.log().iter().any(|line| line.contains(words)), "{:?}", worker.log());
+    assert!(
+        worker.log().iter().any(|line| line.contains(words)),
+        "{:?}",
+        worker.log()
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -393,7 +431,11 @@ async fn versions_that_are_too_far_apart_are_told_so() {
     let robot = Robot::new(&stage, "robot-1").with(&json!({
         "config": { "server": format!("http://{}", main.address) }, "worker": { "defaults_file": stage.path("defaults.yaml") },
     }));
-    std::fs::write(stage.path("defaults.yaml"), "kind: Layer\nname: edge\nspec: { kind: edge }\n").unwrap();
+    std::fs::write(
+        stage.path("defaults.yaml"),
+        "kind: Layer\nname: edge\nspec: { kind: edge }\n",
+    )
+    .unwrap();
     let worker = robot.worker(&stage);
     let mut session = main.session().await;
     hello(&mut session).await;

@@ -24,12 +24,15 @@ impl Engine {
             }
             SyncEvent::Opened(stream) => {
                 self.stream = Some(stream);
-                self.reason = None;
                 self.fault = None;
             }
             SyncEvent::Said(incoming) => {
-                let now = now();
-                match self.replica.apply(self.without_texts(incoming), now) {
+                let applied = self.replica.apply(self.without_texts(incoming), now());
+                if matches!(applied, Ok(Applied::Nothing | Applied::Changed(_))) {
+                    // Both understand each other: what was the matter before is so no more.
+                    self.reason = None;
+                }
+                match applied {
                     // It is known to be the newest by now, which the copies are to know too.
                     Ok(Applied::Nothing) if self.replica.is_in_sync() => self.keep(Changed::Keys(Vec::new())),
                     Ok(Applied::Nothing) => {}

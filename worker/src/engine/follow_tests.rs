@@ -1,7 +1,7 @@
 //! What follows from what the main service says.
 
 use super::*;
-use crate::core::OLDEST_PROTOCOL;
+use crate::core::{OLDEST_PROTOCOL, PROTOCOL};
 
 fn slam(revision: u64) -> Incoming {
     let changed = document("Service/slam", revision, json!({ "config": { "rate_hz": revision } }));
@@ -19,7 +19,10 @@ impl World {
 
     /// The main service goes on from what the worker has.
     async fn goes_on(&self, protocol: u32, revision: u64) {
-        self.sync.send(SyncEvent::Opened(CancellationToken::new())).await.unwrap();
+        self.sync
+            .send(SyncEvent::Opened(CancellationToken::new()))
+            .await
+            .unwrap();
         self.says(Incoming::Welcome {
             protocol,
             store_id: "s".to_owned(),
@@ -58,9 +61,16 @@ async fn after_an_outage_each_place_is_told_once_of_the_final_state() {
         tokio::time::sleep(Duration::from_millis(30)).await;
         w.says(slam(revision)).await;
         let answer = w.slam().await;
-        assert_eq!(answer["config"]["rate_hz"], 30, "nobody is told of a step to the final state");
+        assert_eq!(
+            answer["config"]["rate_hz"], 30,
+            "nobody is told of a step to the final state"
+        );
     }
-    assert_eq!(rates(&w.rest().await), [40, 40], "the instance that asked, and the service without one");
+    assert_eq!(
+        rates(&w.rest().await),
+        [40, 40],
+        "the instance that asked, and the service without one"
+    );
     // From then on changes are told as they come.
     w.says(slam(41)).await;
     assert_eq!(rates(&w.rest().await), [41, 41]);
@@ -91,7 +101,12 @@ async fn where_nobody_is_told_texts_none_is_kept() {
     all[3] = document("Service/slam", 2, secret("canary"));
     // A main service of a version that does not know that none is wanted.
     w.opens(all, 2).await;
-    w.says(commit(3, 2, vec![(Op::Update, document("Service/nav", 3, secret("canary")))])).await;
+    w.says(commit(
+        3,
+        2,
+        vec![(Op::Update, document("Service/nav", 3, secret("canary")))],
+    ))
+    .await;
     w.rest().await;
     let answer = w.slam().await;
     assert_eq!(
@@ -107,7 +122,10 @@ async fn where_nobody_is_told_texts_none_is_kept() {
 async fn why_a_stream_was_ended_is_known_afterwards() {
     let mut w = world();
     w.opens(documents(30), 2).await;
-    for (protocol, words) in [(PROTOCOL + 1, Some("update the older of the two")), (OLDEST_PROTOCOL, None)] {
+    for (protocol, words) in [
+        (PROTOCOL + 1, Some("update the older of the two")),
+        (OLDEST_PROTOCOL, None),
+    ] {
         w.closes().await;
         w.goes_on(protocol, 2).await;
         w.rest().await;

@@ -34,7 +34,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::copy::{Changed, Copies, Loaded, Notes, Position, Update, defaults, lacks_text};
 use crate::core::messages::Delivery;
-use crate::core::{Applied, Gate, Incoming, PROTOCOL, Place, Replica, Served, Signs, Site, Source};
+use crate::core::{Gate, Place, Replica, Served, Signs, Site, Source};
 use crate::serve::{Speaker, Told};
 use crate::sync::SyncEvent;
 
@@ -43,9 +43,6 @@ pub use status::Status;
 
 /// Within this time several changes may become one notice.
 const TOGETHER: Duration = Duration::from_millis(20);
-/// After an outage services hear of the final state, not of each step to it: what they are told waits until everything up to
-/// where the store stood has come, or for so long.
-const CATCH_UP: Duration = Duration::from_secs(3);
 /// Between two looks whether the broker has taken what places are told.
 const SETTLE: Duration = Duration::from_millis(200);
 /// What the worker has is said this long after it became so, and with it what came meanwhile.

@@ -68,8 +68,6 @@ struct State {
     waiting: BTreeMap<String, (i64, Waiting)>,
     /// Of the last that was put at the end, and of the first.
     ends: (i64, i64),
-    /// Places that are being told: nobody knows yet whether the broker takes it.
-    telling: BTreeSet<String>,
     /// Keys of before are to be looked for: those of this worker that are not wanted are to go.
     sweep: bool,
 }
@@ -142,13 +140,7 @@ impl State {
             bytes += self.wanted.get(&key).map_or(0, Bytes::len);
             batch.keys.insert(key);
         }
-        self.telling = batch.waiting.iter().map(|(place, _)| place.clone()).collect();
         batch
-    }
-
-    /// Whether the broker has not taken the newest notice of a place.
-    fn is_waiting(&self, place: &str) -> bool {
-        self.waiting.contains_key(place) || self.telling.contains(place)
     }
 
     /// Keys as they should be now.
@@ -165,7 +157,6 @@ impl State {
 
     /// What could not be told goes back to the front; what has come meanwhile is newer.
     fn put_back(&mut self, batch: Batch) {
-        self.telling.clear();
         self.dirty.extend(batch.keys);
         for (place, waiting) in batch.waiting.into_iter().rev() {
             if !self.waiting.contains_key(&place) {
@@ -235,10 +226,10 @@ impl Speaker {
         self.shared.more.notify_one();
     }
 
-    /// Whether the newest notice of a place still waits, or is on its way to the broker.
+    /// Whether the newest notice of a place still waits.
     #[must_use]
     pub fn is_waiting(&self, place: &str) -> bool {
-        self.shared.state.lock().is_waiting(place)
+        self.shared.state.lock().waiting.contains_key(place)
     }
 
     /// Has keys of before, which nobody wants any more, looked for and deleted. All that are wanted must have been told.
@@ -306,13 +297,11 @@ impl Speaker {
             match outlet.deliver(&changes, &messages).await {
                 Ok(()) => {
                     (pause, most) = (PAUSE.0, BATCH);
-                    self.shared.state.lock().telling.clear();
                     self.shared.keys.fetch_add(changes.len() as u64, Ordering::Relaxed);
                     self.shared.notices.fetch_add(messages.len() as u64, Ordering::Relaxed);
                 }
                 // Whoever is refused alone would be refused again, and must not hold up the others.
                 Err(error) if error.is_refusal() && batch.len() <= 2 && batch.waiting.len() <= 1 => {
-                    self.shared.state.lock().telling.clear();
                     let place = batch.waiting.first().map(|(place, _)| place.as_str());
                     tracing::error!(%error, place, keys = ?batch.keys, "a service is not told of its configuration");
                     self.shared.dropped.fetch_add(1, Ordering::Relaxed);
@@ -532,19 +521,6 @@ mod tests {
             value: Bytes::from("2"),
         };
         assert_eq!(state.changes(&batch.keys), [put]);
-    }
-
-    #[test]
-    fn what_is_on_its_way_is_not_taken_yet() {
-        let mut state = State::default();
-        state.put(told("slam", "1"));
-        let batch = state.take(BATCH);
-        assert!(state.is_waiting("slam"), "the broker may still lose it");
-        state.put_back(batch);
-        assert!(state.is_waiting("slam"));
-        state.take(BATCH);
-        state.telling.clear();
-        assert!(!state.is_waiting("slam"));
     }
 
     #[tokio::test(start_paused = true)]
