@@ -94,7 +94,11 @@ async fn all_is_killed_and_comes_back(alone: bool) {
     let stage = Stage::new();
     let _main = stage.main();
     stage.robot().await;
-    let link = Proxy::start(stage.grpc).unwrap();
+    let main_at = stage.grpc;
+    // It has a runtime of its own, which cannot be started on a thread of this one.
+    let link = tokio::task::spawn_blocking(move || Proxy::start(main_at).unwrap())
+        .await
+        .unwrap();
     // Something weaker is at hand all the time, and says something else.
     let defaults = stage.path("defaults.yaml");
     let weaker = "kind: Layer\nname: edge\nspec: { kind: edge }\n---\nkind: Service\nname: slam\nspec: { config: { camera: { rate_hz: 1 } } }\n---\nkind: Service\nname: nav\nspec: {}\n";

@@ -200,7 +200,7 @@ async fn what_is_said_today_is_recorded() {
     let robot = Robot::new(&stage, "robot-1").with(&json!({
         "config": { "server": format!("http://{}", between.address) }, "worker": { "deliver_secrets": true },
     }));
-    let worker = robot.worker(&stage);
+    let worker = robot.worker_unready(&stage);
     let session = between.session().await;
     let told_all = |recorded: &[Recorded]| {
         // A whole picture: all changes, and an Ack in which the service and the roll-out are.
@@ -213,12 +213,15 @@ async fn what_is_said_today_is_recorded() {
     };
     let passing = pass(0, session, stage.grpc, told_all);
     let changing = async {
+        // It is ready when it has been told something, which the other future passes on.
+        let worker = tokio::task::spawn_blocking(|| worker.ready()).await.unwrap();
         worker
             .until("the worker is in sync", |status| status["source"] == "main")
             .await;
-        changes(&stage, &robot, &worker).await
+        let revision = changes(&stage, &robot, &worker).await;
+        (worker, revision)
     };
-    let (mut recorded, revision) = tokio::join!(passing, changing);
+    let (mut recorded, (worker, revision)) = tokio::join!(passing, changing);
     // The second stream goes on from there, and ends when the main service does.
     let session = between.session().await;
     let passing = pass(1, session, stage.grpc, |recorded| count(recorded, "GoAway") > 0);
@@ -296,7 +299,9 @@ async fn is_served(stage: &Stage, recorded: &[Recorded], protocol: u32) {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     // And it goes on being told.
-    let revision = stage.put("/services/slam", json!({ "config": { "n": 9 } })).await;
+    let revision = stage
+        .put("/services/slam", json!({ "config": { "n": 9 + protocol } }))
+        .await;
     loop {
         let next = tokio::time::timeout(PATIENCE, stream.told.next()).await.unwrap();
         match told(&next.unwrap().unwrap()) {
@@ -355,7 +360,7 @@ async fn the_worker_understands_main_services_that_were_recorded() {
         let greeting = hello(&mut first).await;
         assert_eq!((greeting.protocol, greeting.without_texts), (PROTOCOL, true));
         replay(&first, &recorded, 0).await;
-        let worker = worker.ready();
+        let worker = tokio::task::spawn_blocking(|| worker.ready()).await.unwrap();
         let (revision, digest) = last_digest(&recorded);
         let is_tried = |status: &Value| status["rollouts"][0]["phase"] == "applied";
         worker.until("it has what was recorded", is_tried).await;
@@ -419,12 +424,16 @@ async fn versions_that_are_too_far_apart_are_told_so() {
         };
         assert_eq!(welcome.protocol, protocol.min(PROTOCOL));
     }
-    for protocol in [PROTOCOL - 2, PROTOCOL + 2] {
-        let hello = Bytes::from(greeting(protocol).encode_to_vec());
-        let refused = RawStream::open(stage.grpc, hello).await.err().unwrap();
-        assert_eq!(refused.code(), tonic::Code::FailedPrecondition, "{refused}");
-        assert!(refused.message().contains("update the older of the two"), "{refused}");
-    }
+    let too_new = Bytes::from(greeting(PROTOCOL + 2).encode_to_vec());
+    let mut stream = RawStream::open(stage.grpc, too_new).await.unwrap();
+    let Told::GoAway(away) = told(&stream.told.next().await.unwrap().unwrap()) else {
+        panic!("it is sent away")
+    };
+    assert!(away.reason.contains("update the older of the two"), "{away:?}");
+    assert!(stream.told.next().await.is_none(), "nothing else is said");
+    let none = Bytes::from(greeting(PROTOCOL - 2).encode_to_vec());
+    let refused = RawStream::open(stage.grpc, none).await.err().unwrap();
+    assert_eq!(refused.code(), tonic::Code::InvalidArgument, "{refused}");
 
     // The same from the other side: what a worker makes of it.
     let mut main = RawMain::start().await;
@@ -449,7 +458,14 @@ async fn versions_that_are_too_far_apart_are_told_so() {
     says(&worker, "speaks version 3 of the protocol, this worker 1 to 2").await;
     drop(session);
     let session = main.session().await;
-    let refusal = tonic::Status::failed_precondition("version 2 of the protocol of Sync is not spoken here");
-    session.tell.send(Err(refusal)).await.unwrap();
-    says(&worker, "version 2 of the protocol of Sync is not spoken here").await;
+    let reason = "version 2 of the protocol of Sync is not spoken here";
+    let away = v1::SyncResponse {
+        msg: Some(Told::GoAway(v1::GoAway {
+            retry_after_ms: 100,
+            reason: reason.to_owned(),
+        })),
+    };
+    session.tell.send(Ok(away.encode_to_vec().into())).await.unwrap();
+    drop(session);
+    says(&worker, reason).await;
 }

@@ -30,6 +30,8 @@ use crate::metrics::ApiMetrics;
 
 /// How long a worker may take to say who it is.
 const GREETING: Duration = Duration::from_secs(10);
+/// When a worker that cannot be served is to come again, in ms: one of the two has to be updated first.
+const AGAIN_MS: u32 = 30_000;
 
 /// `blaze.v1.SyncService`.
 pub(super) struct Service {
@@ -60,12 +62,7 @@ impl Service {
             return refuse("no Hello came within 10 s");
         };
         match first?.and_then(|request| request.msg) {
-            Some(Said::Hello(hello)) => {
-                check_protocol(&hello).inspect_err(|status| {
-                    tracing::warn!(worker = hello.worker_id, version = hello.version, %status, "a worker is refused");
-                })?;
-                read_hello(hello).map_err(|problem| self.refuse(call, &problem))
-            }
+            Some(Said::Hello(hello)) => read_hello(hello).map_err(|problem| self.refuse(call, &problem)),
             Some(Said::Ack(_)) | None => refuse("the first message must be Hello"),
         }
     }
@@ -87,6 +84,15 @@ impl sync_service_server::SyncService for Service {
             .open_watch(&call.caller.claims.subject)
             .map_err(|problem| self.refuse(&call, &problem))?;
         let hello = self.greet(&call, &mut said).await?;
+        if let Some(reason) = too_far_apart(&hello) {
+            tracing::warn!(
+                worker = hello.worker_id,
+                version = hello.version,
+                reason,
+                "a worker is sent away"
+            );
+            return Ok(Response::new(sent_away(reason)));
+        }
         let opened = self.core.sync(&call.caller, hello, is_safe).await;
         let opened = opened.map_err(|problem| self.refuse(&call, &problem))?;
         let held = (slot, self.metrics.watcher());
@@ -217,17 +223,27 @@ fn read_hello(hello: v1::Hello) -> Result<SyncHello, Problem> {
     })
 }
 
-/// A worker may be one version older, or one newer: that one speaks this version, too. Others could be misunderstood.
-fn check_protocol(hello: &v1::Hello) -> Result<(), Status> {
+/// Why a worker cannot be served: it may be one version older than this service, or one newer, for then it speaks this
+/// version, too. Others could be misunderstood.
+fn too_far_apart(hello: &SyncHello) -> Option<String> {
     let (oldest, newest) = (OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL + 1);
-    if (oldest..=newest).contains(&hello.protocol) {
-        return Ok(());
-    }
-    Err(Status::failed_precondition(format!(
-        "version {} of the protocol of Sync is not spoken here, but those of workers from {oldest} to {newest}: update the \
-         older of the two",
-        hello.protocol
-    )))
+    let is_served = hello.protocol == 0 || (oldest..=newest).contains(&hello.protocol);
+    (!is_served).then(|| {
+        format!(
+            "version {} of the protocol of Sync is not spoken here, but those of workers from {oldest} to {newest}: update \
+             the older of the two",
+            hello.protocol
+        )
+    })
+}
+
+/// Tells a worker to come again later, and nothing else.
+fn sent_away(reason: String) -> Responses {
+    let go_away = SyncItem::GoAway {
+        retry_after_ms: AGAIN_MS,
+        reason,
+    };
+    Box::pin(stream::iter(response(go_away, "")))
 }
 
 /// What it says, without what has names that are none: a worker that is newer may know more.
