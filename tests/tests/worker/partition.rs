@@ -38,7 +38,7 @@ impl Cut<'_> {
     fn begin(&self) {
         let Self { namespace, port } = self;
         let rules = format!("tcp dport {port} drop; tcp sport {port} drop;");
-        let table = format!("table ip cut {{ chain lost {{ type filter hook input priority 0; {rules} }} }}");
+        let table = format!("table ip cut {{ chain lost {{ type filter hook input priority 0; {rules} }}; }}");
         run(&format!("ip netns exec {namespace} nft '{table}'")).unwrap();
     }
 
