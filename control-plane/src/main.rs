@@ -8,7 +8,7 @@ use blaze_config::process::{Command, Setup, run};
 use blaze_domain::node_file::{Fault, NodeFile};
 use blaze_runtime::config::{Schema, Sources, load_typed, parse_override};
 use blaze_runtime::supervisor::{block_on, exit_code};
-use blaze_runtime::{logs, say};
+use blaze_runtime::{forbid_core_dumps, logs, say};
 use clap::{Parser, Subcommand};
 
 /// A commit makes and drops thousands of small texts and map nodes on other threads than it began on: with the allocator
@@ -68,6 +68,9 @@ enum Task {
 
 fn main() -> ExitCode {
     let mut arguments = Arguments::parse();
+    if let Err(error) = forbid_core_dumps() {
+        say(format_args!("warning: a core dump could hold secrets: {error}"));
+    }
     let mut overrides = std::mem::take(&mut arguments.set);
     if let Some(format) = &arguments.log_format {
         overrides.push(("log.format".to_owned(), format.clone()));

@@ -7,6 +7,7 @@
 
 pub mod admin;
 pub mod config;
+mod core_dumps;
 pub mod environment;
 pub mod logs;
 mod ready;
@@ -14,6 +15,7 @@ pub mod state;
 pub mod supervisor;
 
 pub use admin::{AdminServer, CheckStatus, Gate, Readiness};
+pub use core_dumps::forbid_core_dumps;
 pub use ready::ready_line;
 pub use supervisor::{
     ShutdownPhase, ShutdownReport, ShutdownSteps, StopOnDrop, Supervisor, TaskEnd, TaskHandle, TaskInfo, TaskPolicy,

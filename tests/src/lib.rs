@@ -6,6 +6,7 @@ pub mod flow;
 mod guard;
 pub mod ledger;
 pub mod machine;
+mod memory;
 pub mod network;
 #[cfg(feature = "kafka")]
 pub mod plain;

@@ -3,7 +3,7 @@
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write as _};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Stdio};
+use std::process::{Child, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ pub use rustix::process::Signal;
 use rustix::process::{Pid, kill_process, setpriority_process};
 
 use crate::admin::Admin;
-use crate::{network, wait};
+use crate::{memory, network, wait};
 
 /// Lines of output that are kept.
 const MAX_LINES: usize = 20_000;
@@ -231,13 +231,28 @@ impl Process {
     /// # Errors
     /// When it does not end in time.
     pub fn exit(&mut self, deadline: Duration) -> anyhow::Result<Option<i32>> {
-        let status = wait::until_some(
+        Ok(self.end(deadline)?.code())
+    }
+
+    /// Waits for its end and gives all that the system says of it.
+    ///
+    /// # Errors
+    /// When it does not end in time.
+    pub fn end(&mut self, deadline: Duration) -> anyhow::Result<ExitStatus> {
+        wait::until_some(
             "the end of the process",
             deadline,
             || self.child.try_wait().ok().flatten(),
             || "it still runs".to_owned(),
-        )?;
-        Ok(status.code())
+        )
+    }
+
+    /// How often something stands in its memory, in use or not. Needs the right to look into it.
+    ///
+    /// # Errors
+    /// When the system does not let anybody look.
+    pub fn count_in_memory(&self, needle: &[u8]) -> anyhow::Result<usize> {
+        memory::count(self.child.id(), needle)
     }
 
     /// Resident memory in bytes; `None` when it does not run.

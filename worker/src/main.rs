@@ -16,7 +16,7 @@ use blaze_runtime::config::{
 };
 use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
-use blaze_runtime::{logs, ready_line, say, state};
+use blaze_runtime::{forbid_core_dumps, logs, ready_line, say, state};
 use blaze_worker::admin::Shown;
 use blaze_worker::lease;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
@@ -46,6 +46,9 @@ struct Arguments {
 
 fn main() -> ExitCode {
     let mut arguments = Arguments::parse();
+    if let Err(error) = forbid_core_dumps() {
+        say(format_args!("warning: a core dump could hold secrets: {error}"));
+    }
     let mut overrides = std::mem::take(&mut arguments.set);
     if let Some(format) = &arguments.log_format {
         overrides.push(("log.format".to_owned(), format.clone()));

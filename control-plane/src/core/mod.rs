@@ -32,7 +32,9 @@ mod watch;
 mod workers;
 
 pub use committer::{CommitReport, OnCommit};
-pub use service::{ConfigService, CoreOptions, DiffReport, SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream};
+pub use service::{
+    ConfigService, CoreOptions, DiffReport, OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream,
+};
 pub use types::*;
 pub use watch::WatchStream;
 pub use workers::{Acknowledged, RolloutReport, Running, RunningState, WorkerName, WorkerSession};

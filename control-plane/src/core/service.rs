@@ -39,7 +39,7 @@ use crate::store::{AuditEntry, Store, StoreError};
 use blaze_domain::config::state::State;
 
 pub use history::DiffReport;
-pub use sync::{SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream};
+pub use sync::{OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL, SyncHello, SyncItem, SyncStream};
 
 /// Refusals that wait to be written to the audit, at most.
 const DENIED_QUEUE: usize = 1024;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::net::{SocketAddr, TcpListener};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -27,13 +27,13 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(20);
 
 /// What the processes of one test have in common.
 pub(crate) struct Stage {
-    folder: TempDir,
+    pub(super) folder: TempDir,
     pub(crate) redis: OwnRedis,
     /// The section of the node file.
     brokers: Value,
-    rest: SocketAddr,
-    grpc: SocketAddr,
-    http: reqwest::Client,
+    pub(super) rest: SocketAddr,
+    pub(super) grpc: SocketAddr,
+    pub(super) http: reqwest::Client,
 }
 
 /// A Redis, where the stage has one.
@@ -48,7 +48,7 @@ impl std::ops::Deref for OwnRedis {
 
 /// A running worker and where it is asked.
 pub(crate) struct Worker {
-    process: Process,
+    pub(super) process: Process,
     pub(crate) admin: SocketAddr,
 }
 
@@ -58,15 +58,21 @@ fn free() -> SocketAddr {
 
 fn launch(program: &str, node_file: &str) -> anyhow::Result<(Process, BTreeMap<String, SocketAddr>)> {
     let process = Process::start(program, &["--config", node_file], None)?;
+    let addresses = addresses(&process)?;
+    Ok((process, addresses))
+}
+
+/// Waits for the ready line, and gives what is in it.
+pub(super) fn addresses(process: &Process) -> anyhow::Result<BTreeMap<String, SocketAddr>> {
     let line = wait::until_some(
-        &format!("the ready line of {program}"),
+        "the ready line",
         START,
         || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
         || process.tail(),
     )?;
     let words = line.split(' ').filter_map(|word| word.split_once('='));
     let addresses = words.filter_map(|(name, address)| Some((name.to_owned(), address.parse().ok()?)));
-    Ok((process, addresses.collect()))
+    Ok(addresses.collect())
 }
 
 impl Stage {
@@ -92,8 +98,11 @@ impl Stage {
     }
 
     fn with(redis: Option<RedisServer>, brokers: Value) -> Self {
+        let folder = TempDir::new().unwrap();
+        let key = blaze_auth::generate_encryption_key().unwrap();
+        std::fs::write(folder.path().join("enc.key"), key.as_bytes()).unwrap();
         Self {
-            folder: TempDir::new().unwrap(),
+            folder,
             redis: OwnRedis(redis),
             brokers,
             rest: free(),
@@ -106,7 +115,7 @@ impl Stage {
         self.folder.path().join(name)
     }
 
-    fn write(&self, name: &str, file: &Value) -> String {
+    pub(super) fn write(&self, name: &str, file: &Value) -> String {
         let path = self.path(name);
         // JSON is YAML.
         std::fs::write(&path, file.to_string()).unwrap();
@@ -115,17 +124,28 @@ impl Stage {
 
     /// The main service, ready; after a start on the same store as before.
     pub(crate) fn main(&self) -> Process {
+        self.main_at("warn", None)
+    }
+
+    /// The same with a level of logs, which may all be written to a file.
+    pub(crate) fn main_at(&self, level: &str, log: Option<&Path>) -> Process {
         let file = self.write(
             "main.yaml",
             &json!({
-                "log": { "level": "warn" },
+                "log": { "level": level },
                 "control_plane": {
                     "rest": { "listen": self.rest }, "grpc": { "listen": self.grpc }, "admin": { "listen": "127.0.0.1:0" },
                     "store": { "sqlite": { "path": self.path("main.db") } },
+                    "encryption": { "keys": [{ "id": "e1", "file": self.path("enc.key") }] },
                 },
             }),
         );
-        let process = Process::start("blaze-config", &["--dev", "--config", &file], None).unwrap();
+        let arguments = ["--dev", "--config", &file];
+        let process = match log {
+            Some(log) => Process::start_logged("blaze-config", &arguments, log),
+            None => Process::start("blaze-config", &arguments, None),
+        }
+        .unwrap();
         wait::until_some(
             "the ready line of blaze-config",
             START,
@@ -235,49 +255,18 @@ impl Stage {
         .await
     }
 
-    fn section(&self) -> blaze_domain::node_file::RedisBroker {
-        let file = json!({ "brokers": { "node": { "redis": { "url": self.redis.url() } } } });
-        match NodeFile::read(&file).unwrap().0.brokers.node {
-            Some(NodeBroker::Redis(section)) => section,
-            other => panic!("{other:?}"),
-        }
-    }
-
     pub(crate) fn keys(&self) -> RedisKeys {
-        RedisKeys::open(&self.section()).unwrap()
+        RedisKeys::open(&section(&self.redis)).unwrap()
     }
 
     /// A client of the broker, as services have it, that is connected.
     pub(crate) async fn broker(&self) -> Arc<dyn Broker> {
-        let file = NodeFile::read(&json!({ "brokers": self.brokers })).unwrap().0.brokers;
-        let broker = match (&file.node, &file.layer) {
-            (Some(section), _) => open_node(section, &Role::Service).unwrap(),
-            (None, Some(section)) => open_layer(section, &Role::Service).unwrap(),
-            (None, None) => panic!("no broker"),
-        };
-        let mut status = broker.status();
-        let up = status.wait_for(|status| status.health == Health::Up);
-        tokio::time::timeout(PATIENCE, up)
-            .await
-            .expect("the broker answers")
-            .unwrap();
-        broker
+        connected(&self.brokers).await
     }
 
     /// A service that knows only the broker.
     pub(crate) async fn service(&self) -> Service {
-        let broker = self.broker().await;
-        let reply: ChannelName = match broker.kind() {
-            BrokerKind::Redis | BrokerKind::Memory => "blaze/reply/test".parse().unwrap(),
-            BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => ChannelName::shared_reply(),
-        };
-        let replies = broker.subscribe(&reply, SubscribeOptions::default()).await.unwrap();
-        Service {
-            broker,
-            replies,
-            life: rand::random(),
-            asked: 0,
-        }
+        Service::over(self.broker().await).await
     }
 
     /// Waits until the worker has what the main service has; gives the digest.
@@ -359,7 +348,52 @@ pub(crate) struct Service {
     asked: u64,
 }
 
+/// A Redis as a node file names it.
+pub(super) fn section(redis: &RedisServer) -> blaze_domain::node_file::RedisBroker {
+    let file = json!({ "brokers": { "node": { "redis": { "url": redis.url() } } } });
+    match NodeFile::read(&file).unwrap().0.brokers.node {
+        Some(NodeBroker::Redis(section)) => section,
+        other => panic!("{other:?}"),
+    }
+}
+
+/// A client of a broker, as services have it, that is connected.
+async fn connected(brokers: &Value) -> Arc<dyn Broker> {
+    let file = NodeFile::read(&json!({ "brokers": brokers })).unwrap().0.brokers;
+    let broker = match (&file.node, &file.layer) {
+        (Some(section), _) => open_node(section, &Role::Service).unwrap(),
+        (None, Some(section)) => open_layer(section, &Role::Service).unwrap(),
+        (None, None) => panic!("no broker"),
+    };
+    let mut status = broker.status();
+    let up = status.wait_for(|status| status.health == Health::Up);
+    tokio::time::timeout(PATIENCE, up)
+        .await
+        .expect("the broker answers")
+        .unwrap();
+    broker
+}
+
 impl Service {
+    pub(crate) async fn on(redis: &RedisServer) -> Self {
+        let brokers = json!({ "node": { "redis": { "url": redis.url() } } });
+        Self::over(connected(&brokers).await).await
+    }
+
+    async fn over(broker: Arc<dyn Broker>) -> Self {
+        let reply: ChannelName = match broker.kind() {
+            BrokerKind::Redis | BrokerKind::Memory => "blaze/reply/test".parse().unwrap(),
+            BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => ChannelName::shared_reply(),
+        };
+        let replies = broker.subscribe(&reply, SubscribeOptions::default()).await.unwrap();
+        Self {
+            broker,
+            replies,
+            life: rand::random(),
+            asked: 0,
+        }
+    }
+
     /// Hears of changes of a service from now on.
     pub(crate) async fn listen(&self, service: &str) -> Subscription {
         self.listen_with(service, SubscribeOptions::default()).await
@@ -377,6 +411,15 @@ impl Service {
     async fn listen_with(&self, service: &str, options: SubscribeOptions) -> Subscription {
         let channel = format!("blaze/config/changed/{service}").parse().unwrap();
         self.broker.subscribe(&channel, options).await.unwrap()
+    }
+
+    /// Says something on a channel.
+    pub(crate) fn publish(&self, channel: &str, message: &Value) {
+        let publisher = self
+            .broker
+            .publisher(&channel.parse().unwrap(), PublisherOptions::default())
+            .unwrap();
+        publisher.publish_bare(&Bytes::from(message.to_string()), None);
     }
 
     /// Asks until it is answered, as often as a service may: each second.

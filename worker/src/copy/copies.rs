@@ -12,7 +12,7 @@
 use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use blaze_domain::config::Key;
@@ -78,7 +78,7 @@ pub struct Counts {
     pub failed: u64,
     /// Updates that were merged into one that waited.
     pub coalesced: u64,
-    /// Whether the copy holds all that was stored.
+    /// Whether the copy holds all that it should: what was stored, and nothing is owed.
     pub is_current: bool,
     /// Why the last write failed; none once one was done again.
     pub error: Option<String>,
@@ -88,6 +88,8 @@ pub struct Counts {
 #[derive(Clone)]
 pub struct Copies {
     slots: Arc<[Arc<Slot>]>,
+    /// Something is known already that is to be stored later.
+    owed: Arc<AtomicBool>,
 }
 
 impl Copies {
@@ -109,7 +111,15 @@ impl Copies {
                 }
             });
         }
-        Self { slots }
+        Self {
+            slots,
+            owed: Arc::default(),
+        }
+    }
+
+    /// Says whether something is known that is to be stored later: until then no copy counts as current.
+    pub fn owe(&self, is_owed: bool) {
+        self.owed.store(is_owed, Ordering::Release);
     }
 
     /// Has a state written to every copy, when it can be. Never waits.
@@ -139,7 +149,15 @@ impl Copies {
     /// What became of the updates, by copy.
     #[must_use]
     pub fn counts(&self) -> Vec<Counts> {
-        self.slots.iter().map(|slot| slot.counts()).collect()
+        // Before the slots: whoever stores does so first, and then owes nothing more.
+        let is_owed = self.owed.load(Ordering::Acquire);
+        let counts = self.slots.iter().map(|slot| slot.counts());
+        counts
+            .map(|counts| Counts {
+                is_current: counts.is_current && !is_owed,
+                ..counts
+            })
+            .collect()
     }
 }
 

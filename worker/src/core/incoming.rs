@@ -1,12 +1,15 @@
 //! What the main service tells a worker, and what can be wrong with it.
 
 use std::fmt;
+use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::config::{Document, MAX_DOCUMENTS, Timestamp};
+use blaze_domain::config::{Document, MAX_DOCUMENTS, Timestamp, secret};
 
-/// Version of the protocol that is spoken here.
-pub const PROTOCOL: u32 = 1;
+/// Version of the protocol that is spoken here. Version 2: Hello says whether texts of secrets are wanted.
+pub const PROTOCOL: u32 = 2;
+/// Oldest version that is understood here: a worker serves with a main service that is one version older.
+pub const OLDEST_PROTOCOL: u32 = PROTOCOL - 1;
 /// Specs of a snapshot, in bytes of their compact JSON, at most (512 MiB).
 pub const MAX_SNAPSHOT_BYTES: usize = 512 * 1024 * 1024;
 
@@ -117,6 +120,17 @@ impl fmt::Debug for Incoming {
 }
 
 impl Incoming {
+    /// The same without the texts of secrets.
+    #[must_use]
+    pub fn redacted(mut self) -> Self {
+        match &mut self {
+            Self::Snapshot { documents, .. } => documents.iter_mut().for_each(redact),
+            Self::Commit { edits, .. } => edits.iter_mut().for_each(|edit| redact(&mut edit.document)),
+            Self::Welcome { .. } | Self::Bookmark { .. } | Self::GoAway { .. } => {}
+        }
+        self
+    }
+
     pub(super) fn word(&self) -> &'static str {
         match self {
             Self::Welcome { .. } => "Welcome",
@@ -125,6 +139,16 @@ impl Incoming {
             Self::Bookmark { .. } => "Bookmark",
             Self::GoAway { .. } => "GoAway",
         }
+    }
+}
+
+/// Takes the texts of secrets out of a document.
+pub(super) fn redact(document: &mut Document) {
+    if secret::contains(&document.spec) {
+        document.spec = Arc::new(secret::redact(&document.spec).into_owned());
+    }
+    if let Some(status) = document.status.as_ref().filter(|status| secret::contains(status)) {
+        document.status = Some(secret::redact(status).into_owned());
     }
 }
 
@@ -158,7 +182,10 @@ pub enum SyncFault {
         waited_for: &'static str,
     },
     /// The main service speaks another version.
-    #[error("the main service speaks version {theirs} of the protocol, this worker {PROTOCOL}")]
+    #[error(
+        "the main service speaks version {theirs} of the protocol, this worker {OLDEST_PROTOCOL} to {PROTOCOL}: \
+         update the older of the two"
+    )]
     Protocol {
         /// Its version.
         theirs: u32,

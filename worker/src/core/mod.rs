@@ -34,7 +34,7 @@ pub use asked::{ASKED_FOR, MAX_ASKED};
 pub use change::Change;
 pub use gate::{Failure, Gate, MAX_WINDOWS, RolloutPhase, RolloutState};
 pub use health::{Complaint, MAX_SIGNS, Row, Signs, Trouble};
-pub use incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, Op, PROTOCOL, SyncFault, TooLarge};
+pub use incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, OLDEST_PROTOCOL, Op, PROTOCOL, SyncFault, TooLarge};
 pub use notice::{Config, Notice, Scope, Standing};
 pub use place::{Place, Site, Source};
 pub use replica::{Applied, Replica, ResumePoint};

@@ -18,7 +18,7 @@ use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Key, MAX_DOCUMENTS, Timestamp};
 
 use super::change::{Change, difference};
-use super::incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, Op, PROTOCOL, SyncFault, TooLarge};
+use super::incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, OLDEST_PROTOCOL, Op, PROTOCOL, SyncFault, TooLarge};
 use super::stream::{Phase, Stream, spec_bytes};
 
 /// What a message did.
@@ -233,7 +233,7 @@ impl Replica {
     }
 
     fn welcome(&mut self, protocol: u32, store_id: String, revision: u64, resumed: bool) -> Result<(), SyncFault> {
-        if protocol != PROTOCOL {
+        if !(OLDEST_PROTOCOL..=PROTOCOL).contains(&protocol) {
             return Err(SyncFault::Protocol { theirs: protocol });
         }
         self.goal = revision;

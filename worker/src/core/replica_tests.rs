@@ -334,16 +334,24 @@ fn messages_out_of_order_are_faults() {
     replica.apply(welcome(10, true), at(0)).unwrap_err();
     assert_eq!(replica.resume_point().revision, 10);
     replica.disconnected();
-    let other = Incoming::Welcome {
-        protocol: 2,
+}
+
+#[test]
+fn a_main_service_one_version_older_is_understood_and_no_other() {
+    let welcome = |protocol| Incoming::Welcome {
+        protocol,
         store_id: String::new(),
         revision: 1,
         resumed: false,
     };
-    assert_eq!(
-        replica.apply(other, at(0)).unwrap_err(),
-        SyncFault::Protocol { theirs: 2 }
-    );
+    for theirs in [PROTOCOL - 1, PROTOCOL] {
+        assert!(self::replica().apply(welcome(theirs), at(0)).is_ok(), "{theirs}");
+    }
+    for theirs in [OLDEST_PROTOCOL - 1, PROTOCOL + 1] {
+        let fault = self::replica().apply(welcome(theirs), at(0)).unwrap_err();
+        assert_eq!(fault, SyncFault::Protocol { theirs });
+        assert!(fault.to_string().contains("update the older of the two"), "{fault}");
+    }
 }
 
 #[test]

@@ -30,7 +30,13 @@ impl Made {
 
 fn world(start: Option<Loaded>) -> (World, Arc<Made>) {
     let made = Arc::<Made>::default();
-    let world = world_on(start, true, None, Some(Arc::clone(&made) as Arc<dyn Channels>));
+    let world = world_on(
+        start,
+        true,
+        None,
+        Delivery::Text,
+        Some(Arc::clone(&made) as Arc<dyn Channels>),
+    );
     (world, made)
 }
 

@@ -12,6 +12,7 @@
 
 mod ask;
 mod fade;
+mod follow;
 mod hear;
 mod lead;
 mod missed;
@@ -34,7 +35,7 @@ use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use crate::copy::{Changed, Loaded, Notes, Position, Update, defaults, lacks_text};
-use crate::core::{Applied, Gate, Notice, PROTOCOL, Place, Replica, Served, Signs, Source};
+use crate::core::{Gate, Notice, Place, Replica, Served, Signs, Source};
 use crate::lease::Mark;
 use crate::sync::SyncEvent;
 use fade::Fades;
@@ -81,6 +82,8 @@ pub struct Engine {
     stream: Option<CancellationToken>,
     /// Why there is no stream.
     reason: Option<String>,
+    /// Why the stream was ended from here.
+    fault: Option<String>,
     /// The number of the term in which it leads.
     leads: Option<u64>,
     /// Since when.
@@ -93,6 +96,8 @@ pub struct Engine {
     shown: Option<Mark>,
     flushed: Option<Instant>,
     flush_at: Option<Instant>,
+    /// What was missed is coming; nobody is told before this time.
+    catching_up: Option<Instant>,
     /// When to look whether the broker has taken what places are told.
     settle_at: Option<Instant>,
     ack_at: Instant,
@@ -134,6 +139,7 @@ impl Engine {
             look_at: now + LOOK,
             stream: None,
             reason: None,
+            fault: None,
             leads: None,
             led_at: now,
             tells: false,
@@ -141,6 +147,7 @@ impl Engine {
             shown: None,
             flushed: None,
             flush_at: None,
+            catching_up: None,
             settle_at: None,
             ack_at: now + ACK_AGAIN,
             acked: now.checked_sub(ACK_PACE).unwrap_or(now),
@@ -171,7 +178,7 @@ impl Engine {
         } = loaded.position;
         let mut state = State::new(revision, []);
         for document in loaded.documents {
-            state.put(document);
+            state.put(self.identity.delivery.kept(document));
         }
         let told = tell::told_of(&loaded.notes);
         let failed: Vec<String> = loaded.notes.failed().map(str::to_owned).collect();
@@ -230,93 +237,6 @@ impl Engine {
         }
     }
 
-    fn on_sync(&mut self, event: SyncEvent) {
-        match event {
-            SyncEvent::Greeting { is_safe, answer } => {
-                // Whoever asked may have gone.
-                let _ = answer.send(self.hello(is_safe));
-            }
-            SyncEvent::Opened(stream) => {
-                self.stream = Some(stream);
-                self.reason = None;
-            }
-            SyncEvent::Said(incoming) => {
-                let now = now();
-                match self.replica.apply(incoming, now) {
-                    // It is known to be the newest by now, which the copies are to know too.
-                    Ok(Applied::Nothing) if self.replica.is_in_sync() => self.keep(Changed::Keys(Vec::new())),
-                    Ok(Applied::Nothing) => {}
-                    Ok(Applied::Changed(change)) => {
-                        self.counts.changes += 1;
-                        self.wants_all = false;
-                        self.served.apply(&change);
-                        self.note_services(change.keys.iter().map(Key::kind));
-                        self.note_texts(&change);
-                        self.keep(Changed::Keys(change.keys));
-                        self.flush_soon();
-                    }
-                    Ok(Applied::GoAway { retry_after, reason }) => {
-                        tracing::info!(reason, ?retry_after, "the main service ends the stream");
-                    }
-                    Err(fault) => {
-                        tracing::warn!(%fault, "the stream begins anew");
-                        self.counts.faults += 1;
-                        if let Some(stream) = &self.stream {
-                            stream.cancel();
-                        }
-                    }
-                }
-                self.note_sync();
-            }
-            SyncEvent::Closed { reason, is_unreadable } => {
-                self.wants_all |= is_unreadable;
-                if self.stream.take().is_some() {
-                    tracing::warn!(reason, "the main service is away; services get what is here");
-                }
-                self.reason = Some(reason);
-                self.replica.disconnected();
-                self.note_sync();
-            }
-        }
-    }
-
-    fn hello(&mut self, is_safe: bool) -> v1::Hello {
-        self.replica.disconnected();
-        let resume = self.replica.resume_point();
-        let site = &self.identity.site;
-        let node = site.node.as_ref().or(self.identity.node.as_ref());
-        let mut hello = v1::Hello {
-            protocol: PROTOCOL,
-            layer: site.layer.to_string(),
-            node: node.map(ToString::to_string).unwrap_or_default(),
-            worker_id: self.identity.worker_id.clone(),
-            version: env!("CARGO_PKG_VERSION").to_owned(),
-            store_id: resume.store_id,
-            revision: resume.revision,
-            digest: resume.digest,
-        };
-        // Texts come over a safe connection alone, and with a snapshot: what is here has the newest revision already.
-        if self.wants_all || (is_safe && self.lacks_texts) {
-            (hello.store_id, hello.revision, hello.digest) = Default::default();
-        }
-        hello
-    }
-
-    fn note_sync(&mut self) {
-        let in_sync = self.replica.is_in_sync();
-        let was = self.served.source();
-        self.served.set_in_sync(in_sync);
-        if was != self.served.source() {
-            tracing::info!(
-                in_sync,
-                revision = self.replica.state().revision(),
-                "source of configurations"
-            );
-        }
-        self.begin_telling();
-        self.acknowledge_soon();
-    }
-
     /// Says what is here, if somebody listens.
     fn acknowledge(&mut self) {
         self.acked = Instant::now();
@@ -369,7 +289,7 @@ impl Engine {
         let Some(current) = &status.current else { return };
         let mut state = State::new(0, []);
         for document in &current.documents {
-            state.put(Arc::clone(document));
+            state.put(self.identity.delivery.kept(Arc::clone(document)));
         }
         // What came from the main service or a copy of it is better.
         if self.served.load(state, Source::File).is_ok() {

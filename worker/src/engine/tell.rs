@@ -52,10 +52,12 @@ pub(super) fn at(place: &Place, site: &Site) -> At {
 }
 
 impl Engine {
-    /// Has changes told: at once after a quiet while, else together with what comes until then.
+    /// Has changes told: at once after a quiet while, else together with what comes until then. What was missed in an outage
+    /// is told when it has all come.
     pub(super) fn flush_soon(&mut self) {
         let next = self.flushed.map_or_else(Instant::now, |last| last + TOGETHER);
-        self.flush_at.get_or_insert(next);
+        let next = self.catching_up.map_or(next, |until| until.max(next));
+        self.flush_at = Some(self.flush_at.map_or(next, |at| at.min(next)));
     }
 
     /// Tells what has changed.
@@ -75,6 +77,7 @@ impl Engine {
         for place in &untracked {
             let noted = at(place, &self.identity.site);
             if !self.fade(place, &noted) {
+                // Whether anything is still owed is seen when the rest settles.
                 self.unnoted.remove(place);
                 self.notes.forget(&noted);
             }
@@ -113,6 +116,7 @@ impl Engine {
             self.outputs.speaker.sweep_keys();
         }
         self.tell_own();
+        self.owe_notes();
         self.begin_telling();
         self.settle_soon();
         // After the notices: only what was told can go well or badly.
@@ -263,6 +267,7 @@ impl Engine {
         }
         self.unnoted.insert(place.clone(), (revision, hash));
         self.settle_soon();
+        self.owe_notes();
     }
 
     /// Notes what places were told.
@@ -279,6 +284,14 @@ impl Engine {
         }
         if has_some {
             self.keep_notes();
+        }
+        self.owe_notes();
+    }
+
+    /// Copies without the notes that are still to come do not count as current.
+    pub(super) fn owe_notes(&self) {
+        if let Some(copies) = &self.outputs.copies {
+            copies.owe(self.served.has_pending() || !self.unnoted.is_empty());
         }
     }
 }

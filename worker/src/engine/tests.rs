@@ -2,6 +2,8 @@
 
 #[path = "fade_tests.rs"]
 mod fade;
+#[path = "follow_tests.rs"]
+mod follow;
 #[path = "hear_tests.rs"]
 mod hear;
 #[path = "lead_tests.rs"]
@@ -116,7 +118,11 @@ fn world_from(start: Option<Loaded>, is_leader: bool) -> World {
 }
 
 fn world_with(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>) -> World {
-    world_on(start, is_leader, copies, None)
+    world_as(start, is_leader, copies, Delivery::Text)
+}
+
+fn world_as(start: Option<Loaded>, is_leader: bool, copies: Option<Copies>, delivery: Delivery) -> World {
+    world_on(start, is_leader, copies, delivery, None)
 }
 
 /// The same on a broker where channels are to be made.
@@ -124,6 +130,7 @@ fn world_on(
     start: Option<Loaded>,
     is_leader: bool,
     copies: Option<Copies>,
+    delivery: Delivery,
     channels: Option<Arc<dyn Channels>>,
 ) -> World {
     let (sync, sync_in) = mpsc::channel(64);
@@ -145,7 +152,7 @@ fn world_on(
         },
         node: None,
         worker_id: "w-1".to_owned(),
-        delivery: Delivery::Text,
+        delivery,
     };
     let speaker = Speaker::new(Term::always());
     let outputs = Outputs {

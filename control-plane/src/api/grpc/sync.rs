@@ -22,13 +22,16 @@ use super::gate::{self, Call};
 use super::{outgoing, status};
 use crate::api::limits::ApiLimits;
 use crate::core::{
-    Acknowledged, ConfigService, RolloutReport, Running, RunningState, SyncHello, SyncItem, SyncStream, WorkerSession,
+    Acknowledged, ConfigService, OLDEST_SYNC_PROTOCOL, RolloutReport, Running, RunningState, SYNC_PROTOCOL, SyncHello,
+    SyncItem, SyncStream, WorkerSession,
 };
 use crate::listen::Peer;
 use crate::metrics::ApiMetrics;
 
 /// How long a worker may take to say who it is.
 const GREETING: Duration = Duration::from_secs(10);
+/// When a worker that cannot be served is to come again, in ms: one of the two has to be updated first.
+const AGAIN_MS: u32 = 30_000;
 
 /// `blaze.v1.SyncService`.
 pub(super) struct Service {
@@ -81,6 +84,15 @@ impl sync_service_server::SyncService for Service {
             .open_watch(&call.caller.claims.subject)
             .map_err(|problem| self.refuse(&call, &problem))?;
         let hello = self.greet(&call, &mut said).await?;
+        if let Some(reason) = too_far_apart(&hello) {
+            tracing::warn!(
+                worker = hello.worker_id,
+                version = hello.version,
+                reason,
+                "a worker is sent away"
+            );
+            return Ok(Response::new(sent_away(reason)));
+        }
         let opened = self.core.sync(&call.caller, hello, is_safe).await;
         let opened = opened.map_err(|problem| self.refuse(&call, &problem))?;
         let held = (slot, self.metrics.watcher());
@@ -207,7 +219,31 @@ fn read_hello(hello: v1::Hello) -> Result<SyncHello, Problem> {
         store_id: hello.store_id,
         revision: hello.revision,
         digest: hello.digest,
+        without_texts: hello.without_texts,
     })
+}
+
+/// Why a worker cannot be served: it may be one version older than this service, or one newer, for then it speaks this
+/// version, too. Others could be misunderstood.
+fn too_far_apart(hello: &SyncHello) -> Option<String> {
+    let (oldest, newest) = (OLDEST_SYNC_PROTOCOL, SYNC_PROTOCOL + 1);
+    let is_served = hello.protocol == 0 || (oldest..=newest).contains(&hello.protocol);
+    (!is_served).then(|| {
+        format!(
+            "version {} of the protocol of Sync is not spoken here, but those of workers from {oldest} to {newest}: update \
+             the older of the two",
+            hello.protocol
+        )
+    })
+}
+
+/// Tells a worker to come again later, and nothing else.
+fn sent_away(reason: String) -> Responses {
+    let go_away = SyncItem::GoAway {
+        retry_after_ms: AGAIN_MS,
+        reason,
+    };
+    Box::pin(stream::iter(response(go_away, "")))
 }
 
 /// What it says, without what has names that are none: a worker that is newer may know more.

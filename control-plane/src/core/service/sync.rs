@@ -28,8 +28,10 @@ use super::ConfigService;
 use crate::auth::Right;
 use crate::secrets::Keyring;
 
-/// The protocol of `Sync` that is spoken here.
-pub const SYNC_PROTOCOL: u32 = 1;
+/// The protocol of `Sync` that is spoken here. Version 2: Hello says whether texts of secrets are wanted.
+pub const SYNC_PROTOCOL: u32 = 2;
+/// The oldest one that is spoken here.
+pub const OLDEST_SYNC_PROTOCOL: u32 = SYNC_PROTOCOL - 1;
 /// A part of a snapshot ends with the document that makes it this large, in bytes of JSON: with the largest document it is
 /// still below the 1 MiB that a part may have.
 const PART_BYTES: usize = 512 * 1024;
@@ -63,6 +65,8 @@ pub struct SyncHello {
     pub revision: u64,
     /// Digest of its copy; empty: it does not say.
     pub digest: String,
+    /// It tells nobody the texts of secrets: they are not to be sent.
+    pub without_texts: bool,
 }
 
 /// What a worker is told. After `End` comes nothing.
@@ -126,8 +130,8 @@ impl SyncStream {
 #[derive(Clone)]
 struct Clear {
     keyring: Arc<Keyring>,
-    /// Nobody else can read what is sent.
-    is_safe: bool,
+    /// Texts of secrets are wanted, and nobody else can read what is sent.
+    with_texts: bool,
 }
 
 impl Clear {
@@ -136,7 +140,7 @@ impl Clear {
             return Arc::clone(held);
         }
         let mut clear = (**held).clone();
-        clear.spec = Arc::new(match self.is_safe {
+        clear.spec = Arc::new(match self.with_texts {
             true => secrets::revealed(&self.keyring, held, &held.spec),
             false => secret::redact(&held.spec).into_owned(),
         });
@@ -185,7 +189,7 @@ impl ConfigService {
         let session = self.enter(&hello)?.with_address(caller.address);
         let clear = Clear {
             keyring: Arc::clone(&self.inner.evaluator.keyring),
-            is_safe,
+            with_texts: is_safe && !hello.without_texts,
         };
         tracing::info!(
             layer = %hello.layer, node = hello.node.as_ref().map(NodeName::as_str), worker = hello.worker_id,

@@ -1,7 +1,7 @@
 //! Roll-outs that fail on a canary, as its worker says.
 
 use super::*;
-use crate::core::{Acknowledged, RolloutReport, SyncHello, WorkerSession};
+use crate::core::{Acknowledged, RolloutReport, SYNC_PROTOCOL, SyncHello, WorkerSession};
 
 /// Two canaries in layer `edge`, one in `fog`, and a roll-out of `s` on all of them.
 async fn tried() -> (World, String) {
@@ -43,7 +43,7 @@ fn report(uid: &str, node: &str, phase: &str, reason: &str) -> RolloutReport {
 impl World {
     async fn session(&self, layer: &str, node: &str) -> Arc<WorkerSession> {
         let hello = SyncHello {
-            protocol: 1,
+            protocol: SYNC_PROTOCOL,
             layer: layer.parse().unwrap(),
             node: Some(node.parse().unwrap()),
             worker_id: format!("{node}-1"),
@@ -51,6 +51,7 @@ impl World {
             store_id: String::new(),
             revision: 0,
             digest: String::new(),
+            without_texts: false,
         };
         let opened = self
             .service

@@ -6,7 +6,7 @@ use blaze_domain::config::{canonical, secret};
 use futures::stream::BoxStream;
 
 use super::*;
-use crate::core::{Acknowledged, Running, RunningState, SyncHello, SyncItem, WorkerSession};
+use crate::core::{Acknowledged, Running, RunningState, SYNC_PROTOCOL, SyncHello, SyncItem, WorkerSession};
 
 /// A worker that believes all it is told.
 struct Copy {
@@ -21,7 +21,7 @@ struct Copy {
 
 fn hello(layer: &str, revision: u64, store_id: &str) -> SyncHello {
     SyncHello {
-        protocol: 1,
+        protocol: SYNC_PROTOCOL,
         layer: layer.parse().unwrap(),
         node: Some("robot-1".parse().unwrap()),
         worker_id: "w-1".to_owned(),
@@ -29,6 +29,7 @@ fn hello(layer: &str, revision: u64, store_id: &str) -> SyncHello {
         store_id: store_id.to_owned(),
         revision,
         digest: String::new(),
+        without_texts: false,
     }
 }
 
@@ -224,6 +225,13 @@ async fn secrets_go_in_clear_over_a_safe_connection_alone() {
             shown
         );
     }
+    let mut blind = w
+        .worker(SyncHello {
+            without_texts: true,
+            ..hello("edge", 0, "")
+        })
+        .await;
+    blind.until(1).await;
     let mut live = w.worker(hello("edge", 0, "")).await;
     live.until(1).await;
     w.put(
@@ -235,6 +243,16 @@ async fn secrets_go_in_clear_over_a_safe_connection_alone() {
     let document = &live.documents[&key("Service/slam")];
     assert_eq!(document.config().unwrap()["password"]["$secret"]["text"], "second");
     assert!(secret::contains(&document.spec));
+    // Whoever wants none gets none, neither at the beginning nor later.
+    assert_eq!(
+        blind.documents[&key("Service/slam")].config().unwrap()["password"],
+        json!({ "$secret": { "redacted": true, "version": 1 } })
+    );
+    blind.until(2).await;
+    assert_eq!(
+        blind.documents[&key("Service/slam")].config().unwrap()["password"],
+        json!({ "$secret": { "redacted": true, "version": 2 } })
+    );
 }
 
 #[tokio::test]

@@ -1,11 +1,14 @@
 //! What a worker writes: answers, notices, the values of Redis.
 
+use std::sync::Arc;
+
 use blaze_domain::config::secret::{self, Secret};
-use blaze_domain::config::{MAX_EFFECTIVE_BYTES, Timestamp};
+use blaze_domain::config::{Document, MAX_EFFECTIVE_BYTES, Timestamp};
 use serde_json::{Map, Value, json};
 
 use super::get::{ErrorCode, RequestError};
 use crate::core::answer::{Freshness, Reply};
+use crate::core::incoming::redact;
 use crate::core::notice::{Notice, Scope, Standing};
 use crate::core::place::Source;
 
@@ -21,6 +24,20 @@ pub enum Delivery {
     Text,
     /// As `{"$secret":{"redacted":true,"version":n}}`.
     Redacted,
+}
+
+impl Delivery {
+    /// The document as it is kept in memory and in copies: without texts where nobody is told them.
+    #[must_use]
+    pub fn kept(self, document: Arc<Document>) -> Arc<Document> {
+        let has_secrets = secret::contains(&document.spec) || document.status.as_ref().is_some_and(secret::contains);
+        if self == Self::Text || !has_secrets {
+            return document;
+        }
+        let mut document = Arc::unwrap_or_clone(document);
+        redact(&mut document);
+        Arc::new(document)
+    }
 }
 
 /// A configuration that is too large to be sent.

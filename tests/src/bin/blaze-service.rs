@@ -1,0 +1,109 @@
+//! A service that lives by its configuration: says on stdout what it gets, acknowledges it, and shows that it lives. Tests kill
+//! it like any service.
+//!
+//! ```text
+//! config {"revision":7,"deleted":false,"config":{…}}      for each change
+//! ```
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use blaze_brokers::Role;
+use blaze_brokers::redis::RedisBroker;
+use blaze_domain::node_file::{NodeBroker, NodeFile, RedisBroker as RedisSection};
+use blaze_domain::{InstanceName, LayerName, NodeName, Scope, ServiceName};
+use blaze_runtime::logs::{self, LogFormat};
+use blaze_sdk::{AckStatus, ConfigChange, ConfigManager, ServiceManager, ServiceOptions, ServiceState};
+use clap::Parser;
+use serde_json::json;
+
+/// A service that acknowledges its configuration. SIGTERM ends it.
+#[derive(Debug, Parser)]
+struct Options {
+    /// URL of the Redis of its node
+    #[arg(long)]
+    redis: String,
+    #[arg(long)]
+    layer: LayerName,
+    #[arg(long)]
+    node: NodeName,
+    #[arg(long)]
+    service: ServiceName,
+    #[arg(long)]
+    instance: InstanceName,
+    /// How long a sign of life counts
+    #[arg(long, default_value_t = 3_000)]
+    watchdog_ms: u64,
+    /// A larger `rate_hz` is rejected
+    #[arg(long, default_value_t = u64::MAX)]
+    reject_above: u64,
+    /// It does not acknowledge a larger `rate_hz` than 10 before this file is there
+    #[arg(long)]
+    acknowledge_when: Option<PathBuf>,
+    /// With a larger `rate_hz` it is unhealthy
+    #[arg(long, default_value_t = u64::MAX)]
+    unhealthy_above: u64,
+}
+
+#[tokio::main]
+async fn main() -> anyhow::Result<()> {
+    let options = Options::parse();
+    let _logs = logs::init("warn", LogFormat::Text)?;
+    let section = section(&options.redis)?;
+    let broker = Arc::new(RedisBroker::open(&section, &Role::Service)?);
+    let service = ServiceManager::start(ServiceOptions {
+        node: Some(options.node.clone()),
+        instance: options.instance.clone(),
+        cache: Some(section),
+        watchdog_ttl: Duration::from_millis(options.watchdog_ms),
+        ..ServiceOptions::new(options.layer.clone(), options.service.clone(), broker, Scope::Node)
+    })
+    .await?;
+    service.cache().set_state(ServiceState::Ready);
+    let (config, cache) = (service.config().clone(), service.cache().clone());
+    let (reject, unhealthy) = (options.reject_above, options.unhealthy_above);
+    let (acknowledges, when) = (config.clone(), options.acknowledge_when.clone());
+    let _listener = config.on_change(move |change| {
+        say(change);
+        let rate = change.new.as_ref().and_then(|new| new["rate_hz"].as_u64()).unwrap_or(0);
+        // This is a thread of the pool for callbacks, which may wait.
+        while rate > 10 && when.as_ref().is_some_and(|when| !when.exists()) {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        acknowledge(&acknowledges, rate, reject);
+        cache.set_state(match rate > unhealthy {
+            true => ServiceState::Unhealthy,
+            false => ServiceState::Ready,
+        });
+    });
+    tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?
+        .recv()
+        .await;
+    service.shutdown().await;
+    Ok(())
+}
+
+fn section(url: &str) -> anyhow::Result<RedisSection> {
+    let file = json!({ "brokers": { "node": { "redis": { "url": url } } } });
+    let read = NodeFile::read(&file).map_err(|faults| anyhow::anyhow!("{faults:?}"))?;
+    match read.0.brokers.node {
+        Some(NodeBroker::Redis(section)) => Ok(section),
+        other => anyhow::bail!("{other:?} is no Redis"),
+    }
+}
+
+fn say(change: &ConfigChange) {
+    let line = json!({ "revision": change.revision, "deleted": change.deleted, "config": change.new.as_deref() });
+    println!("config {line}");
+}
+
+fn acknowledge(config: &ConfigManager, rate: u64, reject_above: u64) {
+    let said = match rate > reject_above {
+        true => config.ack(AckStatus::Rejected, &format!("rate_hz: at most {reject_above}")),
+        false => config.ack(AckStatus::Applied, ""),
+    };
+    if let Err(error) = said {
+        eprintln!("not acknowledged: {error}");
+    }
+}

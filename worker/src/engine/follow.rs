@@ -1,0 +1,139 @@
+//! What the main service says, and what follows from it.
+
+use std::time::Duration;
+
+use blaze_domain::config::Key;
+use blaze_proto::v1;
+use tokio::time::Instant;
+
+use super::{Engine, now};
+use crate::copy::Changed;
+use crate::core::messages::Delivery;
+use crate::core::{Applied, Incoming, PROTOCOL};
+use crate::sync::SyncEvent;
+
+/// After an outage services hear of the final state, not of each step to it: what they are told waits until everything up to
+/// where the store stood has come, or for so long.
+const CATCH_UP: Duration = Duration::from_secs(3);
+
+impl Engine {
+    pub(super) fn on_sync(&mut self, event: SyncEvent) {
+        match event {
+            SyncEvent::Greeting { is_safe, answer } => {
+                // Whoever asked may have gone.
+                let _ = answer.send(self.hello(is_safe));
+            }
+            SyncEvent::Opened(stream) => {
+                self.stream = Some(stream);
+                self.fault = None;
+            }
+            SyncEvent::Said(incoming) => {
+                let applied = self.replica.apply(self.without_texts(incoming), now());
+                if matches!(applied, Ok(Applied::Nothing | Applied::Changed(_))) {
+                    // Both understand each other: what was the matter before is so no more.
+                    self.reason = None;
+                }
+                match applied {
+                    // It is known to be the newest by now, which the copies are to know too.
+                    Ok(Applied::Nothing) if self.replica.is_in_sync() => self.keep(Changed::Keys(Vec::new())),
+                    Ok(Applied::Nothing) => {}
+                    Ok(Applied::Changed(change)) => {
+                        self.counts.changes += 1;
+                        self.wants_all = false;
+                        self.served.apply(&change);
+                        self.note_services(change.keys.iter().map(Key::kind));
+                        self.note_catching_up();
+                        self.note_texts(&change);
+                        self.owe_notes();
+                        self.keep(Changed::Keys(change.keys));
+                        self.flush_soon();
+                    }
+                    Ok(Applied::GoAway { retry_after, reason }) => {
+                        tracing::info!(reason, ?retry_after, "the main service ends the stream");
+                        self.fault = Some(reason);
+                    }
+                    Err(fault) => {
+                        tracing::warn!(%fault, "the stream begins anew");
+                        self.fault = Some(fault.to_string());
+                        self.counts.faults += 1;
+                        if let Some(stream) = &self.stream {
+                            stream.cancel();
+                        }
+                    }
+                }
+                self.note_sync();
+            }
+            SyncEvent::Closed { reason, is_unreadable } => {
+                self.wants_all |= is_unreadable;
+                // What ended it says more than that it has ended.
+                let reason = self.fault.take().unwrap_or(reason);
+                let was_there = self.stream.take().is_some();
+                if was_there || self.reason.as_ref() != Some(&reason) {
+                    tracing::warn!(reason, "the main service is away; services get what is here");
+                }
+                self.reason = Some(reason);
+                self.replica.disconnected();
+                self.catching_up = None;
+                self.note_sync();
+            }
+        }
+    }
+
+    fn hello(&mut self, is_safe: bool) -> v1::Hello {
+        self.replica.disconnected();
+        let resume = self.replica.resume_point();
+        let site = &self.identity.site;
+        let node = site.node.as_ref().or(self.identity.node.as_ref());
+        let mut hello = v1::Hello {
+            protocol: PROTOCOL,
+            layer: site.layer.to_string(),
+            node: node.map(ToString::to_string).unwrap_or_default(),
+            worker_id: self.identity.worker_id.clone(),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            store_id: resume.store_id,
+            revision: resume.revision,
+            digest: resume.digest,
+            without_texts: self.identity.delivery == Delivery::Redacted,
+        };
+        // Texts come over a safe connection alone, and with a snapshot: what is here has the newest revision already.
+        if self.wants_all || (is_safe && self.lacks_texts && !hello.without_texts) {
+            (hello.store_id, hello.revision, hello.digest) = Default::default();
+        }
+        hello
+    }
+
+    /// What nobody is told as text is not kept as text either. A main service that knows it does not send it.
+    fn without_texts(&self, incoming: Incoming) -> Incoming {
+        match self.identity.delivery {
+            Delivery::Text => incoming,
+            Delivery::Redacted => incoming.redacted(),
+        }
+    }
+
+    /// What was missed in an outage comes in steps, of which only the last is told.
+    fn note_catching_up(&mut self) {
+        if !self.replica.is_in_sync() && self.catching_up.is_none() {
+            let until = Instant::now() + CATCH_UP;
+            self.catching_up = Some(until);
+            self.flush_at = Some(until);
+        }
+    }
+
+    fn note_sync(&mut self) {
+        let in_sync = self.replica.is_in_sync();
+        if in_sync && self.catching_up.take().is_some() {
+            self.flush_soon();
+        }
+        let was = self.served.source();
+        self.served.set_in_sync(in_sync);
+        if was != self.served.source() {
+            tracing::info!(
+                in_sync,
+                revision = self.replica.state().revision(),
+                "source of configurations"
+            );
+        }
+        self.begin_telling();
+        self.acknowledge_soon();
+    }
+}

@@ -1,0 +1,144 @@
+//! What follows from what the main service says.
+
+use super::*;
+use crate::core::{OLDEST_PROTOCOL, PROTOCOL};
+
+fn slam(revision: u64) -> Incoming {
+    let changed = document("Service/slam", revision, json!({ "config": { "rate_hz": revision } }));
+    commit(revision, revision - 1, vec![(Op::Update, changed)])
+}
+
+impl World {
+    async fn closes(&self) {
+        let closed = SyncEvent::Closed {
+            reason: "cut".to_owned(),
+            is_unreadable: false,
+        };
+        self.sync.send(closed).await.unwrap();
+    }
+
+    /// The main service goes on from what the worker has.
+    async fn goes_on(&self, protocol: u32, revision: u64) {
+        self.sync
+            .send(SyncEvent::Opened(CancellationToken::new()))
+            .await
+            .unwrap();
+        self.says(Incoming::Welcome {
+            protocol,
+            store_id: "s".to_owned(),
+            revision,
+            resumed: true,
+        })
+        .await;
+    }
+
+    async fn reason(&self) -> Option<String> {
+        let (send, status) = oneshot::channel();
+        self.queries.send(Query::Status(send)).await.unwrap();
+        status.await.unwrap().reason
+    }
+}
+
+fn rates(told: &[Seen]) -> Vec<u64> {
+    let rate = |seen: &Seen| match seen {
+        Seen::Notice(_, notice) => notice["config"]["rate_hz"].as_u64(),
+        Seen::Key(..) => None,
+    };
+    told.iter().filter_map(rate).collect()
+}
+
+#[tokio::test(start_paused = true)]
+async fn after_an_outage_each_place_is_told_once_of_the_final_state() {
+    let mut w = world();
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.slam().await;
+    w.rest().await;
+    w.closes().await;
+    w.goes_on(PROTOCOL, 40).await;
+    for revision in 3..=40 {
+        // Slower than what would be told together, and with somebody who asks meanwhile.
+        tokio::time::sleep(Duration::from_millis(30)).await;
+        w.says(slam(revision)).await;
+        let answer = w.slam().await;
+        assert_eq!(
+            answer["config"]["rate_hz"], 30,
+            "nobody is told of a step to the final state"
+        );
+    }
+    assert_eq!(
+        rates(&w.rest().await),
+        [40, 40],
+        "the instance that asked, and the service without one"
+    );
+    // From then on changes are told as they come.
+    w.says(slam(41)).await;
+    assert_eq!(rates(&w.rest().await), [41, 41]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_does_not_come_is_not_waited_for_for_long() {
+    let mut w = world();
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.closes().await;
+    w.goes_on(PROTOCOL, 40).await;
+    for revision in 3..=5 {
+        w.says(slam(revision)).await;
+    }
+    assert_eq!(rates(&w.rest().await), [5]);
+    w.says(slam(6)).await;
+    w.closes().await;
+    assert_eq!(rates(&w.rest().await), [6], "what came before the stream ended is told");
+}
+
+#[tokio::test(start_paused = true)]
+async fn where_nobody_is_told_texts_none_is_kept() {
+    let mut w = world_as(None, true, None, Delivery::Redacted);
+    assert!(w.hello().await.without_texts);
+    let secret = |text: &str| json!({ "config": { "password": { "$secret": { "text": text, "version": 2 } } } });
+    let mut all = documents(30);
+    all[3] = document("Service/slam", 2, secret("canary"));
+    // A main service of a version that does not know that none is wanted.
+    w.opens(all, 2).await;
+    w.says(commit(
+        3,
+        2,
+        vec![(Op::Update, document("Service/nav", 3, secret("canary")))],
+    ))
+    .await;
+    w.rest().await;
+    let answer = w.slam().await;
+    assert_eq!(
+        answer["config"]["password"],
+        json!({ "$secret": { "redacted": true, "version": 2 } })
+    );
+    // Nothing is missing, so nothing is asked for anew.
+    assert_eq!(w.hello().await.revision, 3);
+    assert!(!world().hello().await.without_texts);
+}
+
+#[tokio::test(start_paused = true)]
+async fn why_a_stream_was_ended_is_known_afterwards() {
+    let mut w = world();
+    w.opens(documents(30), 2).await;
+    for (protocol, words) in [
+        (PROTOCOL + 1, Some("update the older of the two")),
+        (OLDEST_PROTOCOL, None),
+    ] {
+        w.closes().await;
+        w.goes_on(protocol, 2).await;
+        w.rest().await;
+        w.closes().await;
+        let reason = w.reason().await.unwrap();
+        assert!(reason.contains(words.unwrap_or("cut")), "{reason}");
+    }
+    w.goes_on(PROTOCOL, 2).await;
+    w.says(Incoming::GoAway {
+        retry_after: Duration::from_secs(1),
+        reason: "the service is ending".to_owned(),
+    })
+    .await;
+    w.closes().await;
+    assert_eq!(w.reason().await.unwrap(), "the service is ending");
+}
