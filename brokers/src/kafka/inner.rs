@@ -17,10 +17,9 @@ use super::bell::Bell;
 use super::clock::BrokerClock;
 use super::consumer::{Consumer, Join, Refused, Source};
 use super::context::LastError;
-use super::directory::{Directory, Listing, LookupError, Marks};
+use super::directory::{Directory, LookupError, Marks};
 use super::flow_side::FlowState;
 use super::gate::Gate;
-use super::maker::Made;
 use super::names::{self, Names};
 use super::producer::Producer;
 use super::read_to_end::ReaderToEnd;
@@ -94,20 +93,6 @@ pub(super) struct Inner {
 impl Inner {
     pub(super) fn is_closed(&self) -> bool {
         self.closed.load(Ordering::Acquire)
-    }
-
-    /// Whether it makes topics, for which it must know all that there are.
-    pub(super) fn makes_topics(&self) -> bool {
-        self.flow.is_some() || self.worker.is_some()
-    }
-
-    /// Makes the topics that are missing, if it makes any.
-    pub(super) fn keep_topics(&self, listing: &Listing) -> Result<Made, String> {
-        match (&self.flow, &self.worker) {
-            (Some(flow), _) => flow.keep_topics(self, listing),
-            (None, Some(worker)) => worker.maker.make(self, listing).map(|(made, _)| made),
-            (None, None) => Ok(Made::Nothing),
-        }
     }
 
     /// The client that makes topics and asks for their settings, made at first use.

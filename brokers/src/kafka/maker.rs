@@ -257,3 +257,19 @@ impl Maker {
         std::mem::take(&mut *self.collisions.lock())
     }
 }
+
+impl Inner {
+    /// Whether it makes topics, for which it must know all that there are.
+    pub(super) fn makes_topics(&self) -> bool {
+        self.flow.is_some() || self.worker.is_some()
+    }
+
+    /// Makes the topics that are missing, if it makes any.
+    pub(super) fn keep_topics(&self, listing: &Listing) -> Result<Made, String> {
+        match (&self.flow, &self.worker) {
+            (Some(flow), _) => flow.keep_topics(self, listing),
+            (None, Some(worker)) => worker.maker.make(self, listing).map(|(made, _)| made),
+            (None, None) => Ok(Made::Nothing),
+        }
+    }
+}
