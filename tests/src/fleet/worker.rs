@@ -11,7 +11,6 @@ use blaze_brokers::{Broker, Role, open_layer, open_node};
 use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
 use blaze_domain::{LayerName, NodeName, Scope};
 use blaze_runtime::Supervisor;
-use blaze_worker::lease;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::{LocalBroker, WorkerSettings};
 use serde_json::{Value, json};
@@ -149,14 +148,14 @@ impl Worker {
         let broker = place.open(&Role::Worker)?;
         let keys = settings.keys.as_ref().map(RedisKeys::open).transpose()?.map(Arc::new);
         let (layer, node) = (settings.site.layer.clone(), settings.node.clone());
-        let worker_id = format!("{node}-{:08x}", rand::random::<u32>());
         let options = WorkerOptions {
-            lease: lease::open(&settings, keys.as_ref(), &worker_id)?,
-            worker_id,
+            worker_id: format!("{node}-{:08x}", rand::random::<u32>()),
             settings,
             broker,
             keys,
             folder: spec.folder.clone(),
+            // Of its prefix each is the only one.
+            lease: None,
         };
         let supervisor = Supervisor::new(node.to_string());
         let running = RunningWorker::start(options, &supervisor).await?;

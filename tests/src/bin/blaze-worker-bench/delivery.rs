@@ -199,7 +199,7 @@ struct Plain {
 
 impl Plain {
     async fn new(broker: Arc<dyn Broker>, kind: BrokerKind) -> anyhow::Result<Self> {
-        let channel = match kind {
+        let channel: ChannelName = match kind {
             BrokerKind::Redis => "bench/plain".parse()?,
             // Channels must be made there; services leave alone what is no answer to them.
             BrokerKind::Kafka => ChannelName::shared_reply(),
