@@ -9,6 +9,7 @@ use clap::{Args, Parser, Subcommand};
 use crate::admin::TopOptions;
 use crate::config::ConfigCommand;
 use crate::demo::options::DemoOptions;
+use crate::dev::options::DevOptions;
 use crate::local::{EchoOptions, HzOptions, PublishOptions};
 use crate::output::Output;
 use crate::plan::PlanOptions;
@@ -54,6 +55,8 @@ pub enum Command {
     Hz(HzOptions),
     /// Robot, fog and cloud in one process, with recorded data
     Demo(DemoOptions),
+    /// Main service, worker, flow and broker of one node in one process, for developing services: loopback, no tokens
+    Dev(Box<DevOptions>),
     /// Commands of the configuration.
     #[command(flatten)]
     Config(Box<ConfigCommand>),

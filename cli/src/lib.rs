@@ -5,15 +5,20 @@
 //!      ├─► plan: plan file ──► allocator of the data plane ──► output
 //!      ├─► config: get, apply, watch, … ──► REST of the main service of BlazeConfig ──► output
 //!      ├─► local: pub, echo, hz ──► ServiceManager ──► local broker of the node file
-//!      └─► demo: recordings ──► player ──► flows and services of one process ──► board ──► report
+//!      ├─► demo: recordings ──► player ──► flows and services of one process ──► board ──► report
+//!      └─► dev: main service, worker and flow of one node in one process
 //! ```
 
 pub mod admin;
 pub mod args;
 pub mod config;
 pub mod demo;
+pub mod dev;
+mod embedded;
+mod ends;
 pub mod exit;
 pub mod http;
+mod live;
 pub mod local;
 mod node_file;
 pub mod output;
@@ -66,6 +71,7 @@ async fn dispatch(arguments: Arguments) -> Result<Exit, CliError> {
         Command::Echo(options) => local::echo(options, format?).await,
         Command::Hz(options) => local::hz(options, format?).await,
         Command::Demo(options) => demo::run(options, format?).await,
+        Command::Dev(options) => dev::run(*options, format?).await,
         Command::Config(command) => config::run(*command, output).await,
         Command::Completions { shell } => {
             let mut script = Vec::new();

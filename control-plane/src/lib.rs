@@ -15,5 +15,7 @@ pub mod listen;
 pub mod metrics;
 pub mod process;
 mod reload;
+pub mod running;
 pub mod secrets;
 pub mod store;
+mod waiting;

@@ -1,38 +1,30 @@
-//! The process around the core: what it is built of, and in which order it begins and ends.
+//! The process: serve, or one piece of work on the store.
 //!
 //! ```text
-//! keys ─▶ store (migrated) ─▶ core ─▶ REST, gRPC, admin ─▶ ready line
-//! SIGTERM: not ready ─▶ no new connections ─▶ watches end ─▶ open requests finish ─▶ store closed
+//! setup ─▶ serve: RunningMain ─▶ ready line ─▶ signal ─▶ shutdown
+//!      └─▶ migrate, backup, restore, reencrypt: store ─▶ work ─▶ store closed
 //! ```
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::{Arc, OnceLock};
-use std::time::{Duration, Instant};
+use std::sync::Arc;
+use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_domain::node_file::{ControlPlaneSection, StoreSection};
-use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, exit_code};
-use blaze_runtime::{AdminServer, CheckStatus, Gate, Readiness, ready_line, say};
-use rand::RngExt as _;
+use blaze_runtime::supervisor::{ShutdownSteps, Supervisor, TaskPolicy, exit_code};
+use blaze_runtime::{ready_line, say};
 
-use crate::api::grpc::{self, GrpcOptions};
-use crate::api::limits::ApiLimits;
-use crate::api::rest::{self, RestOptions};
+use crate::auth::Authenticator;
 use crate::auth::startup::check_startup;
-use crate::auth::{Authenticator, Revocations};
-use crate::core::{ConfigService, CoreOptions};
-use crate::listen::{
-    ListenCounters, ListenLimits, Listener, Protocols, Serving, Tls, install_crypto_provider, metrics_text,
-};
-use crate::metrics::ApiMetrics;
+use crate::listen::{Tls, install_crypto_provider};
+use crate::running::{Addresses, RunningMain};
 use crate::secrets::Keyring;
 use crate::store::migrate::Plan;
-use crate::store::{self, FullStore, Store, StoreError, backup};
+use crate::store::{self, FullStore, StoreError, backup};
 
 /// A shutdown takes at most this long.
-const SHUTDOWN: Duration = Duration::from_secs(10);
+pub(crate) const SHUTDOWN: Duration = Duration::from_secs(10);
 
 /// What the process does.
 #[derive(Debug, Clone)]
@@ -95,7 +87,7 @@ impl Setup {
         if faults.is_empty() { Ok(()) } else { Err(faults) }
     }
 
-    async fn open(&self, supervisor: &Supervisor) -> Result<Arc<dyn FullStore>, StoreError> {
+    pub(crate) async fn open(&self, supervisor: &Supervisor) -> Result<Arc<dyn FullStore>, StoreError> {
         match self.in_memory {
             true => store::in_memory(supervisor).await,
             false => store::open(&self.section.store, supervisor).await,
@@ -104,16 +96,16 @@ impl Setup {
 }
 
 /// Everything that is read of files before the store is opened.
-struct Keys {
-    keyring: Keyring,
-    authenticator: Option<Authenticator>,
-    tls: Option<Tls>,
+pub(crate) struct Keys {
+    pub(crate) keyring: Keyring,
+    pub(crate) authenticator: Option<Authenticator>,
+    pub(crate) tls: Option<Tls>,
 }
 
 impl Keys {
     /// # Errors
     /// Every fault, with its place in the node file.
-    fn read(section: &ControlPlaneSection) -> Result<Self, Vec<String>> {
+    pub(crate) fn read(section: &ControlPlaneSection) -> Result<Self, Vec<String>> {
         let authenticator = section.auth.as_ref().map(Authenticator::load).transpose();
         let keyring = Keyring::load(&section.encryption);
         match (authenticator, keyring, Tls::load(&section.tls)) {
@@ -130,7 +122,7 @@ impl Keys {
     }
 
     /// Reads the files again when they change.
-    fn watch(&self, supervisor: &Supervisor) {
+    pub(crate) fn watch(&self, supervisor: &Supervisor) {
         self.keyring.watch(supervisor);
         if let Some(authenticator) = &self.authenticator {
             authenticator.watch(supervisor);
@@ -266,264 +258,30 @@ async fn reencrypt(supervisor: &Supervisor, setup: &Setup) -> anyhow::Result<()>
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "it stands in `map_err`")]
-fn all_of(faults: Vec<String>) -> anyhow::Error {
+pub(crate) fn all_of(faults: Vec<String>) -> anyhow::Error {
     anyhow::anyhow!(faults.join("; "))
 }
 
-/// What runs once everything is built.
-struct Running {
-    service: ConfigService,
-    store: Arc<dyn FullStore>,
-    rest: Serving,
-    grpc: Serving,
-    counters: [Arc<ListenCounters>; 2],
-}
-
 async fn serve(supervisor: &Supervisor, setup: Setup) -> ExitCode {
-    let readiness = Readiness::new();
-    readiness.add("store", Gate::Decides, CheckStatus::Failed, "not opened yet");
-    let metrics = match ApiMetrics::new() {
-        Ok(metrics) => Arc::new(metrics),
+    let main = match RunningMain::start(supervisor, setup).await {
+        Ok(main) => Arc::new(main),
         Err(error) => {
-            say(format_args!("blaze-config failed: metrics: {error}"));
+            say(format_args!("blaze-config failed: {error:#}"));
             return ExitCode::from(exit_code::FAILED);
         }
     };
-    let running: Arc<OnceLock<Running>> = Arc::new(OnceLock::new());
-    let admin = match admin(supervisor, &setup, &readiness, &metrics, &running).await {
-        Ok(address) => address,
-        Err(error) => {
-            say(format_args!("blaze-config failed: {error}"));
-            return ExitCode::from(exit_code::FAILED);
-        }
-    };
-    // The store may come later than this process, and SIGTERM earlier than the store.
-    let starting = {
-        let (supervisor, readiness, running) = (supervisor.clone(), readiness.clone(), Arc::clone(&running));
-        async move {
-            let stopping = supervisor.stopping_token();
-            let built = tokio::select! {
-                built = start(&supervisor, &setup, &readiness, &metrics) => built,
-                () = stopping.cancelled() => return Ok(()),
-            };
-            let built = built.map_err(|error| format!("{error:#}"))?;
-            let (rest, grpc) = (built.rest.local_addr(), built.grpc.local_addr());
-            // Set once, here.
-            let _ = running.set(built);
-            readiness.ready().await;
-            ready_line(&[("rest", rest), ("grpc", grpc), ("admin", admin)]).map_err(|error| error.to_string())
-        }
-    };
-    let failing = supervisor.clone();
-    supervisor.spawn("start", TaskPolicy::MayEnd, async move {
-        if let Err(reason) = starting.await {
-            failing.fail(reason);
+    let (announced, stopping, failing) = (Arc::clone(&main), supervisor.stopping_token(), supervisor.clone());
+    supervisor.spawn("ready line", TaskPolicy::MayEnd, async move {
+        let Addresses { rest, grpc, admin } = tokio::select! {
+            addresses = announced.ready() => addresses,
+            () = stopping.cancelled() => return,
+        };
+        if let Err(error) = ready_line(&[("rest", rest), ("grpc", grpc), ("admin", admin)]) {
+            failing.fail(error.to_string());
         }
     });
-    let (watches, drained, closed) = (Arc::clone(&running), Arc::clone(&running), running);
-    let steps = ShutdownSteps::new(SHUTDOWN)
-        .on(ShutdownPhase::NotReady, "readiness", async move { readiness.stop() })
-        .on(ShutdownPhase::EndStreams, "watches", async move {
-            if let Some(running) = watches.get() {
-                running.service.end_watches();
-            }
-        })
-        .on(ShutdownPhase::Drain, "requests", async move {
-            if let Some(running) = drained.get() {
-                running.rest.stop();
-                running.grpc.stop();
-                tokio::join!(running.rest.drained(), running.grpc.drained());
-            }
-        })
-        .on(ShutdownPhase::Drain, "store", async move {
-            if let Some(running) = closed.get() {
-                running.store.close().await;
-            }
-        });
+    let steps = main.shutdown_steps(ShutdownSteps::new(SHUTDOWN));
     supervisor.clone().run(steps).await
-}
-
-async fn admin(
-    supervisor: &Supervisor,
-    setup: &Setup,
-    readiness: &Readiness,
-    metrics: &Arc<ApiMetrics>,
-    running: &Arc<OnceLock<Running>>,
-) -> std::io::Result<SocketAddr> {
-    let (metrics, running) = (Arc::clone(metrics), Arc::clone(running));
-    let text = move || {
-        let mut text = String::new();
-        if let Some(running) = running.get() {
-            let core = &running.service;
-            metrics.state(
-                core.revision(),
-                core.oldest_revision(),
-                core.documents(),
-                core.denials_skipped(),
-            );
-            let lags = core.worker_lags();
-            metrics.worker_lags(lags.iter().map(|((layer, node), lag)| {
-                let node = node.as_ref().map_or("", |node| node.as_str());
-                (layer.as_str(), node, *lag)
-            }));
-            text.push_str(&metrics_text(&running.counters));
-        }
-        metrics.text() + &text
-    };
-    let address = setup.section.admin.listen;
-    let server = AdminServer::bind(address, axum::Router::new(), readiness.clone(), Arc::new(text)).await?;
-    let address = server.address();
-    server.serve(supervisor);
-    Ok(address)
-}
-
-/// Between two lines that say that nothing has changed.
-const STILL_WAITING: Duration = Duration::from_secs(60);
-
-/// What the log is told of a store that cannot be reached: each reason once.
-#[derive(Default)]
-struct Waiting {
-    /// The last reason without its numbers, and when something was told.
-    told: Option<(String, Instant)>,
-}
-
-#[derive(Debug, PartialEq, Eq)]
-enum News {
-    /// Another reason than before, with what to do about it if that is known.
-    Other(Option<&'static str>),
-    /// The same reason for long.
-    Still,
-    None,
-}
-
-impl Waiting {
-    fn news(&mut self, reason: &str, now: Instant) -> News {
-        let shape = without_numbers(reason);
-        match &mut self.told {
-            Some((told, at)) if *told == shape => {
-                if now.saturating_duration_since(*at) < STILL_WAITING {
-                    return News::None;
-                }
-                *at = now;
-                News::Still
-            }
-            told => {
-                *told = Some((shape, now));
-                News::Other(hint(reason))
-            }
-        }
-    }
-}
-
-/// Times and counters differ from one try to the next: `1.5 ms` and `820 µs` are the same.
-fn without_numbers(text: &str) -> String {
-    let part = |c: char| c.is_alphanumeric() || matches!(c, '.' | 'µ');
-    let mut out = String::new();
-    for word in text.split_inclusive(|c: char| !part(c)) {
-        if word.contains(|c: char| c.is_ascii_digit()) {
-            out.push('#');
-        } else if !matches!(word.trim_end_matches(|c: char| !part(c)), "ns" | "µs" | "ms" | "s") {
-            out.push_str(word);
-        }
-    }
-    out
-}
-
-/// MongoDB's driver tells the state of each member in words alone.
-fn hint(reason: &str) -> Option<&'static str> {
-    reason
-        .contains("RsGhost")
-        .then_some("a member says that its replica set was never initiated: run rs.initiate() once, on one member")
-}
-
-/// Opens the store, again and again while it cannot be reached.
-async fn open_store(
-    supervisor: &Supervisor,
-    setup: &Setup,
-    readiness: &Readiness,
-) -> anyhow::Result<Arc<dyn FullStore>> {
-    let mut waiting = Waiting::default();
-    loop {
-        let error = match setup.open(supervisor).await {
-            Ok(store) => return Ok(store),
-            Err(error) if error.is_transient() => error,
-            Err(error) => return Err(error.into()),
-        };
-        match waiting.news(&error.to_string(), Instant::now()) {
-            News::Other(hint) => tracing::warn!(%error, hint, "waiting for the store"),
-            News::Still => tracing::warn!("still waiting for the store, for the reason that was told before"),
-            News::None => tracing::debug!(%error, "waiting for the store"),
-        }
-        readiness.set("store", CheckStatus::Failed, error.told());
-        let pause = rand::rng().random_range(Duration::from_millis(100)..Duration::from_secs(2));
-        tokio::time::sleep(pause).await;
-    }
-}
-
-async fn start(
-    supervisor: &Supervisor,
-    setup: &Setup,
-    readiness: &Readiness,
-    metrics: &Arc<ApiMetrics>,
-) -> anyhow::Result<Running> {
-    let section = &setup.section;
-    let keys = Keys::read(section).map_err(all_of)?;
-    keys.watch(supervisor);
-    let Keys {
-        keyring,
-        authenticator,
-        tls,
-    } = keys;
-    let store = open_store(supervisor, setup, readiness).await?;
-    let told = Arc::clone(metrics);
-    let options = CoreOptions {
-        store: Arc::clone(&store) as Arc<dyn Store>,
-        authenticator: authenticator.map(Arc::new),
-        dev: setup.dev,
-        revocations: Revocations::new(),
-        keyring: Arc::new(keyring),
-        history: section.history.clone(),
-        on_commit: Arc::new(move |report| told.commit(&report)),
-        readiness: readiness.clone(),
-    };
-    let service = ConfigService::start(supervisor, options).await?;
-    let limits = Arc::new(ApiLimits::new(&section.limits));
-    let rest = rest::router(
-        service.clone(),
-        RestOptions {
-            dev: setup.dev,
-            limits: Arc::clone(&limits),
-            readiness: readiness.clone(),
-            metrics: Arc::clone(metrics),
-        },
-    );
-    let grpc = grpc::router(
-        service.clone(),
-        GrpcOptions {
-            dev: setup.dev,
-            limits,
-            metrics: Arc::clone(metrics),
-            readiness: readiness.clone(),
-            reflection: section.grpc.reflection || setup.dev,
-            stopping: supervisor.stopping_token(),
-        },
-    );
-    let listen = ListenLimits {
-        // A watcher that stands still for a minute is told why it ends; see `watch_too_slow`.
-        write_stall: Duration::from_secs(120),
-        drain_timeout: SHUTDOWN - Duration::from_secs(2),
-        ..ListenLimits::default()
-    };
-    let rest_port = section.rest.listen;
-    let rest_port = Listener::bind("rest", rest_port, tls.clone(), Protocols::Both, listen.clone()).await?;
-    let grpc_port = Listener::bind("grpc", section.grpc.listen, tls, Protocols::Http2, listen).await?;
-    Ok(Running {
-        counters: [rest_port.counters(), grpc_port.counters()],
-        rest: rest_port.serve(supervisor, rest),
-        grpc: grpc_port.serve(supervisor, grpc),
-        service,
-        store,
-    })
 }
 
 #[cfg(test)]
@@ -606,40 +364,6 @@ mod tests {
             ..ControlPlaneSection::default()
         };
         assert_eq!(setup(section).check_all().unwrap_err().len(), 1);
-    }
-
-    #[test]
-    fn a_reason_to_wait_is_told_once() {
-        let ghost = |rtt: &str| {
-            format!(
-                "MongoDB: Server selection timeout: No available servers. Topology: {{ Type: ReplicaSetNoPrimary, Servers: \
-                 [ {{ Address: 127.0.0.1:27017, Type: RsGhost, Average RTT: {rtt}, Last Update Time: 2026-11-23 9:12:33.5 }} ] }}"
-            )
-        };
-        let (mut waiting, start) = (Waiting::default(), Instant::now());
-        let News::Other(Some(hint)) = waiting.news(&ghost("1.2ms"), start) else {
-            panic!("the first reason is news");
-        };
-        assert!(hint.contains("rs.initiate()"));
-        assert_eq!(
-            waiting.news(&ghost("820µs"), start + Duration::from_secs(2)),
-            News::None
-        );
-        assert_eq!(
-            waiting.news(&ghost("2.5 ms"), start + Duration::from_secs(59)),
-            News::None
-        );
-        assert_eq!(
-            waiting.news(&ghost("2 ms"), start + Duration::from_secs(61)),
-            News::Still
-        );
-        assert_eq!(
-            waiting.news(&ghost("2 ms"), start + Duration::from_secs(63)),
-            News::None
-        );
-        let other = "MongoDB: connection refused";
-        assert_eq!(waiting.news(other, start + Duration::from_secs(64)), News::Other(None));
-        assert!(matches!(waiting.news(&ghost("1 s"), start), News::Other(Some(_))));
     }
 
     #[tokio::test]

@@ -1,5 +1,6 @@
 //! Real processes of the product, their output, and their end.
 
+use std::ffi::OsStr;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write as _};
 use std::path::{Path, PathBuf};
@@ -114,7 +115,15 @@ impl Process {
     /// # Errors
     /// When it is not built or does not start.
     pub fn start(name: &str, arguments: &[&str], namespace: Option<&str>) -> anyhow::Result<Self> {
-        Self::launch(name, arguments, namespace, None)
+        Self::launch(name, arguments, namespace, &[], None)
+    }
+
+    /// Starts a program of the workspace with variables of the environment besides those of the test.
+    ///
+    /// # Errors
+    /// When it is not built or does not start.
+    pub fn start_with(name: &str, arguments: &[&str], environment: &[(&str, &OsStr)]) -> anyhow::Result<Self> {
+        Self::launch(name, arguments, None, environment, None)
     }
 
     /// Starts a program of the workspace that says more than is kept: all of its stderr is written to a file, too.
@@ -123,13 +132,20 @@ impl Process {
     /// When it is not built or does not start, or the file cannot be made.
     pub fn start_logged(name: &str, arguments: &[&str], log: &Path) -> anyhow::Result<Self> {
         let file = File::create(log).with_context(|| format!("making {}", log.display()))?;
-        Self::launch(name, arguments, None, Some(file))
+        Self::launch(name, arguments, None, &[], Some(file))
     }
 
-    fn launch(name: &str, arguments: &[&str], namespace: Option<&str>, log: Option<File>) -> anyhow::Result<Self> {
+    fn launch(
+        name: &str,
+        arguments: &[&str],
+        namespace: Option<&str>,
+        environment: &[(&str, &OsStr)],
+        log: Option<File>,
+    ) -> anyhow::Result<Self> {
         let mut command = network::program(namespace, binary(name)?);
         command
             .args(arguments)
+            .envs(environment.iter().copied())
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped());

@@ -46,6 +46,8 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "blaze-flow",
             "blaze-sdk",
             "blaze-auth",
+            "blaze-config",
+            "blaze-worker",
         ],
     ),
     (

@@ -1,6 +1,7 @@
 //! What the admin port shows of a worker.
 
 use std::fmt::Write as _;
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -9,7 +10,7 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
 use axum::{Json, Router};
-use blaze_runtime::{CheckStatus, Gate, Readiness};
+use blaze_runtime::{AdminServer, CheckStatus, Gate, Readiness, Supervisor, TaskPolicy};
 use parking_lot::Mutex;
 use serde_json::json;
 
@@ -34,6 +35,31 @@ struct Inner {
 }
 
 impl Shown {
+    /// Serves the admin port of a worker that is [started](Self::set) afterwards, so that it can be asked from the beginning.
+    ///
+    /// # Errors
+    /// When the port cannot be bound.
+    pub async fn serve(
+        &self,
+        address: SocketAddr,
+        readiness: Readiness,
+        supervisor: &Supervisor,
+    ) -> std::io::Result<SocketAddr> {
+        let numbers = self.clone();
+        let metrics = Arc::new(move || numbers.metrics());
+        let admin = AdminServer::bind(address, self.router(), readiness.clone(), metrics).await?;
+        let address = admin.address();
+        admin.serve(supervisor);
+        let (look, stop) = (self.clone().look(readiness), supervisor.stopping_token());
+        supervisor.spawn("look", TaskPolicy::MayEnd, async move {
+            tokio::select! {
+                () = look => {}
+                () = stop.cancelled() => {}
+            }
+        });
+        Ok(address)
+    }
+
     /// The worker runs.
     pub fn set(&self, worker: Arc<RunningWorker>) {
         self.inner.lock().worker = Some(worker);
@@ -44,12 +70,12 @@ impl Shown {
     }
 
     /// The routes below `/v1`.
-    pub fn router(&self) -> Router {
+    fn router(&self) -> Router {
         Router::new().route("/v1/status", get(status)).with_state(self.clone())
     }
 
     /// Looks at the worker again and again, for readiness and metrics.
-    pub async fn look(self, readiness: Readiness) {
+    async fn look(self, readiness: Readiness) {
         readiness.add(
             "configuration",
             Gate::Decides,

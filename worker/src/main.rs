@@ -10,7 +10,7 @@ use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, OpenError, Role, check_layer, open_layer, open_node};
 use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
-use blaze_runtime::admin::{AdminServer, Readiness};
+use blaze_runtime::admin::Readiness;
 use blaze_runtime::config::{
     Current, Follower, Keys, Loaded, Schema, Sources, WatchSettings, follow, load_typed, parse_override, watch_with,
 };
@@ -141,12 +141,7 @@ async fn start(
         anyhow::anyhow!(lines.join("; "))
     })?;
     let (readiness, shown) = (Readiness::new(), Shown::default());
-    let numbers = shown.clone();
-    let metrics = Arc::new(move || numbers.metrics());
-    let admin = AdminServer::bind(file.admin.worker, shown.router(), readiness.clone(), metrics).await?;
-    let address = admin.address();
-    admin.serve(supervisor);
-    spawn(supervisor, "look", shown.clone().look(readiness.clone()));
+    let address = shown.serve(file.admin.worker, readiness.clone(), supervisor).await?;
     let worker = Arc::new(begin(settings, file, supervisor).await?);
     shown.set(Arc::clone(&worker));
     let overlays = worker.own().overlays();

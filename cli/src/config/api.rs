@@ -254,6 +254,15 @@ impl Client {
             .collect()
     }
 
+    /// An answer that did not come while somebody waited for it.
+    pub(crate) fn silent(&self) -> CliError {
+        CliError::NoServer {
+            server: self.server().to_owned(),
+            reason: "no answer in time".to_owned(),
+            advice: "It may be busy: try again.".to_owned(),
+        }
+    }
+
     /// An answer that is not as the contract says.
     pub(crate) fn odd(&self, reason: &str) -> CliError {
         CliError::Foreign {

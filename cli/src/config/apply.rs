@@ -7,7 +7,7 @@ use std::time::Duration;
 use blaze_domain::config::Kind;
 use clap::Args;
 use serde_json::Value;
-use tokio::time::{Instant, sleep};
+use tokio::time::{Instant, sleep, timeout_at};
 
 use super::call::Call;
 use super::client::Client;
@@ -214,6 +214,34 @@ fn layers(answer: &Value, sources: &[Source]) -> Option<BTreeSet<String>> {
     Some(layers)
 }
 
+/// The newest revision of documents that an answer tells of.
+fn newest(answer: &Value) -> Option<u64> {
+    let revisions = results(answer).iter().map(|result| result.get("revision")?.as_u64());
+    revisions.flatten().max()
+}
+
+/// Layers that see some of the documents, as far as these say; `None`: all may.
+fn seen_by(sources: &[Source]) -> Option<BTreeSet<String>> {
+    let mut layers = BTreeSet::new();
+    for Source { key, value, .. } in sources {
+        let text = |pointer: &str| Some(value.pointer(pointer)?.as_str()?.to_owned());
+        match key.kind() {
+            Kind::Layer => {
+                layers.insert(key.name().to_string());
+            }
+            Kind::Node => layers.extend(text("/spec/layer")),
+            Kind::Service => {
+                let named = value.pointer("/spec/layers").and_then(Value::as_array)?;
+                layers.extend(named.iter().filter_map(|layer| layer.as_str().map(str::to_owned)));
+            }
+            // Where a node stands, and what a roll-out is about, is not said here.
+            Kind::Instance => layers.extend(Some(text("/spec/layer")?)),
+            Kind::Rollout => return None,
+        }
+    }
+    Some(layers)
+}
+
 /// Waits until all connected workers concerned have the revision of an answer.
 async fn wait(
     client: &Client,
@@ -225,14 +253,20 @@ async fn wait(
     let changed = results(answer)
         .iter()
         .any(|result| member(result, "action") != "unchanged");
-    let Some(revision) = answer.get("revision").and_then(Value::as_u64).filter(|_| changed) else {
+    let (revision, layers) = match changed {
+        true => (answer.get("revision").and_then(Value::as_u64), layers(answer, sources)),
+        // What was there already may be on its way yet: whoever waits again waits for the same.
+        false => (newest(answer), seen_by(sources)),
+    };
+    let Some(revision) = revision else {
         return Ok(());
     };
-    let layers = layers(answer, sources);
     let until = Instant::now() + longest;
     let mut pause = FIRST_PAUSE;
     loop {
-        let behind = match client.workers().await {
+        let asked = timeout_at(until.max(Instant::now() + FIRST_PAUSE), client.workers()).await;
+        let asked = asked.unwrap_or_else(|_| Err(client.silent()));
+        let behind = match asked {
             Ok(workers) => {
                 let concerned = concerned(&workers, layers.as_ref());
                 let behind = behind(&concerned, revision);

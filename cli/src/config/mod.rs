@@ -15,7 +15,7 @@ mod apply;
 mod ask;
 mod call;
 mod cascade;
-mod client;
+pub(crate) mod client;
 mod context_command;
 mod contexts;
 mod delete;
@@ -25,15 +25,17 @@ mod edit;
 mod effective;
 mod endpoint;
 mod export;
-mod files;
+pub(crate) mod files;
 mod fleet;
 mod get;
 mod history;
 mod kinds;
+mod node;
 mod options;
 mod patch;
 mod refusal;
 mod rollout;
+pub(crate) mod seed;
 mod sse;
 mod stream;
 #[cfg(test)]
@@ -62,6 +64,7 @@ pub use fleet::{AuditOptions, WorkersOptions};
 pub use get::GetOptions;
 pub use history::{HistoryOptions, RevertOptions, RollbackOptions};
 pub use kinds::Target;
+pub use node::{JoinOptions, NodeCommand};
 pub use options::{DocumentOptions, ServerOptions};
 pub use patch::PatchOptions;
 pub use refusal::Refusal;
@@ -120,6 +123,9 @@ pub enum ConfigCommand {
     /// Tokens: create, list, revoke, look into
     #[command(subcommand)]
     Token(TokenCommand),
+    /// Nodes: bring one into the system
+    #[command(subcommand)]
+    Node(NodeCommand),
     /// Servers that you work with
     #[command(subcommand)]
     Context(ContextCommand),
@@ -151,6 +157,7 @@ pub async fn run(command: ConfigCommand, output: Output) -> Result<Exit, CliErro
         ConfigCommand::Audit(options) => fleet::audit(&options, output.format()?).await,
         ConfigCommand::Trim(options) => trim::run(&options, output.format()?).await,
         ConfigCommand::Token(command) => token::run(&command, output.format()?).await,
+        ConfigCommand::Node(command) => node::run(&command, output.format()?).await,
         ConfigCommand::Context(command) => context_command::run(&command, output.format()?),
     }
 }

@@ -58,6 +58,17 @@ pub struct CreateOptions {
     /// How long it lives, at most 365d
     #[arg(long, value_name = "DURATION", default_value = "24h", value_parser = parse_life)]
     pub expires: Duration,
+    /// Who signs it.
+    #[command(flatten)]
+    pub signing: SigningOptions,
+    /// Which server.
+    #[command(flatten)]
+    pub server: ServerOptions,
+}
+
+/// Who signs a token: the server, or a key of one's own.
+#[derive(Debug, Clone, Args)]
+pub struct SigningOptions {
     /// Sign with this key instead of asking a server
     #[arg(long, value_name = "FILE", requires = "alg", help_heading = "Without a server")]
     pub key_file: Option<PathBuf>,
@@ -83,9 +94,6 @@ pub struct CreateOptions {
         help_heading = "Without a server"
     )]
     pub audience: String,
-    /// Which server.
-    #[command(flatten)]
-    pub server: ServerOptions,
 }
 
 /// Options of `blaze token list`.
@@ -129,7 +137,7 @@ pub struct KeygenOptions {
     pub out: PathBuf,
 }
 
-fn parse_life(text: &str) -> Result<Duration, String> {
+pub(super) fn parse_life(text: &str) -> Result<Duration, String> {
     match parse_duration(text)? {
         life if (Duration::from_secs(1)..=LONGEST).contains(&life) => Ok(life),
         _ => Err("1s to 365d are allowed".to_owned()),
@@ -207,28 +215,62 @@ async fn create(options: &CreateOptions) -> Result<Value, CliError> {
             "a worker's token is for one layer: give --layer".to_owned(),
         ));
     }
-    let expires_in_s = options.expires.as_secs();
-    if let (Some(key_file), Some(algorithm)) = (&options.key_file, options.alg) {
+    let wanted = Wanted {
+        subject: &options.subject,
+        roles: &options.roles,
+        layer: options.layer.as_ref(),
+        expires: options.expires,
+    };
+    if let Some(signed) = options.signing.sign(&wanted)? {
+        return Ok(signed);
+    }
+    ask_for(&Client::of(&options.server)?, &wanted).await
+}
+
+/// What a token is to say.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Wanted<'a> {
+    pub(super) subject: &'a str,
+    pub(super) roles: &'a [String],
+    pub(super) layer: Option<&'a LayerName>,
+    pub(super) expires: Duration,
+}
+
+impl SigningOptions {
+    /// Signs it here, if there is a key; the answer has the members of `POST /tokens`.
+    ///
+    /// # Errors
+    /// As [`token_local::sign`].
+    pub(super) fn sign(&self, wanted: &Wanted<'_>) -> Result<Option<Value>, CliError> {
+        let (Some(key_file), Some(algorithm)) = (&self.key_file, self.alg) else {
+            return Ok(None);
+        };
         let token = LocalToken {
             key_file,
             algorithm,
-            key_id: options.key_id.as_deref(),
+            key_id: self.key_id.as_deref(),
             realm: Realm {
-                issuer: options.issuer.clone(),
-                audience: options.audience.clone(),
+                issuer: self.issuer.clone(),
+                audience: self.audience.clone(),
             },
-            subject: &options.subject,
-            roles: &options.roles,
-            layer: options.layer.as_ref().map(LayerName::as_str),
-            expires_in_s: i64::try_from(expires_in_s).unwrap_or(i64::MAX),
+            subject: wanted.subject,
+            roles: wanted.roles,
+            layer: wanted.layer.map(LayerName::as_str),
+            expires_in_s: i64::try_from(wanted.expires.as_secs()).unwrap_or(i64::MAX),
         };
-        return token_local::sign(&token, now_ms());
+        token_local::sign(&token, now_ms()).map(Some)
     }
+}
+
+/// Has the server sign a token.
+///
+/// # Errors
+/// As [`Client::send`], and [`CliError::Foreign`] for an answer without a token.
+pub(super) async fn ask_for(client: &Client, wanted: &Wanted<'_>) -> Result<Value, CliError> {
     let body = json!({
-        "subject": options.subject, "roles": options.roles, "layer": options.layer.as_ref().map(LayerName::as_str),
-        "expires_in_s": expires_in_s,
+        "subject": wanted.subject, "roles": wanted.roles, "layer": wanted.layer.map(LayerName::as_str),
+        "expires_in_s": wanted.expires.as_secs(),
     });
-    let client = Client::of(&options.server)?;
     let answer = client.send(&Call::post(format!("{BASE}/tokens"), &body)).await?.body;
     if answer.get("token").is_some_and(Value::is_string) {
         Ok(answer)

@@ -290,6 +290,20 @@ impl Board {
             .sum()
     }
 
+    /// Pictures that came to each consumer outside the publisher's layer, on average.
+    #[must_use]
+    pub fn pictures_elsewhere(&self) -> f64 {
+        let state = self.state.lock();
+        let is_elsewhere = |entry: &&ConsumerEntry| {
+            let publisher = state.publishers.get(entry.publisher);
+            publisher.is_some_and(|publisher| publisher.topic.large)
+                && entry.consumer.node.layer() != PUBLISHING_NODE.layer()
+        };
+        let received = state.consumers.iter().filter(is_elsewhere);
+        let received: Vec<u64> = received.map(|entry| entry.stats.counters().received).collect();
+        received.iter().sum::<u64>() as f64 / received.len().max(1) as f64
+    }
+
     /// Takes over routes and drops from the flows. What is not to be seen any more keeps its last value.
     pub fn set_view(&self, view: &FlowView) {
         let from = Spot::Node(PUBLISHING_NODE);

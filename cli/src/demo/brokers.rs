@@ -28,6 +28,8 @@ pub(super) struct NodeBrokers {
     pub(super) flow_layer: LayerBroker,
     /// What the layer broker puts before every name.
     pub(super) layer_prefix: String,
+    /// The node broker as a node file would have it.
+    pub(super) node_section: NodeBroker,
     services_node: Arc<dyn Broker>,
     services_layer: Arc<dyn Broker>,
 }
@@ -99,10 +101,10 @@ impl BrokerSource {
             epoch,
         };
         let fault = |error: blaze_brokers::OpenError| CliError::Failed(format!("{}: {error}", node.name()));
-        let (flow_node, services_node): (Arc<dyn Broker>, Arc<dyn Broker>) = match &self.servers {
+        let (node_section, flow_node, services_node): (_, Arc<dyn Broker>, Arc<dyn Broker>) = match &self.servers {
             None => {
                 let hub = MemoryHub::new(node.name());
-                (Arc::new(hub.broker()), Arc::new(hub.broker()))
+                (NodeBroker::Memory, Arc::new(hub.broker()), Arc::new(hub.broker()))
             }
             Some(servers) => {
                 let section = NodeBroker::Redis(RedisBroker {
@@ -112,10 +114,8 @@ impl BrokerSource {
                     password_file: None,
                     tls: None,
                 });
-                (
-                    open_node(&section, &role).map_err(fault)?,
-                    open_node(&section, &Role::Service).map_err(fault)?,
-                )
+                let (flow, services) = (open_node(&section, &role), open_node(&section, &Role::Service));
+                (section, flow.map_err(fault)?, services.map_err(fault)?)
             }
         };
         let kafka = self.servers.as_ref().and_then(|servers| match node {
@@ -152,6 +152,7 @@ impl BrokerSource {
             flow_node,
             flow_layer,
             layer_prefix,
+            node_section,
             services_node,
             services_layer,
         })

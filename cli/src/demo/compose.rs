@@ -7,40 +7,30 @@
 //! fog-1:   node broker ─ flow ─ fog layer broker   ───────┤
 //! cloud-1: node broker ─ flow ─ cloud layer broker ───────┘
 //! ```
+//!
+//! Where all of them run here, a main service of BlazeConfig and a worker on each node broker run beside them.
 
-use std::collections::HashMap;
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
-use blaze_domain::ServiceName;
-use blaze_flow::flow::settings::FlowSettings;
-use blaze_flow::flow::{Beginning, Epochs, FlowOptions, RunningFlow};
+use blaze_domain::Scope;
 use blaze_runtime::Supervisor;
-use blaze_runtime::config::Sources;
-use blaze_sdk::{
-    Advertise, Lease, PublishOptions, Publisher, Request, ServiceManager, ServiceOptions, SubscribeOptions,
-    Subscription,
-};
-use bytes::Bytes;
-use futures::future::join_all;
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::Mutex;
 
-use super::board::{Board, ConsumerCounts, ConsumerId};
-use super::brokers::{BrokerSource, NodeBrokers};
-use super::domain_id::{self, DEFAULT_DOMAIN, ReservedDomain};
-use super::options::{DemoNode, DemoOptions};
+use super::board::Board;
+use super::changes::{ChangePlan, SHORTEST};
+use super::configuration::{Configuration, Place};
+use super::nodes::{Nodes, start_nodes, wait_ready};
+use super::options::DemoOptions;
 use super::recording::{self, Recording};
 use super::report::{Report, Style};
-use super::roles::{Consumer, PUBLISHING_NODE, PlayedTopic, consumers, played_topics, scope_of};
-use super::session::{self, Script, Stage};
+use super::roles::{PUBLISHING_NODE, PlayedTopic, consumers, played_topics};
+use super::session;
+use super::stage::Script;
+use super::system::{EndableSystem, System};
+use crate::ends::Ends;
 use crate::exit::{CliError, Exit};
-use crate::node_file;
 use crate::output::Format;
-
-/// How long a node may take to be ready.
-const READY_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Runs the demo.
 ///
@@ -90,9 +80,22 @@ async fn prepare(options: &DemoOptions, supervisor: Supervisor, start: Instant) 
     let topics = played_topics(recordings.iter().map(Arc::as_ref));
     let names = options.nodes();
     let board = Arc::new(Board::new(topics.clone(), &names, start));
-    wait_ready(&nodes).await?;
+    let changes = plan(options, &nodes, &topics);
+    let (ready, configuration) = tokio::join!(wait_ready(&nodes), async {
+        match &changes {
+            Ok(_) => start_configuration(&nodes, &supervisor).await.map(Some),
+            Err(_) => Ok(None),
+        }
+    });
+    ready?;
+    let configuration = configuration?;
+    if let Some(configuration) = &configuration {
+        eprintln!("ready rest={}", configuration.rest());
+    }
     let system = System {
         nodes,
+        configuration,
+        analytics: parking_lot::Mutex::default(),
         topics: topics.clone(),
         board,
         services: Mutex::default(),
@@ -107,8 +110,40 @@ async fn prepare(options: &DemoOptions, supervisor: Supervisor, start: Instant) 
         recordings,
         topics,
         duration: options.duration,
+        changes,
     };
     Ok((system, script))
+}
+
+/// The changes of the configuration that the run shows, or why it shows none.
+fn plan(options: &DemoOptions, nodes: &Nodes, topics: &[PlayedTopic]) -> Result<ChangePlan, String> {
+    let Some(robot) = nodes.robot().filter(|_| options.is_complete()) else {
+        return Err("no change of the configuration is shown: that needs all nodes in one process".to_owned());
+    };
+    if options.duration < SHORTEST {
+        let shortest = SHORTEST.as_secs();
+        return Err(format!(
+            "no change of the configuration is shown: that needs --duration {shortest}s or more"
+        ));
+    }
+    Ok(ChangePlan {
+        limit_mbps: robot.limit_mbps,
+        with_pictures: topics.iter().any(|topic| topic.large),
+        limit_binds: options.record.is_empty() && options.set.is_empty(),
+    })
+}
+
+async fn start_configuration(nodes: &Nodes, supervisor: &Supervisor) -> Result<Configuration, CliError> {
+    let robot = nodes
+        .robot()
+        .ok_or_else(|| CliError::Failed(format!("{} does not run here", PUBLISHING_NODE.name())))?;
+    let places = nodes.running.iter().map(|running| Place {
+        node: running.node,
+        file: running.file.clone(),
+        broker_section: running.brokers.node_section.clone(),
+        broker: Arc::clone(running.brokers.of_services(Scope::Node)),
+    });
+    Configuration::start(places.collect(), &robot.flow, supervisor.child("configuration")).await
 }
 
 fn tell_skipped(recordings: &[Recording]) {
@@ -122,365 +157,6 @@ fn tell_skipped(recordings: &[Recording]) {
                 "blaze: {file}: {} messages cannot be played",
                 recording.unusable_messages
             );
-        }
-    }
-}
-
-/// A node that runs.
-struct RunningNode {
-    node: DemoNode,
-    brokers: NodeBrokers,
-    flow: RunningFlow,
-}
-
-struct Nodes {
-    running: Vec<RunningNode>,
-    /// Keeps other demos off the domain.
-    _domain: Option<ReservedDomain>,
-}
-
-async fn start_nodes(options: &DemoOptions, supervisor: &Supervisor) -> Result<Nodes, CliError> {
-    let listen = match options.listen {
-        Some(IpAddr::V4(address)) => address,
-        Some(IpAddr::V6(_)) | None => Ipv4Addr::LOCALHOST,
-    };
-    if !domain_id::is_local(listen) {
-        return Err(CliError::Usage(format!(
-            "--listen {listen}: no interface of this host has this address."
-        )));
-    }
-    let reserved = if options.is_complete() {
-        domain_id::reserve(listen)
-    } else {
-        None
-    };
-    let domain = match &reserved {
-        Some(reserved) => reserved.domain,
-        None if options.is_complete() => {
-            return Err(CliError::Failed(
-                "every DDS domain from 20 to 100 is in use on this host".to_owned(),
-            ));
-        }
-        None => DEFAULT_DOMAIN,
-    };
-    // Settings of all nodes first: a faulty --set is told before anything runs.
-    let settings: Vec<(DemoNode, FlowSettings)> = options
-        .nodes()
-        .into_iter()
-        .map(|node| Ok((node, settings_of(node, options, listen, domain)?)))
-        .collect::<Result<_, CliError>>()?;
-    let mut source = BrokerSource::new(options.brokers)?;
-    let mut running = Vec::new();
-    for (node, settings) in settings {
-        let epochs = Epochs::begin(&settings.me, None)
-            .map_err(|error| CliError::Failed(format!("{} has no epoch: {error}", node.name())))?;
-        let brokers = source.of(node, &settings.me, epochs.first())?;
-        let beginning = Beginning {
-            epochs,
-            layer_prefix: brokers.layer_prefix.clone(),
-        };
-        let flow_options = FlowOptions {
-            settings,
-            node: Some(Arc::clone(&brokers.flow_node)),
-            layer: Some(brokers.flow_layer.clone()),
-            state_dir: None,
-        };
-        let flow = blaze_flow::flow::start_with(flow_options, beginning, supervisor.child(node.name()))
-            .await
-            .map_err(|error| CliError::Failed(format!("{} does not start: {error:#}", node.name())))?;
-        running.push(RunningNode { node, brokers, flow });
-    }
-    Ok(Nodes {
-        running,
-        _domain: reserved,
-    })
-}
-
-/// What a node of the demo has in its node file, with the user's `--set` on top.
-fn settings_of(node: DemoNode, options: &DemoOptions, listen: Ipv4Addr, domain: u16) -> Result<FlowSettings, CliError> {
-    let peers: Vec<String> = options.peer.iter().map(|peer| format!("\"{peer}\"")).collect();
-    let (layer, name, peers) = (node.layer(), node.name(), peers.join(", "));
-    let own = [
-        ("layer", format!("{{ name: {layer}, kind: {layer} }}")),
-        ("node", format!("{{ name: {name} }}")),
-        ("brokers.node", "{ memory: {} }".to_owned()),
-        ("brokers.layer", "{ memory: {} }".to_owned()),
-        (
-            "brokers.inter",
-            format!("{{ dds: {{ domain: {domain}, listen: \"{listen}\", peers: [{peers}] }} }}"),
-        ),
-        ("admin.flow", "\"127.0.0.1:0\"".to_owned()),
-    ];
-    let sources = Sources {
-        overrides: own
-            .into_iter()
-            .map(|(key, value)| (key.to_owned(), value))
-            .chain(
-                options
-                    .set
-                    .iter()
-                    .map(|setting| (setting.key.clone(), setting.value.clone())),
-            )
-            .collect(),
-        file_may_be_absent: true,
-        ..Sources::default()
-    };
-    let file = node_file::read(&sources).map_err(|faults| CliError::Usage(format!("--set: {faults}")))?;
-    FlowSettings::try_from(&file).map_err(|error| CliError::Usage(format!("--set: {error}")))
-}
-
-async fn wait_ready(nodes: &Nodes) -> Result<(), CliError> {
-    for running in &nodes.running {
-        let name = running.node.name();
-        tokio::time::timeout(READY_TIMEOUT, running.flow.ready())
-            .await
-            .map_err(|_| {
-                let waited = READY_TIMEOUT.as_secs();
-                CliError::Failed(format!(
-                    "{name} was not ready within {waited} s; see http://{}/readyz",
-                    running.flow.admin()
-                ))
-            })?;
-        eprintln!("ready node={name} admin={}", running.flow.admin());
-    }
-    Ok(())
-}
-
-/// All nodes of this process and the services on them.
-struct System {
-    nodes: Nodes,
-    topics: Vec<PlayedTopic>,
-    board: Arc<Board>,
-    services: Mutex<HashMap<(&'static str, DemoNode), Arc<ServiceManager>>>,
-    /// In the order of `topics`; none where robot-1 runs elsewhere.
-    publishers: Vec<Publisher>,
-    _advertised: Vec<Lease>,
-    listeners: Mutex<HashMap<ConsumerId, Listener>>,
-}
-
-struct Listener {
-    subscription: Subscription,
-    lease: Lease,
-}
-
-impl System {
-    /// The service of that name on that node, started with its first topic.
-    async fn service(&self, name: &'static str, node: DemoNode) -> Result<Arc<ServiceManager>, String> {
-        let mut services = self.services.lock().await;
-        if let Some(service) = services.get(&(name, node)) {
-            return Ok(Arc::clone(service));
-        }
-        let running = self.nodes.running.iter().find(|running| running.node == node);
-        let running = running.ok_or_else(|| format!("{} does not run here", node.name()))?;
-        let scope = scope_of(name, node);
-        let broker = Arc::clone(running.brokers.of_services(scope));
-        let id = running.flow.id();
-        let service_name: ServiceName = name.parse().map_err(|error| format!("{name} {error}"))?;
-        let options = ServiceOptions {
-            pool_threads: 2,
-            ..ServiceOptions::new(id.layer.clone(), service_name, broker, scope)
-        };
-        let service = ServiceManager::start(options.on_node(id.node.clone()))
-            .await
-            .map_err(|error| error.to_string())?;
-        let service = Arc::new(service);
-        services.insert((name, node), Arc::clone(&service));
-        Ok(service)
-    }
-
-    async fn with_publishers(mut self) -> Result<Self, CliError> {
-        if !self.nodes.running.iter().any(|running| running.node == PUBLISHING_NODE) {
-            return Ok(self);
-        }
-        for topic in self.topics.clone() {
-            let (publisher, lease) = self.advertise(&topic).await.map_err(|fault| {
-                CliError::Failed(format!("{} cannot publish {}: {fault}", topic.service, topic.name))
-            })?;
-            self.publishers.push(publisher);
-            self._advertised.push(lease);
-        }
-        Ok(self)
-    }
-
-    async fn advertise(&self, topic: &PlayedTopic) -> Result<(Publisher, Lease), String> {
-        let service = self.service(topic.service, PUBLISHING_NODE).await?;
-        let publish = PublishOptions {
-            encoding: topic.encoding.clone(),
-            reliability: topic.reliability(),
-            lifespan: topic.lifespan(),
-            large: topic.large,
-            ..PublishOptions::default()
-        };
-        let publisher = service
-            .broker()
-            .publisher(&topic.name, &publish)
-            .map_err(|error| error.to_string())?;
-        let advertise = Advertise {
-            rate_hz: Some(topic.rate_hz),
-            max_bytes: Some(topic.max_bytes as u64),
-            encoding: topic.encoding.clone(),
-            type_name: topic.type_name.clone(),
-            reliability: topic.reliability(),
-            lifespan: topic.lifespan(),
-            ..Advertise::new(topic.name.clone())
-        };
-        let lease = service
-            .flow()
-            .advertise(advertise)
-            .await
-            .map_err(|error| error.to_string())?;
-        Ok((publisher, lease))
-    }
-
-    async fn shutdown(self) {
-        self.listeners.lock().await.clear();
-        drop(self.publishers);
-        drop(self._advertised);
-        let services = std::mem::take(&mut *self.services.lock().await);
-        join_all(
-            services
-                .into_values()
-                .filter_map(Arc::into_inner)
-                .map(ServiceManager::shutdown),
-        )
-        .await;
-        join_all(self.nodes.running.into_iter().map(|running| async {
-            running.flow.shutdown().await;
-            running.brokers.close().await;
-        }))
-        .await;
-    }
-}
-
-/// A system, and what may end it before its time.
-struct EndableSystem {
-    system: System,
-    ends: Ends,
-}
-
-impl Stage for EndableSystem {
-    fn admin_ports(&self) -> Vec<(DemoNode, SocketAddr)> {
-        let running = self.system.nodes.running.iter();
-        running.map(|running| (running.node, running.flow.admin())).collect()
-    }
-
-    async fn listen(&self, consumer: &Consumer, id: ConsumerId) -> Result<(), String> {
-        let system = &self.system;
-        let topic = system
-            .topics
-            .iter()
-            .find(|topic| topic.name == consumer.topic)
-            .ok_or("nobody plays it")?;
-        let service = system.service(consumer.service, consumer.node).await?;
-        let board = Arc::clone(&system.board);
-        let options = SubscribeOptions {
-            large: topic.large,
-            ..SubscribeOptions::default()
-        };
-        let subscription = service
-            .broker()
-            .subscribe(&topic.name, options, move |message| {
-                if let Some(frame) = message.frame() {
-                    board.frame_arrived(id, frame, unix_ns(), Instant::now());
-                }
-            })
-            .await
-            .map_err(|error| error.to_string())?;
-        let request = Request {
-            type_name: topic.type_name.clone(),
-            reliability: topic.reliability(),
-            lifespan: topic.lifespan(),
-            ..Request::new(topic.name.clone())
-        };
-        let lease = service
-            .flow()
-            .request(request)
-            .await
-            .map_err(|error| error.to_string())?;
-        system
-            .listeners
-            .lock()
-            .await
-            .insert(id, Listener { subscription, lease });
-        Ok(())
-    }
-
-    async fn stop_listening(&self, id: ConsumerId) -> Result<(), String> {
-        let Some(listener) = self.system.listeners.lock().await.remove(&id) else {
-            return Ok(());
-        };
-        let withdrawn = listener.lease.withdraw().await;
-        self.system
-            .board
-            .set_consumer_counts(id, counts_of(&listener.subscription));
-        listener.subscription.close().await;
-        withdrawn.map_err(|error| error.to_string())
-    }
-
-    fn publisher(&self) -> Option<Box<dyn FnMut(usize, Bytes) + Send>> {
-        let publishers = self.system.publishers.clone();
-        if publishers.is_empty() {
-            return None;
-        }
-        Some(Box::new(move |topic, payload| {
-            if let Some(publisher) = publishers.get(topic) {
-                publisher.publish(payload);
-            }
-        }))
-    }
-
-    async fn look(&self) {
-        for (id, listener) in self.system.listeners.lock().await.iter() {
-            self.system
-                .board
-                .set_consumer_counts(*id, counts_of(&listener.subscription));
-        }
-    }
-
-    async fn interrupted(&self) -> Option<String> {
-        self.ends.wait().await
-    }
-}
-
-fn counts_of(subscription: &Subscription) -> ConsumerCounts {
-    let stats = subscription.stats();
-    ConsumerCounts {
-        queue_full: stats.queue_dropped,
-        lifespan: stats.expired,
-        duplicated: stats.duplicated,
-    }
-}
-
-fn unix_ns() -> u64 {
-    let since_epoch = SystemTime::now()
-        .duration_since(SystemTime::UNIX_EPOCH)
-        .unwrap_or_default();
-    u64::try_from(since_epoch.as_nanos()).unwrap_or(u64::MAX)
-}
-
-/// What ends the demo before its time: a signal, or a part of it that failed.
-struct Ends {
-    signals: Mutex<[tokio::signal::unix::Signal; 2]>,
-    supervisor: Supervisor,
-}
-
-impl Ends {
-    fn new(supervisor: Supervisor) -> Result<Self, CliError> {
-        let listen = |kind| signal(kind).map_err(|error| CliError::Failed(format!("no signal handlers: {error}")));
-        Ok(Self {
-            signals: Mutex::new([listen(SignalKind::interrupt())?, listen(SignalKind::terminate())?]),
-            supervisor,
-        })
-    }
-
-    /// Waits for the end; a sentence if it was no signal.
-    async fn wait(&self) -> Option<String> {
-        let mut signals = self.signals.lock().await;
-        let [interrupt, terminate] = &mut *signals;
-        tokio::select! {
-            _ = interrupt.recv() => None,
-            _ = terminate.recv() => None,
-            reason = self.supervisor.failed() => Some(reason),
         }
     }
 }

@@ -124,7 +124,7 @@ impl FromStr for Setting {
         }
         if matches!(key.split('.').next(), Some("layer" | "node")) {
             return Err(format!(
-                "{key}: the demo gives its nodes their names; choose some of them with --only"
+                "{key}: nodes have their names otherwise; the demo chooses among its own with --only, `blaze dev` has --layer and --node"
             ));
         }
         yaml_serde::from_str::<serde_json::Value>(value).map_err(|error| format!("the value is no YAML: {error}"))?;

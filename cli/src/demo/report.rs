@@ -266,6 +266,9 @@ fn summary_text(summary: &Summary, width: Option<u16>) -> String {
             moved.service, moved.from, moved.to, moved.gap_ms
         ));
     }
+    for change in &summary.changes {
+        text.push_str(&format!("{}.\n  {}.\n", change.asked(), change.effect_text()));
+    }
     text.push_str(&verdict_text(summary));
     text
 }

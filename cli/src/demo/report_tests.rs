@@ -131,6 +131,11 @@ fn json_lines_are_those_of_the_contract() {
     assert_eq!(summary["duration_s"], 30.0);
     assert_eq!(summary["first_message_s"]["cloud"], 1.3);
     assert_eq!(summary["moves"][0]["gap_ms"], 0.0);
+    let changes = summary["changes"].as_array().unwrap();
+    assert_eq!(
+        (&changes[0]["callback_ms"], &changes[1]["after_per_s"]),
+        (&Value::from(2.5), &Value::from(3.0))
+    );
     assert_eq!(summary["topics"].as_array().unwrap().len(), 9);
     assert!(text(&report.err).contains("not for programs"));
 }
@@ -140,6 +145,8 @@ fn the_summary_says_what_was_wrong() {
     let mut outcome = good_outcome();
     outcome.topics.truncate(1);
     outcome.topics[0].lost = 2;
+    outcome.changes.made.truncate(1);
+    outcome.plan = None;
     let mut report = report(Style::Lines);
     report.summary(&judge(outcome)).unwrap();
     assert_eq!(
@@ -150,6 +157,8 @@ fn the_summary_says_what_was_wrong() {
          \n\
          First message after the start: cloud 1.3 s, edge 0.4 s, fog 1.2 s.\n\
          analytics moved from fog/fog-1 to cloud/cloud-1: 0 ms without a message.\n\
+         PUT service/analytics (window 50 → 10): 2xx after 1.2 ms, the callback of analytics on fog/fog-1 after 2.5 ms.\n\
+         \x20 analytics: 1.0 → 5.0 results a second.\n\
          NOT OK:\n\
          \x20 - imu/data to edge/edge-2 (monitor): 2 messages were lost\n\
          `blaze why TOPIC --flow HOST:PORT` tells while the demo runs; its nodes name their ports at the start.\n"

@@ -3,22 +3,22 @@
 //! What the flows and services are is the business of a [`Stage`]; this is the same for any.
 
 use std::collections::BTreeSet;
-use std::future::Future;
 use std::io::Write;
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use blaze_domain::TopicName;
+use parking_lot::Mutex;
+use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval_at, sleep, sleep_until};
 
 use super::board::{Board, ConsumerId};
+use super::changes::{Changes, Changing};
 use super::flows::FlowView;
-use super::options::DemoNode;
 use super::player::{Played, Player, PlayerReport};
-use super::recording::Recording;
 use super::report::Report;
-use super::roles::{Consumer, MOVES_FROM, MOVES_TO, MOVING_SERVICE, PlayedTopic};
+use super::roles::{Consumer, MOVES_FROM, MOVES_TO, MOVING_SERVICE};
+use super::stage::{Script, Stage};
 use super::verdict::{Outcome, Summary, judge};
 use crate::exit::CliError;
 
@@ -31,42 +31,8 @@ const DRAIN_QUIET: Duration = Duration::from_millis(300);
 /// How long bridges may take to re-form after the move.
 const REFORM_LIMIT: Duration = Duration::from_secs(2);
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
-
-/// The flows and services that a session runs on.
-pub trait Stage {
-    /// Nodes of this process and their admin ports.
-    fn admin_ports(&self) -> Vec<(DemoNode, SocketAddr)>;
-
-    /// Starts a service that listens: what it receives goes to the board under `id`.
-    fn listen(&self, consumer: &Consumer, id: ConsumerId) -> impl Future<Output = Result<(), String>>;
-
-    /// Ends a service that listens.
-    fn stop_listening(&self, id: ConsumerId) -> impl Future<Output = Result<(), String>>;
-
-    /// Publishes; called on the player's thread. Topics are counted over all recordings, see
-    /// [`played_topics`](super::roles::played_topics). `None`: the publishers are in another process.
-    fn publisher(&self) -> Option<Box<dyn FnMut(usize, bytes::Bytes) + Send>>;
-
-    /// Brings to the board what listeners dropped; called each second and at the end.
-    fn look(&self) -> impl Future<Output = ()>;
-
-    /// Completes when the user wants an end, or a flow ended by itself (then with a sentence).
-    fn interrupted(&self) -> impl Future<Output = Option<String>>;
-}
-
-/// What a session plays, and for how long.
-pub struct Script {
-    /// Nodes of this process.
-    pub nodes: Vec<DemoNode>,
-    /// What is played.
-    pub recordings: Vec<Arc<Recording>>,
-    /// Its topics.
-    pub topics: Vec<PlayedTopic>,
-    /// Who listens here.
-    pub consumers: Vec<Consumer>,
-    /// How long.
-    pub duration: Duration,
-}
+/// Sentences about changes that wait to be printed.
+const EVENTS: usize = 16;
 
 /// Runs the script and prints it. Returns what was found at the end.
 ///
@@ -84,6 +50,7 @@ pub async fn run<S: Stage, Out: Write, Err: Write>(
         start: Instant::now(),
         faults: Vec::new(),
         moving: Moving::No,
+        changes: Arc::default(),
     };
     for consumer in script.consumers.iter().filter(|consumer| !consumer.later) {
         let id = session.listen(consumer).await;
@@ -103,7 +70,10 @@ pub async fn run<S: Stage, Out: Write, Err: Write>(
     session.look().await;
     let interrupted = interruption.is_some();
     session.faults.extend(interruption.flatten());
+    let changes = std::mem::take(&mut *session.changes.lock());
     let summary = judge(Outcome {
+        plan: script.changes.ok(),
+        changes,
         nodes: script.nodes,
         duration: played,
         interrupted,
@@ -122,6 +92,7 @@ struct Session<'a, S> {
     start: Instant,
     faults: Vec<String>,
     moving: Moving,
+    changes: Arc<Mutex<Changes>>,
 }
 
 /// The consumer that goes to another node half way.
@@ -190,11 +161,31 @@ impl<S: Stage> Session<'_, S> {
         let end = sleep_until(start + script.duration);
         let (board, stage) = (self.board, self.stage);
         let interrupted = stage.interrupted();
-        tokio::pin!(half, end, interrupted);
+        let (events, mut told) = mpsc::channel(EVENTS);
+        let outcome = Arc::clone(&self.changes);
+        let changing = script.changes.as_ref().ok().map(|plan| Changing {
+            stage,
+            board,
+            start: self.start,
+            duration: script.duration,
+            plan: *plan,
+            events,
+            outcome: &outcome,
+        });
+        let changing = async {
+            if let Some(changing) = changing {
+                changing.run().await;
+            }
+        };
+        tokio::pin!(half, end, interrupted, changing);
+        if let Err(why) = &script.changes {
+            report.event(Duration::ZERO, why)?;
+        }
         // What `recent` counts begins with the first message.
         let _ = board.recent(self.start);
         let mut last_tick = self.start;
         let mut half_passed = false;
+        let mut changed = false;
         loop {
             tokio::select! {
                 () = &mut end => {
@@ -213,6 +204,8 @@ impl<S: Stage> Session<'_, S> {
                     half_passed = true;
                     self.begin_move(script, report).await?;
                 }
+                () = &mut changing, if !changed => changed = true,
+                Some(text) = told.recv() => report.event(self.start.elapsed(), &text)?,
                 () = sleep(LOOK_PERIOD), if self.is_joining() => {
                     if self.has_joined() {
                         self.finish_move(report).await?;

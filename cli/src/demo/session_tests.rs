@@ -1,10 +1,13 @@
 use std::collections::HashMap;
+use std::net::SocketAddr;
 
 use blaze_domain::WriterId;
 use parking_lot::Mutex;
 
 use super::*;
-use crate::demo::recording::load_built_in;
+use crate::demo::changes::{ChangePlan, Taken, Wanted};
+use crate::demo::options::DemoNode;
+use crate::demo::recording::{Recording, load_built_in};
 use crate::demo::report::Style;
 use crate::demo::roles::{consumers, played_topics};
 use crate::demo::stats::Arrival;
@@ -16,6 +19,7 @@ struct Wire {
     topics: Vec<TopicName>,
     /// Every so many messages of the first topic one is left out.
     lose_every: u64,
+    changed: Mutex<Vec<Wanted>>,
 }
 
 impl Stage for Wire {
@@ -64,6 +68,28 @@ impl Stage for Wire {
         }))
     }
 
+    async fn change(&self, wanted: &Wanted) -> Result<Taken, String> {
+        let revision = match wanted {
+            Wanted::Window(_) => 7,
+            Wanted::Limit(_) => 8,
+        };
+        self.changed.lock().push(*wanted);
+        Ok(Taken {
+            revision,
+            accepted: Duration::from_millis(2),
+            called_back: Duration::from_millis(3),
+        })
+    }
+
+    /// Ten times as many after the change of the service.
+    fn results(&self) -> u64 {
+        let received = self.board.received_by_all();
+        match self.changed.lock().is_empty() {
+            true => received,
+            false => received * 10,
+        }
+    }
+
     async fn look(&self) {}
 
     async fn interrupted(&self) -> Option<String> {
@@ -72,6 +98,15 @@ impl Stage for Wire {
 }
 
 async fn run_demo(duration: Duration, lose_every: u64) -> (Summary, String) {
+    let (summary, printed, _) = run_with(duration, lose_every, Err("no changes are shown".to_owned())).await;
+    (summary, printed)
+}
+
+async fn run_with(
+    duration: Duration,
+    lose_every: u64,
+    changes: Result<ChangePlan, String>,
+) -> (Summary, String, Vec<Wanted>) {
     let recordings: Vec<Arc<Recording>> = load_built_in().unwrap().into_iter().map(Arc::new).collect();
     let topics = played_topics(recordings.iter().map(Arc::as_ref));
     let board = Arc::new(Board::new(topics.clone(), &DemoNode::ALL, Instant::now()));
@@ -80,6 +115,7 @@ async fn run_demo(duration: Duration, lose_every: u64) -> (Summary, String) {
         listening: Arc::default(),
         topics: topics.iter().map(|topic| topic.name.clone()).collect(),
         lose_every,
+        changed: Mutex::default(),
     };
     let script = Script {
         nodes: DemoNode::ALL.to_vec(),
@@ -87,11 +123,44 @@ async fn run_demo(duration: Duration, lose_every: u64) -> (Summary, String) {
         recordings,
         topics,
         duration,
+        changes,
     };
-    let mut out = Vec::new();
-    let mut report = Report::new(Style::Json, &mut out, std::io::sink());
+    let (mut out, mut err) = (Vec::new(), Vec::new());
+    let mut report = Report::new(Style::Json, &mut out, &mut err);
     let summary = run(&wire, &board, script, &mut report).await.unwrap();
-    (summary, String::from_utf8(out).unwrap())
+    out.extend(err);
+    (summary, String::from_utf8(out).unwrap(), wire.changed.into_inner())
+}
+
+#[tokio::test]
+async fn changes_come_at_their_times_and_what_they_do_is_measured() {
+    let plan = ChangePlan {
+        limit_mbps: 160.0,
+        with_pictures: true,
+        // The wire has no limit.
+        limit_binds: false,
+    };
+    let (summary, printed, changed) = run_with(Duration::from_secs(8), u64::MAX, Ok(plan)).await;
+    assert!(summary.ok, "{:?}", summary.problems);
+    assert_eq!(
+        changed,
+        [Wanted::Window(10), Wanted::Limit(Some(40.0)), Wanted::Limit(None)]
+    );
+    let [service, link] = &summary.changes[..] else {
+        panic!("{:?}", summary.changes);
+    };
+    assert!(service.after_per_s > 5.0 * service.before_per_s, "{service:?}");
+    assert_eq!(
+        (service.revision, service.accepted_ms, service.callback_ms),
+        (7, 2.0, 3.0)
+    );
+    assert!(link.before_per_s > 20.0 && link.after_per_s > 20.0, "{link:?}");
+    for part in [
+        "PUT service/analytics (window 50 → 10): 2xx after 2.0 ms",
+        "160 Mbit/s again after 3.0 ms",
+    ] {
+        assert!(printed.contains(part), "{part}: {printed}");
+    }
 }
 
 #[tokio::test]
@@ -112,7 +181,7 @@ async fn a_perfect_wire_is_ok() {
     assert_eq!(summary.moves[0].gap_ms, 0.0);
     let rows = printed.lines().filter(|line| line.contains("\"kind\":\"row\"")).count();
     assert!(rows >= 20, "{rows} rows of 10 consumers in 2.5 s");
-    assert!(printed.lines().last().unwrap().contains("\"kind\":\"summary\""));
+    assert!(printed.contains("\"kind\":\"summary\"") && printed.contains("no changes are shown"));
 }
 
 #[tokio::test]

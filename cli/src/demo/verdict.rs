@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde::Serialize;
 
 use super::board::{Move, TopicRow};
+use super::changes::{Change, ChangePlan, Changes, PICTURES};
 use super::options::DemoNode;
 use super::roles::{MOVES_FROM, MOVES_TO, PUBLISHING_NODE};
 
@@ -25,6 +26,8 @@ pub struct Summary {
     pub first_message_s: BTreeMap<&'static str, f64>,
     /// Consumers that went from one node to another.
     pub moves: Vec<Move>,
+    /// Changes of the configuration that were made, and what they did.
+    pub changes: Vec<Change>,
     /// Each topic on its way to each consumer.
     pub topics: Vec<TopicRow>,
     /// What was not as it should be, for people.
@@ -48,6 +51,10 @@ pub struct Outcome {
     pub moved: Option<Move>,
     /// As on the board.
     pub topics: Vec<TopicRow>,
+    /// Which changes of the configuration were to be made.
+    pub plan: Option<ChangePlan>,
+    /// Which were.
+    pub changes: Changes,
 }
 
 /// Judges the outcome.
@@ -78,13 +85,45 @@ pub fn judge(outcome: Outcome) -> Summary {
             "the consumer did not move from fog to cloud".to_owned()
         });
     }
+    if let Some(plan) = &outcome.plan {
+        judge_changes(plan, &outcome.changes, outcome.interrupted, &mut problems);
+    }
     Summary {
         ok: problems.is_empty(),
         duration_s: (outcome.duration.as_secs_f64() * 1_000.0).round() / 1_000.0,
         first_message_s: outcome.first_message_s,
         moves: outcome.moved.into_iter().collect(),
+        changes: outcome.changes.made,
         topics: outcome.topics,
         problems,
+    }
+}
+
+/// Every change of the plan reached whom it was for, and did what it is for.
+fn judge_changes(plan: &ChangePlan, changes: &Changes, interrupted: bool, problems: &mut Vec<String>) {
+    problems.extend(changes.problems.iter().cloned());
+    let expected = 1 + usize::from(plan.with_pictures);
+    let known = changes.made.len() + changes.problems.len();
+    if known < expected {
+        problems.push(if interrupted {
+            "it was stopped before every change of the configuration".to_owned()
+        } else {
+            format!("{known} of {expected} changes of the configuration were made in time")
+        });
+    }
+    for change in &changes.made {
+        let (before, after) = (change.before_per_s, change.after_per_s);
+        // With more of a recording's own pictures than this link takes, a narrower one lets fewer through.
+        let is_wrong = match change.effect {
+            PICTURES => plan.limit_binds && (after >= before || after == 0.0),
+            _ => after <= before,
+        };
+        if is_wrong {
+            problems.push(format!(
+                "{} of {} did not do what it should: {before:.1} → {after:.1} {} a second",
+                change.setting, change.service, change.effect
+            ));
+        }
     }
 }
 

@@ -53,6 +53,33 @@ pub(in crate::demo) fn good_outcome() -> Outcome {
             gap_ms: 0.0,
         }),
         topics,
+        plan: Some(ChangePlan {
+            limit_mbps: 160.0,
+            with_pictures: true,
+            limit_binds: true,
+        }),
+        changes: Changes {
+            made: vec![good_change("results", 1.0, 5.0), good_change(PICTURES, 12.0, 3.0)],
+            problems: Vec::new(),
+        },
+    }
+}
+
+/// A change that did what it should.
+fn good_change(effect: &'static str, before_per_s: f64, after_per_s: f64) -> Change {
+    Change {
+        document: "service/analytics".to_owned(),
+        setting: "window",
+        from: 50.0,
+        to: 10.0,
+        at: "fog/fog-1".to_owned(),
+        service: "analytics",
+        revision: 9,
+        accepted_ms: 1.25,
+        callback_ms: 2.5,
+        effect,
+        before_per_s,
+        after_per_s,
     }
 }
 
@@ -64,8 +91,8 @@ fn a_good_run_is_ok() {
 
 #[test]
 fn each_fault_is_found() {
-    type Change = fn(&mut Outcome);
-    let cases: [(Change, &str); 12] = [
+    type Fault = fn(&mut Outcome);
+    let cases: [(Fault, &str); 16] = [
         (
             |outcome| outcome.topics[0].lost = 1,
             "imu/data to edge/edge-2 (monitor): 1 messages were lost",
@@ -102,6 +129,25 @@ fn each_fault_is_found() {
             "it was stopped before",
         ),
         (|outcome| outcome.faults.push("a flow ended".to_owned()), "a flow ended"),
+        (
+            |outcome| outcome.changes.made.truncate(1),
+            "1 of 2 changes of the configuration were made in time",
+        ),
+        (
+            |outcome| outcome.changes.made[0].after_per_s = 1.0,
+            "window of analytics did not do what it should: 1.0 → 1.0 results a second",
+        ),
+        (
+            |outcome| outcome.changes.made[1].after_per_s = 12.5,
+            "12.0 → 12.5 pictures a second",
+        ),
+        (
+            |outcome| {
+                outcome.changes.made.truncate(1);
+                outcome.changes.problems.push("it did not come".to_owned());
+            },
+            "it did not come",
+        ),
     ];
     for (change, expected) in cases {
         let mut outcome = good_outcome();
@@ -136,6 +182,8 @@ fn a_part_of_the_demo_answers_for_itself_alone() {
     outcome.topics[0].sent = None;
     outcome.topics[0].silent = Some(Duration::from_secs(9));
     outcome.first_message_s = BTreeMap::from([("cloud", 40.0)]);
+    outcome.plan = None;
+    outcome.changes = Changes::default();
     assert!(
         judge(outcome).ok,
         "when the others start, and why they drop, is not known here"

@@ -138,6 +138,7 @@ impl VersionRow {
     }
 
     /// The document as it is from this change on.
+    #[cfg(feature = "mongodb")]
     pub(crate) fn into_current(self) -> DocumentRow {
         DocumentRow {
             key: self.key,

@@ -65,6 +65,7 @@ pub enum Action {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum StoreKind {
     Sqlite,
+    #[cfg_attr(not(feature = "mongodb"), expect(dead_code, reason = "its store is not built"))]
     MongoDb,
 }
 

@@ -133,6 +133,7 @@ pub(crate) fn now() -> Timestamp {
 }
 
 /// Sends a piece of an export.
+#[cfg(feature = "mongodb")]
 pub(crate) async fn send(pieces: &mpsc::Sender<Piece>, piece: Piece) -> Result<(), StoreError> {
     pieces.send(piece).await.map_err(|_| gone())
 }

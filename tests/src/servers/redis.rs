@@ -70,6 +70,15 @@ pub struct RedisServer {
 }
 
 impl RedisServer {
+    /// The folder with the program that this starts, for who starts one by itself.
+    ///
+    /// # Errors
+    /// When it is not installed.
+    pub fn program_folder(kind: RedisKind) -> anyhow::Result<PathBuf> {
+        let program = kind.program()?;
+        Ok(program.parent().map(Path::to_owned).unwrap_or_default())
+    }
+
     /// Starts a server and waits until it answers.
     ///
     /// # Errors

@@ -50,6 +50,7 @@ fn number(value: &Value) -> f64 {
 
 #[test]
 fn recorded_data_finds_its_way_from_the_edge_to_the_cloud() {
+    // Ten seconds are the shortest with changes of the configuration.
     let seconds = if blaze_tests::long() { "30s" } else { "12s" };
     let run = demo(&["--duration", seconds]);
     assert_eq!(run.code, Some(0), "{}", run.tail);
@@ -96,7 +97,40 @@ fn recorded_data_finds_its_way_from_the_edge_to_the_cloud() {
         (&moved["from"], &moved["to"]),
         (&Value::from("fog/fog-1"), &Value::from("cloud/cloud-1"))
     );
+    let changes = run.summary["changes"].as_array().unwrap();
+    let of = |document: &str| changes.iter().find(|change| change["document"] == document).unwrap();
+    let (service, link) = (of("service/analytics"), of("node/robot-1"));
+    assert_eq!(
+        (&service["at"], &link["at"]),
+        (&Value::from("fog/fog-1"), &Value::from("edge/robot-1"))
+    );
+    for change in [service, link] {
+        assert!(
+            number(&change["callback_ms"]) < 1_000.0,
+            "a change comes within a second: {change}"
+        );
+    }
+    assert!(
+        number(&service["after_per_s"]) > 2.0 * number(&service["before_per_s"]),
+        "{service}"
+    );
+    assert!(number(&link["after_per_s"]) < number(&link["before_per_s"]), "{link}");
     println!("{}", run.summary);
+}
+
+#[test]
+fn a_part_of_the_nodes_and_a_short_run_change_nothing_and_say_so() {
+    for (arguments, why) in [
+        (
+            &["--only", "robot-1", "--duration", "1s"][..],
+            "all nodes in one process",
+        ),
+        (&["--duration", "2s"], "--duration 10s"),
+    ] {
+        let run = demo(arguments);
+        assert_eq!(run.summary["changes"], serde_json::json!([]), "{}", run.summary);
+        assert!(run.tail.contains(why), "{why}: {}", run.tail);
+    }
 }
 
 /// Another recording: text and numbers as ROS 2 CDR, two topics, LZ4 chunks.

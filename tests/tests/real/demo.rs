@@ -45,6 +45,14 @@ fn the_demo_runs_on_redis_and_kafka_with_the_same_verdict() -> anyhow::Result<()
         serde_json::json!(["node:redis", "inter:dds", "layer:kafka"]),
         "{to_cloud}"
     );
+    // Over a worker on Redis.
+    for document in ["service/analytics", "node/robot-1"] {
+        let mut changes = summary["changes"].as_array().into_iter().flatten();
+        assert!(
+            changes.any(|change| change["document"] == document),
+            "{document}: {summary}"
+        );
+    }
     for row in topics.iter().filter(|row| row["topic"] != "camera/image_raw") {
         for count in ["lost", "duplicated", "reordered"] {
             assert_eq!(row[count], 0, "{row}");

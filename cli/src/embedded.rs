@@ -1,0 +1,143 @@
+//! The programs of BlazeConfig within this process: a main service without tokens, and workers on the brokers of its nodes.
+//!
+//! ```text
+//! node file ─► main service: REST, gRPC on loopback ◄── worker (one per node) ─► its broker ─► services
+//!                  ▲
+//!                  └── Admin: the same REST that everybody has
+//! ```
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use blaze_brokers::Broker;
+use blaze_brokers::redis::RedisKeys;
+use blaze_config::process::Setup;
+use blaze_config::running::{Addresses, RunningMain};
+use blaze_domain::node_file::{ControlPlaneSection, NodeFile};
+use blaze_runtime::{Readiness, Supervisor};
+use blaze_worker::admin::Shown;
+use blaze_worker::running::{RunningWorker, WorkerOptions};
+use blaze_worker::settings::WorkerSettings;
+use tokio::time::sleep;
+
+use crate::exit::CliError;
+
+/// Between two looks at a worker.
+const LOOK: Duration = Duration::from_millis(10);
+
+/// Starts a main service that asks for no tokens, and waits until it serves.
+///
+/// # Errors
+/// [`CliError::Usage`] for what `blaze-config --dev` refuses, [`CliError::Failed`] for a port or a store that cannot be used.
+pub(crate) async fn start_main(
+    section: ControlPlaneSection,
+    in_memory: bool,
+    supervisor: &Supervisor,
+) -> Result<(RunningMain, Addresses), CliError> {
+    let setup = Setup {
+        section,
+        dev: true,
+        in_memory,
+    };
+    setup.check().map_err(|faults| CliError::Usage(faults.join("\n  ")))?;
+    let main = RunningMain::start(supervisor, setup)
+        .await
+        .map_err(|error| CliError::Failed(format!("the main service does not start: {error:#}")))?;
+    let addresses = tokio::select! {
+        addresses = main.ready() => addresses,
+        reason = supervisor.failed() => {
+            return Err(CliError::Failed(format!("the main service does not start: {reason}")));
+        }
+    };
+    Ok((main, addresses))
+}
+
+/// A worker that runs, and where it is asked.
+pub(crate) struct Worker {
+    pub(crate) running: Arc<RunningWorker>,
+    /// `None`: on no port.
+    pub(crate) admin: Option<SocketAddr>,
+    readiness: Readiness,
+}
+
+impl Worker {
+    /// Starts the worker of a node on a broker of it. Its copies are kept in `folder`, if there is one; it is asked on the admin port
+    /// of the node file, if `is_asked`.
+    ///
+    /// # Errors
+    /// [`CliError::Failed`]: a port or a folder that cannot be used.
+    pub(crate) async fn start(
+        file: &NodeFile,
+        broker: Arc<dyn Broker>,
+        folder: Option<PathBuf>,
+        is_asked: bool,
+        supervisor: &Supervisor,
+    ) -> Result<Self, CliError> {
+        let failed = |error: String| CliError::Failed(format!("the worker does not start: {error}"));
+        let settings = WorkerSettings::of(file).map_err(|faults| {
+            let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
+            CliError::Invalid(lines.join("\n  "))
+        })?;
+        let keys = settings.keys.as_ref().map(RedisKeys::open).transpose();
+        let keys = keys.map_err(|error| failed(error.to_string()))?.map(Arc::new);
+        let (shown, readiness) = (Shown::default(), Readiness::new());
+        let admin = match is_asked {
+            true => {
+                let served = shown.serve(file.admin.worker, readiness.clone(), supervisor).await;
+                Some(served.map_err(|error| failed(format!("{}: {error}", file.admin.worker)))?)
+            }
+            false => None,
+        };
+        let options = WorkerOptions {
+            worker_id: format!("{}-{}", settings.node, std::process::id()),
+            settings,
+            broker,
+            keys,
+            folder,
+            // On the broker of a node there is one worker.
+            lease: None,
+        };
+        let running = RunningWorker::start(options, supervisor).await;
+        let running = Arc::new(running.map_err(|error| failed(format!("{error:#}")))?);
+        shown.set(Arc::clone(&running));
+        Ok(Self {
+            running,
+            admin,
+            readiness,
+        })
+    }
+
+    /// Waits until it serves what the main service has at a revision.
+    ///
+    /// # Errors
+    /// [`CliError::Failed`] when it does not within `limit`: what it waits for.
+    pub(crate) async fn has(&self, revision: u64, limit: Duration) -> Result<(), CliError> {
+        let start = Instant::now();
+        loop {
+            let status = self.running.status().await;
+            if status
+                .as_ref()
+                .is_some_and(|status| status.in_sync && status.revision >= revision)
+            {
+                return Ok(());
+            }
+            if start.elapsed() > limit {
+                let reason = status.and_then(|status| status.reason);
+                let reason = reason.unwrap_or_else(|| "it is not in sync yet".to_owned());
+                let limit = limit.as_secs();
+                return Err(CliError::Failed(format!(
+                    "the worker has not got the configuration within {limit} s: {reason}"
+                )));
+            }
+            sleep(LOOK).await;
+        }
+    }
+
+    /// Leaves everything as the next life wants to find it.
+    pub(crate) async fn drain(&self) {
+        self.readiness.stop();
+        self.running.drain().await;
+    }
+}
