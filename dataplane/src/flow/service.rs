@@ -41,11 +41,10 @@ impl FlowService {
         supervisor: &Supervisor,
     ) -> Result<Option<Self>, SdkError> {
         let shared = &flow.shared;
-        let local = [Scope::Node, Scope::Layer].into_iter();
-        let Some((scope, broker)) = local
-            .filter_map(|scope| Some((scope, shared.brokers.of(scope)?)))
-            .next()
-        else {
+        let local = [Scope::Node, Scope::Layer]
+            .into_iter()
+            .find_map(|scope| Some((scope, shared.brokers.of(scope)?)));
+        let Some((scope, broker)) = local else {
             return Ok(None);
         };
         let Ok(name) = "blaze-flow".parse::<ServiceName>() else {

@@ -77,8 +77,8 @@ impl Acks {
 pub(crate) async fn is_configured(worker: &Worker) {
     worker
         .until("the flow has its configuration", |status| {
-            let rows = status["services"].as_array().into_iter().flatten();
-            rows.into_iter().any(|row| {
+            let mut rows = status["services"].as_array().into_iter().flatten();
+            rows.any(|row| {
                 row["service"] == "blaze-flow"
                     && row["instance"] == "0"
                     && row["state"] == "ready"

@@ -37,11 +37,8 @@ async fn rates_rules_and_compression_follow_while_messages_flow() {
     plain::tell_redis(&far_redis.url(), "", &request).unwrap();
     flow.wait_bridge("camera/x", PATIENCE).unwrap();
     let topic = |seen: &Value| {
-        let rows = seen["topics"].as_array().into_iter().flatten();
-        rows.into_iter()
-            .find(|row| row["topic"] == "camera/x")
-            .cloned()
-            .unwrap_or_default()
+        let mut rows = seen["topics"].as_array().into_iter().flatten();
+        rows.find(|row| row["topic"] == "camera/x").cloned().unwrap_or_default()
     };
     let rate = move |seen: &Value| topic(seen)["lanes"][0]["allocated_hz"].as_f64().unwrap_or_default();
     // 50 Hz of 200 kB need some 80 Mbit/s.
