@@ -12,6 +12,7 @@
 //! secrets    what services are not told is nowhere
 //! wire       both ends of `Sync` across versions
 //! raw        `Sync` as bytes
+//! recorded   recordings of it
 //! partition  the link to the main service loses everything while very much is changed (needs root: a network namespace)
 //! ```
 
@@ -27,6 +28,7 @@ mod kit;
 mod outages;
 mod partition;
 mod raw;
+mod recorded;
 mod rollouts;
 mod secrets;
 mod serving;
