@@ -234,8 +234,9 @@ impl ConfigManager {
         self.shared.shown.borrow().held().map(read)
     }
 
-    /// Calls back for each change from now on, also for the first configuration, on the service's pool, in order, one at a
-    /// time. A callback that is more than 16 changes behind gets its last two as one.
+    /// Calls back for each change from now on, also for the first configuration if it comes later than this call, on the
+    /// service's pool, in order, one at a time. A callback that is more than 16 changes behind gets its last two as one. Whoever
+    /// must not miss the first one looks at [`ConfigManager::value`] once afterwards.
     pub fn on_change(&self, callback: impl Fn(&ConfigChange) + Send + Sync + 'static) -> ConfigListener {
         self.shared.listeners.add(&[], Box::new(callback))
     }

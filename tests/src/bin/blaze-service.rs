@@ -14,9 +14,9 @@ use blaze_brokers::redis::RedisBroker;
 use blaze_domain::node_file::{NodeBroker, NodeFile, RedisBroker as RedisSection};
 use blaze_domain::{InstanceName, LayerName, NodeName, Scope, ServiceName};
 use blaze_runtime::logs::{self, LogFormat};
-use blaze_sdk::{AckStatus, ConfigChange, ConfigManager, ServiceManager, ServiceOptions, ServiceState};
+use blaze_sdk::{AckStatus, ConfigManager, ServiceManager, ServiceOptions, ServiceState};
 use clap::Parser;
-use serde_json::json;
+use serde_json::{Value, json};
 
 /// A service that acknowledges its configuration. SIGTERM ends it.
 #[derive(Debug, Parser)]
@@ -64,9 +64,9 @@ async fn main() -> anyhow::Result<()> {
     let (config, cache) = (service.config().clone(), service.cache().clone());
     let (reject, unhealthy) = (options.reject_above, options.unhealthy_above);
     let (acknowledges, when) = (config.clone(), options.acknowledge_when.clone());
-    let _listener = config.on_change(move |change| {
-        say(change);
-        let rate = change.new.as_ref().and_then(|new| new["rate_hz"].as_u64()).unwrap_or(0);
+    let take = move |revision: u64, new: Option<&Value>| {
+        say(revision, new);
+        let rate = new.and_then(|new| new["rate_hz"].as_u64()).unwrap_or(0);
         // This is a thread of the pool for callbacks, which may wait.
         while rate > 10 && when.as_ref().is_some_and(|when| !when.exists()) {
             std::thread::sleep(Duration::from_millis(10));
@@ -76,7 +76,14 @@ async fn main() -> anyhow::Result<()> {
             true => ServiceState::Unhealthy,
             false => ServiceState::Ready,
         });
-    });
+    };
+    let take = Arc::new(take);
+    let takes = Arc::clone(&take);
+    let _listener = config.on_change(move |change| takes(change.revision, change.new.as_deref()));
+    // What came before anybody listened is no change any more.
+    if let (Some(revision), Some(value)) = (config.revision(), config.value()) {
+        tokio::task::spawn_blocking(move || take(revision, Some(&value))).await?;
+    }
     tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?
         .recv()
         .await;
@@ -93,8 +100,8 @@ fn section(url: &str) -> anyhow::Result<RedisSection> {
     }
 }
 
-fn say(change: &ConfigChange) {
-    let line = json!({ "revision": change.revision, "deleted": change.deleted, "config": change.new.as_deref() });
+fn say(revision: u64, config: Option<&Value>) {
+    let line = json!({ "revision": revision, "deleted": config.is_none(), "config": config });
     println!("config {line}");
 }
 

@@ -18,6 +18,7 @@
 //! secrets    what services are not told is nowhere
 //! wire       both ends of `Sync` across versions
 //! raw        `Sync` as bytes
+//! recorded   recordings of it
 //! partition  the link to the main service loses everything while very much is changed (needs root: a network namespace)
 //! ```
 
@@ -39,6 +40,7 @@ mod leases;
 mod outages;
 mod partition;
 mod raw;
+mod recorded;
 mod rollouts;
 mod secrets;
 mod serving;

@@ -153,6 +153,8 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
     let status = blaze(&stage, &["rollout", "status", "faster"]).unwrap();
     assert_eq!(status["status"]["phase"], "failed");
     stage.equal(&canary, PATIENCE).await;
+    // Also that the new one asked: else nobody knows in the next life that it is to be told, until it asks again after a minute.
+    canary.has_kept_all(2).await;
     main.kill().unwrap();
     canary.kill();
     let _main = stage.main();
