@@ -29,7 +29,7 @@ use std::time::Duration;
 
 use blaze_domain::LayerName;
 use blaze_domain::config::state::State;
-use blaze_domain::config::{Key, Kind, Timestamp};
+use blaze_domain::config::{Kind, Timestamp};
 use blaze_proto::v1;
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
@@ -37,7 +37,6 @@ use tokio_util::sync::CancellationToken;
 use crate::copy::{Changed, Loaded, Notes, Position, Update, defaults, lacks_text};
 use crate::core::{Gate, Notice, Place, Replica, Served, Signs, Source};
 use crate::lease::Mark;
-use crate::sync::SyncEvent;
 use fade::Fades;
 use missed::Missed;
 
