@@ -120,7 +120,7 @@ impl<'a> Changes<'a> {
             }
             (_, true) => {
                 self.put(&format!("/services/{service}"), json!({ "config": { "n": n } }))
-                    .await
+                    .await;
             }
         }
     }

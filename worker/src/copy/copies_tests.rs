@@ -8,6 +8,7 @@ use tokio::sync::Semaphore;
 use super::*;
 use crate::copy::fake::Fake;
 use crate::copy::samples::{loaded, notes, position, service};
+use crate::copy::slot::MAX_KEYS;
 
 const LONG: Duration = Duration::from_secs(300);
 

@@ -13,7 +13,7 @@ use super::copies::{Changed, Counts, Update};
 use super::{Notes, Position};
 
 /// Keys that a slot remembers as changed; beyond that everything is written.
-const MAX_KEYS: usize = 10_000;
+pub(super) const MAX_KEYS: usize = 10_000;
 
 /// What waits for one copy.
 pub(super) struct Slot {

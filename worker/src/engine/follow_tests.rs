@@ -42,7 +42,7 @@ impl World {
 fn rates(told: &[Seen]) -> Vec<u64> {
     let rate = |seen: &Seen| match seen {
         Seen::Notice(_, notice) => notice["config"]["rate_hz"].as_u64(),
-        Seen::Key(..) => None,
+        Seen::Key(..) | Seen::TakenAway(..) => None,
     };
     told.iter().filter_map(rate).collect()
 }

@@ -22,7 +22,7 @@ fn notices(seen: &[Seen]) -> Vec<(u64, u64)> {
             notice["revision"].as_u64().unwrap(),
             notice["config"]["rate_hz"].as_u64().unwrap_or_default(),
         )),
-        Seen::Notice(..) | Seen::Key(..) => None,
+        Seen::Notice(..) | Seen::Key(..) | Seen::TakenAway(..) => None,
     });
     of_slam.collect()
 }
@@ -30,7 +30,7 @@ fn notices(seen: &[Seen]) -> Vec<(u64, u64)> {
 fn key_of_slam(seen: &[Seen]) -> Option<u64> {
     seen.iter().rev().find_map(|seen| match seen {
         Seen::Key(key, Some(value)) if key == "blaze:config:slam" => value["config"]["rate_hz"].as_u64(),
-        Seen::Key(..) | Seen::Notice(..) => None,
+        Seen::Key(..) | Seen::Notice(..) | Seen::TakenAway(..) => None,
     })
 }
 

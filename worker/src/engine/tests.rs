@@ -27,6 +27,7 @@ use crate::core::testing::document;
 use crate::core::{Edit, Incoming, Op};
 use crate::lease::Term;
 use crate::serve::{Channels, Outlet, OutletError, Speaker};
+use crate::sync::SyncEvent;
 
 /// What services see.
 #[derive(Debug, Clone, PartialEq)]
