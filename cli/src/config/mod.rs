@@ -30,7 +30,7 @@ mod fleet;
 mod get;
 mod history;
 mod kinds;
-mod node;
+pub(crate) mod node;
 mod options;
 mod patch;
 mod refusal;

@@ -9,6 +9,7 @@ use blaze_runtime::config::Sources;
 use clap::Args;
 use serde_json::{Value, json};
 
+use crate::config::node::options::has_password;
 use crate::demo::options::Setting;
 use crate::exit::CliError;
 use crate::node_file;
@@ -59,6 +60,10 @@ impl FromStr for DevBroker {
         match text {
             "memory" => Ok(Self::Memory),
             "redis" => Ok(Self::OwnRedis),
+            // It would stand in the list of processes and in what is printed.
+            url if has_password(url) => {
+                Err("a password does not belong here: --set brokers.node.redis.password_file=FILE".to_owned())
+            }
             url if ["redis://", "rediss://", "redis+unix://", "unix://"]
                 .iter()
                 .any(|scheme| url.starts_with(scheme)) =>
@@ -140,6 +145,13 @@ mod tests {
             Command::Dev(options) => Ok(*options),
             other => panic!("{other:?}"),
         }
+    }
+
+    #[test]
+    fn a_broker_is_named_without_its_password() {
+        let refused = parse(&["--broker", "redis://me:secret@127.0.0.1:6379"]).unwrap_err();
+        assert!(refused.to_string().contains("password_file"), "{refused}");
+        assert!(parse(&["--broker", "redis://127.0.0.1:6379"]).is_ok());
     }
 
     #[test]

@@ -31,10 +31,10 @@ pub struct FlowService {
 
 impl FlowService {
     /// Makes the flow a service on its own broker, that of the node if there is one, else that of the layer. `None`: it has
-    /// neither. `cache` is where its sign of life goes; without it that is a message.
+    /// neither. `cache` is where its sign of life goes; without it, or if it can never work, that is a message.
     ///
     /// # Errors
-    /// `BLAZE_INSTANCE` is no name, or the cache can never work.
+    /// `BLAZE_INSTANCE` is no name.
     pub async fn start(
         flow: &RunningFlow,
         cache: Option<RedisBroker>,
@@ -53,7 +53,7 @@ impl FlowService {
         let options = ServiceOptions::new(shared.me.layer.clone(), name, Arc::clone(broker), scope)
             .on_node(shared.me.node.clone())
             .instance_of_environment()?;
-        let manager = ServiceManager::start(ServiceOptions {
+        let options = ServiceOptions {
             // Nothing of a flow runs as a callback.
             pool_threads: 1,
             epoch: shared.epoch.load(Ordering::Relaxed),
@@ -61,8 +61,8 @@ impl FlowService {
             cache,
             version: env!("CARGO_PKG_VERSION").to_owned(),
             ..options
-        })
-        .await?;
+        };
+        let manager = started(options).await?;
         let (readiness, signs) = (shared.readiness.clone(), manager.cache().clone());
         let stop = supervisor.shutdown_token();
         supervisor.spawn("signs of life", TaskPolicy::MayEnd, async move {
@@ -89,6 +89,17 @@ impl FlowService {
         {
             tracing::debug!("the sign of life is left to vanish by itself");
         }
+    }
+}
+
+/// Messages flow also where the cache cannot be told of it.
+async fn started(options: ServiceOptions) -> Result<ServiceManager, SdkError> {
+    match ServiceManager::start(options.clone()).await {
+        Err(SdkError::Cache(error)) => {
+            tracing::error!(%error, "cache.redis cannot be used: the sign of life goes as messages on blaze/watchdog");
+            ServiceManager::start(ServiceOptions { cache: None, ..options }).await
+        }
+        started => started,
     }
 }
 
@@ -123,10 +134,38 @@ async fn show(readiness: &Readiness, signs: &CacheManager) {
 mod tests {
     use blaze_brokers::memory::MemoryHub;
     use blaze_brokers::{Broker as _, Content, SubscribeOptions};
+    use blaze_domain::node_file::NodeFile;
     use blaze_runtime::{CheckStatus, Gate};
-    use serde_json::Value;
+    use serde_json::{Value, json};
 
     use super::*;
+
+    #[tokio::test]
+    async fn a_cache_that_can_never_work_keeps_no_flow_from_being_a_service() {
+        let hub = MemoryHub::new("node");
+        let reader = hub.broker();
+        let mut beats = reader
+            .subscribe(&"blaze/watchdog".parse().unwrap(), SubscribeOptions::default())
+            .await
+            .unwrap();
+        let cache = json!({ "redis": { "url": "redis://127.0.0.1:1", "password_file": "not/there" } });
+        let (file, _) = NodeFile::read(&json!({ "cache": cache })).unwrap();
+        let options = ServiceOptions {
+            cache: Some(file.cache_redis().unwrap().clone()),
+            ..ServiceOptions::new(
+                "edge".parse().unwrap(),
+                "blaze-flow".parse().unwrap(),
+                Arc::new(hub.broker()),
+                Scope::Node,
+            )
+        };
+        let refused = ServiceManager::start(options.clone()).await;
+        assert!(matches!(refused, Err(SdkError::Cache(_))));
+        let manager = started(options.on_node("robot-1".parse().unwrap())).await.unwrap();
+        manager.cache().set_state(ServiceState::Ready);
+        assert_eq!(beats.receive(&mut Vec::new(), 1).await, 1);
+        manager.shutdown().await;
+    }
 
     #[tokio::test(start_paused = true)]
     async fn a_flow_is_unhealthy_when_it_is_not_ready_for_a_while_and_not_when_it_ends() {

@@ -112,6 +112,7 @@ async fn prepare(
     }
     if let Some(file) = &options.node_file {
         check_node_file(file, &node_file)?;
+        token_file::check_writable(file)?;
     }
     let revision = existing
         .as_ref()

@@ -6,7 +6,7 @@
 //! ```
 
 mod join;
-mod options;
+pub(crate) mod options;
 mod plan;
 mod token_file;
 

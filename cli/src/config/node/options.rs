@@ -166,7 +166,8 @@ impl FromStr for LayerBrokerChoice {
     }
 }
 
-fn has_password(url: &str) -> bool {
+/// Whether a URL of Redis names a user or a password.
+pub(crate) fn has_password(url: &str) -> bool {
     let rest = url.split_once("://").map_or(url, |(_, rest)| rest);
     let authority = rest.split(['/', '?', '#']).next().unwrap_or_default();
     authority.contains('@')

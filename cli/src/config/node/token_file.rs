@@ -54,12 +54,12 @@ pub(super) fn inspect(file: &Path, layer: &str, now_ms: i64) -> Result<Option<St
     Ok(Some(format!("runs out in {}", short_duration(left_s))))
 }
 
-/// Whether a file can be written there, before a token is made for it; nothing is left of the trial.
+/// Whether a file can be written there, before a token is made; nothing is left of the trial.
 ///
 /// # Errors
 /// [`CliError::Failed`].
 pub(super) fn check_writable(file: &Path) -> Result<(), CliError> {
-    let failed = |reason: String| CliError::Failed(format!("the token file {}: {reason}", file.display()));
+    let failed = |reason: String| CliError::Failed(format!("{}: {reason}", file.display()));
     if file.is_dir() {
         return Err(failed("is a folder".to_owned()));
     }
