@@ -25,6 +25,9 @@ use crate::serve::{Told, changed};
 
 /// How long the last notice of a place stays.
 const FADE: Duration = Duration::from_secs(600);
+/// How long a worker that does not tell keeps in mind what it would take away if it were to lead: whoever leads has done it, unless
+/// nobody did.
+const IN_MIND: Duration = Duration::from_secs(24 * 3600);
 
 /// A place that nobody tells of anything any more.
 #[derive(Debug, Clone, Copy)]
@@ -88,10 +91,11 @@ impl Engine {
         self.fades.channels_differ |= kinds.into_iter().any(|kind| kind == Kind::Service);
     }
 
-    /// Has the channels of all services that are told of anything, or were a while ago.
+    /// Has the channels of all services that are told of anything, or were a while ago. What is not shown yet comes with the flush
+    /// that shows it.
     pub(super) fn serve_channels(&mut self) {
         let Some(channels) = &self.outputs.channels else { return };
-        if !std::mem::take(&mut self.fades.channels_differ) {
+        if self.served.has_pending() || !std::mem::take(&mut self.fades.channels_differ) {
             return;
         }
         let of_documents = self.served.state().of_kind(Kind::Service, None);
@@ -116,7 +120,12 @@ impl Engine {
             let instance: Option<&InstanceName> = place.instance.as_ref();
             // The same instance on another node has the same key.
             let is_told = self.served.tells(&place.service, instance);
-            if is_told || (fading.taken_away && !self.outputs.speaker.is_waiting(&place.to_string())) {
+            let is_waiting = self.outputs.speaker.is_waiting(&place.to_string());
+            let is_over = match self.tells {
+                true => fading.taken_away && !is_waiting,
+                false => now.saturating_duration_since(fading.since) >= IN_MIND,
+            };
+            if is_told || is_over {
                 self.fades.places.remove(&place);
                 self.fades.channels_differ = true;
                 if self.served.told_at(&place).is_none() {
@@ -124,10 +133,17 @@ impl Engine {
                     self.notes.forget(&tell::at(&place, &self.identity.site));
                     is_noted = true;
                 }
-            } else if !fading.taken_away {
-                self.tell_end(&place);
+            } else if self.tells && !fading.taken_away {
+                let is_unheard = is_waiting || self.missed.contains(&place);
+                if !is_unheard {
+                    self.tell_end(&place);
+                }
                 if let Some(fading) = self.fades.places.get_mut(&place) {
-                    fading.taken_away = true;
+                    match is_unheard {
+                        // Its end has not been told yet, and is to stay for a while then.
+                        true => fading.since = now,
+                        false => fading.taken_away = true,
+                    }
                 }
             }
         }
@@ -135,6 +151,13 @@ impl Engine {
             self.keep_notes();
         }
         self.serve_channels();
+    }
+
+    /// What was being taken away may not have been: whoever tells next does it.
+    pub(super) fn take_away_again(&mut self) {
+        for fading in self.fades.places.values_mut() {
+            fading.taken_away = false;
+        }
     }
 
     fn tell_end(&mut self, place: &Place) {

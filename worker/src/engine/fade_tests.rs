@@ -135,3 +135,45 @@ async fn a_worker_that_is_restarted_takes_away_what_was_over_before() {
     assert_eq!(taken_away(&w.rest().await), [("blaze/config/changed/old", "7")]);
     assert_eq!(made.last(), ["nav", "slam"]);
 }
+
+#[tokio::test(start_paused = true)]
+async fn the_channel_of_a_service_that_came_in_an_outage_is_there_when_it_is_told() {
+    let (mut w, made) = world(None);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.closes().await;
+    w.goes_on(PROTOCOL, 40).await;
+    let late = document("Service/late", 3, json!({}));
+    w.says(commit(3, 2, vec![(Op::Create, late)])).await;
+    // More is to come, and meanwhile it is looked whether anything has faded.
+    tokio::time::sleep(LOOK * 2).await;
+    assert_eq!(made.last(), ["nav", "slam"], "it is not shown yet");
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    w.rest().await;
+    assert_eq!(made.last(), ["late", "nav", "slam"]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn whoever_does_not_tell_takes_nothing_away_until_it_does() {
+    let made = Arc::<Made>::default();
+    let channels = Arc::clone(&made) as Arc<dyn Channels>;
+    let mut w = world_on(None, false, None, Delivery::Text, Some(channels));
+    w.opens(documents(30), 2).await;
+    let nav = document("Service/nav", 3, json!({}));
+    w.says(commit(3, 2, vec![(Op::Delete, nav)])).await;
+    tokio::time::sleep(LONG).await;
+    assert!(w.rest().await.is_empty());
+    assert_eq!(made.last(), ["nav", "slam"]);
+    w.leader.send_replace(Some(1));
+    tokio::time::sleep(LOOK * 3).await;
+    let seen = w.rest().await;
+    let end = seen.iter().position(
+        |seen| matches!(seen, Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true),
+    );
+    let away = seen
+        .iter()
+        .position(|seen| matches!(seen, Seen::TakenAway(channel, _) if channel.ends_with("/nav")));
+    assert!(end.is_some() && away > end, "{seen:?}");
+    tokio::time::sleep(LOOK * 3).await;
+    assert_eq!(made.last(), ["slam"]);
+}

@@ -73,7 +73,8 @@ impl Engine {
                 }
                 self.reason = Some(reason);
                 self.replica.disconnected();
-                self.catching_up = None;
+                // A time that is still to come stays: else a link that comes and goes would put it off for ever.
+                self.catching_up = self.catching_up.filter(|until| *until > Instant::now());
                 self.note_sync();
             }
         }

@@ -141,6 +141,7 @@ impl Engine {
             }
         }
         speaker.clear();
+        self.take_away_again();
         self.keyed.clear();
         self.outputs.told.send_replace(None);
         self.settle_soon();
@@ -153,8 +154,18 @@ impl Engine {
     }
 
     fn confirm(&mut self) {
-        if let Some(noted) = &self.noted {
-            self.missed.confirm(noted, Instant::now());
+        let now = Instant::now();
+        match (&self.noted, &self.shown) {
+            (Some(noted), shown) => {
+                self.missed.confirm(noted, now);
+                // Whoever told all of this state has told what followed from a file or another store before it.
+                if shown.as_ref().is_some_and(|shown| noted.covers(shown)) {
+                    self.missed.confirm_others(&noted.store_id, now);
+                }
+            }
+            // Of a mounted file nobody leaves a mark.
+            (None, None) => self.missed.confirm_others("", now),
+            (None, Some(_)) => {}
         }
     }
 

@@ -145,10 +145,18 @@ impl Missed {
 
     /// Services were told so far, whoever did it.
     pub(super) fn confirm(&mut self, told: &Mark, now: Instant) {
-        let is_told = |entry: &Entry| {
-            let is_covered = entry.mark.as_ref().is_some_and(|mark| told.covers(mark));
-            is_covered && now.duration_since(entry.at) > RECENT
-        };
+        self.forget_old(now, |entry| entry.mark.as_ref().is_some_and(|mark| told.covers(mark)));
+    }
+
+    /// What followed from no store, or another one than this, is over.
+    pub(super) fn confirm_others(&mut self, store_id: &str, now: Instant) {
+        self.forget_old(now, |entry| {
+            entry.mark.as_ref().is_none_or(|mark| mark.store_id != store_id)
+        });
+    }
+
+    fn forget_old(&mut self, now: Instant, is_over: impl Fn(&Entry) -> bool) {
+        let is_told = |entry: &Entry| is_over(entry) && now.duration_since(entry.at) > RECENT;
         let order = &mut self.order;
         self.places.retain(|_, entry| {
             let stays = !is_told(entry);
@@ -259,6 +267,11 @@ mod tests {
         missed.confirm(&other, later);
         missed.confirm(&mark(99), later);
         assert!(missed.contains(&place("file")) && missed.len() == 1);
+        missed.note(&notice("own", "a", &[], Some("b")), Some(mark(100)), now);
+        missed.confirm_others("s", now);
+        assert_eq!(missed.len(), 2, "whoever told it may have died over it");
+        missed.confirm_others("s", later);
+        assert!(missed.contains(&place("own")) && missed.len() == 1);
     }
 
     #[test]

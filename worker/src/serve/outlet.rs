@@ -276,15 +276,27 @@ impl Channels for BrokerOutlet {
     fn serve(&self, services: BTreeSet<ServiceName>) {
         let Some(side) = &self.side else { return };
         let mut served = self.served.lock();
-        for service in services.difference(&served) {
-            let Some(channel) = changed(service) else { continue };
-            if let Err(error) = side.prepare(&channel) {
-                tracing::error!(%error, %service, "it cannot be told of changes; it is answered when it asks");
+        // First what goes: there may be room for no more.
+        served.retain(|service| {
+            let stays = services.contains(service);
+            if !stays && let Some(channel) = changed(service) {
+                side.release(&channel);
+            }
+            stays
+        });
+        for service in services {
+            let Some(channel) = changed(&service).filter(|_| !served.contains(&service)) else {
+                continue;
+            };
+            match side.prepare(&channel) {
+                Ok(()) => {
+                    served.insert(service);
+                }
+                // It is tried again when services come or go.
+                Err(error) => {
+                    tracing::error!(%error, %service, "it cannot be told of changes; it is answered when it asks");
+                }
             }
         }
-        for channel in served.difference(&services).filter_map(changed) {
-            side.release(&channel);
-        }
-        *served = services;
     }
 }
