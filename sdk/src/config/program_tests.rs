@@ -81,7 +81,9 @@ async fn sections_of_the_node_file_are_laid_over_and_judgements_acknowledged() {
             "config": null, "deleted": true, "paths": [], "scopes": [] }),
     );
     let mut overlays = program.overlays();
-    let gone = tokio::time::timeout(LONG, overlays.wait_for(Option::is_none)).await.is_ok();
+    let gone = tokio::time::timeout(LONG, overlays.wait_for(Option::is_none))
+        .await
+        .is_ok();
     assert!(gone, "a deleted service has no configuration");
     service.shutdown().await;
 }

@@ -7,6 +7,7 @@ use parking_lot::Mutex;
 
 use super::*;
 use crate::copy::Told as Noted;
+use crate::core::PROTOCOL;
 
 /// Longer than anything stays.
 const LONG: Duration = Duration::from_secs(900);

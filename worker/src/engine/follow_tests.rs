@@ -9,7 +9,7 @@ fn slam(revision: u64) -> Incoming {
 }
 
 impl World {
-    async fn closes(&self) {
+    pub(super) async fn closes(&self) {
         let closed = SyncEvent::Closed {
             reason: "cut".to_owned(),
             is_unreadable: false,
@@ -18,7 +18,7 @@ impl World {
     }
 
     /// The main service goes on from what the worker has.
-    async fn goes_on(&self, protocol: u32, revision: u64) {
+    pub(super) async fn goes_on(&self, protocol: u32, revision: u64) {
         self.sync
             .send(SyncEvent::Opened(CancellationToken::new()))
             .await
