@@ -218,7 +218,8 @@ async fn it_rests_for_longer_while_another_copy_has_everything_and_is_woken_in_t
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
         let written = file.replaced.load(Ordering::Relaxed);
-        let expected = if is_away { 35..=40 } else { 4..=6 };
+        // Now and then the database has not got the newest yet when that is looked at.
+        let expected = if is_away { 35..=40 } else { 4..=10 };
         assert!(expected.contains(&written), "{written} times, away: {is_away}");
         store(41);
         let began = Instant::now();

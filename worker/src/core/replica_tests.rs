@@ -344,11 +344,16 @@ fn a_main_service_one_version_older_is_understood_and_no_other() {
         revision: 1,
         resumed: false,
     };
+    let met = |theirs| {
+        let mut replica = self::replica();
+        replica.disconnected();
+        replica.apply(welcome(theirs), at(0))
+    };
     for theirs in [PROTOCOL - 1, PROTOCOL] {
-        assert!(self::replica().apply(welcome(theirs), at(0)).is_ok(), "{theirs}");
+        assert!(met(theirs).is_ok(), "{theirs}");
     }
     for theirs in [OLDEST_PROTOCOL - 1, PROTOCOL + 1] {
-        let fault = self::replica().apply(welcome(theirs), at(0)).unwrap_err();
+        let fault = met(theirs).unwrap_err();
         assert_eq!(fault, SyncFault::Protocol { theirs });
         assert!(fault.to_string().contains("update the older of the two"), "{fault}");
     }

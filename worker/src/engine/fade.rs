@@ -153,6 +153,13 @@ impl Engine {
         self.serve_channels();
     }
 
+    /// A place hears of its end only now, so that it stays for a while from now on.
+    pub(super) fn fade_anew(&mut self, place: &Place) {
+        if let Some(fading) = self.fades.places.get_mut(place) {
+            fading.since = Instant::now();
+        }
+    }
+
     /// What was being taken away may not have been: whoever tells next does it.
     pub(super) fn take_away_again(&mut self) {
         for fading in self.fades.places.values_mut() {

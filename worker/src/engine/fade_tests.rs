@@ -166,7 +166,7 @@ async fn whoever_does_not_tell_takes_nothing_away_until_it_does() {
     assert!(w.rest().await.is_empty());
     assert_eq!(made.last(), ["nav", "slam"]);
     w.leader.send_replace(Some(1));
-    tokio::time::sleep(LOOK * 3).await;
+    tokio::time::sleep(LONG).await;
     let seen = w.rest().await;
     let end = seen.iter().position(
         |seen| matches!(seen, Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true),

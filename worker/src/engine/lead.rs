@@ -84,6 +84,9 @@ impl Engine {
             .into_iter()
             .filter_map(|left| self.as_it_is(left))
             .partition(|notice| notice.hash.is_none());
+        for notice in &gone {
+            self.fade_anew(&notice.place);
+        }
         let mut told: Vec<Told> = Vec::with_capacity(gone.len() + left.len());
         // First what goes: an instance that moves has the same key there.
         for notice in gone.iter().chain(&left) {
