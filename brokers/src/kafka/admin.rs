@@ -27,6 +27,8 @@ pub(super) enum Purpose {
     LastValues,
     /// The same, of few and small values: what is old goes soon, so that whoever reads all has little to read.
     Notices,
+    /// The same, where the order counts for a while, and not the last values alone.
+    Terms,
 }
 
 impl Purpose {
@@ -34,7 +36,7 @@ impl Purpose {
         let (segment, message) = match self {
             Self::Messages | Self::LastValues => ("67108864", "17825792"),
             // A segment that is written to is never compacted.
-            Self::Notices => ("4194304", "2097152"),
+            Self::Notices | Self::Terms => ("4194304", "2097152"),
         };
         let mut settings = vec![
             ("segment.bytes", segment),
@@ -43,8 +45,13 @@ impl Purpose {
         ];
         settings.extend(match self {
             Self::Messages => [("retention.ms", "600000"), ("retention.bytes", "268435456")],
-            Self::LastValues | Self::Notices => [("cleanup.policy", "compact"), ("min.cleanable.dirty.ratio", "0.1")],
+            Self::LastValues | Self::Notices | Self::Terms => {
+                [("cleanup.policy", "compact"), ("min.cleanable.dirty.ratio", "0.1")]
+            }
         });
+        if self == Self::Terms {
+            settings.push(("min.compaction.lag.ms", "3600000"));
+        }
         settings
     }
 
@@ -52,7 +59,7 @@ impl Purpose {
     pub(super) fn keeps(self) -> bool {
         match self {
             Self::Messages => false,
-            Self::LastValues | Self::Notices => true,
+            Self::LastValues | Self::Notices | Self::Terms => true,
         }
     }
 }

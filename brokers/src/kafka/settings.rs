@@ -19,9 +19,6 @@ const DEBUG: &str = "topic";
 /// A consumer needs a group, though it never joins one.
 const GROUP: &str = "blaze";
 
-/// How long a member of a group may go without a look at what the group says; it looks twenty times a second.
-const GROUP_POLL_MS: u128 = 60_000;
-
 /// What correctness rests on, so that nobody may set it otherwise.
 const FIXED: &[&str] = &[
     "acks",
@@ -203,26 +200,35 @@ impl Settings {
         config
     }
 
-    /// Shares out partitions with the other members of a group, and reads nothing. A member that is silent for a session is
-    /// taken for dead.
-    pub(super) fn group_member(&self, group: &str, session: Duration) -> ClientConfig {
-        let session_ms = session.as_millis().max(1);
-        // Whoever waits hears of a change with the next heartbeat.
-        let heartbeat_ms = (session_ms / 20).clamp(50, 1000);
+    /// Reads the log of a lease to its end and on, and shows its position as that of a group.
+    pub(super) fn lease_reader(&self, group: &str) -> ClientConfig {
         self.with(
-            &[],
+            &[
+                ("fetch.wait.max.ms", "500"),
+                ("fetch.min.bytes", "1"),
+                ("fetch.error.backoff.ms", "20"),
+            ],
             &[
                 ("group.id", group),
-                ("session.timeout.ms", &session_ms.to_string()),
-                ("heartbeat.interval.ms", &heartbeat_ms.to_string()),
-                ("max.poll.interval.ms", &session_ms.max(GROUP_POLL_MS).to_string()),
-                // No request may take longer: whoever asks again must be heard.
-                ("socket.timeout.ms", &(session_ms / 3).clamp(500, 10_000).to_string()),
-                ("partition.assignment.strategy", "cooperative-sticky"),
                 ("enable.auto.commit", "false"),
                 ("enable.auto.offset.store", "false"),
+                ("enable.partition.eof", "true"),
                 ("allow.auto.create.topics", "false"),
-                ("auto.offset.reset", "latest"),
+                // Another log under the same name must never be taken for this one.
+                ("auto.offset.reset", "error"),
+            ],
+        )
+    }
+
+    /// Writes to it. What the server does not take within `patience` is given up: later it would be of no use.
+    pub(super) fn lease_writer(&self, patience: Duration) -> ClientConfig {
+        let timeout = patience.as_millis().max(1).to_string();
+        self.with(
+            &[("linger.ms", "0")],
+            &[
+                ("acks", "all"),
+                ("compression.type", "none"),
+                ("message.timeout.ms", &timeout),
             ],
         )
     }
@@ -324,8 +330,9 @@ pub(super) mod tests {
             settings.reader_to_end(),
             settings.questions(),
             settings.admin(),
-            settings.group_member("g", Duration::from_millis(200)),
-            settings.group_member("g", Duration::from_secs(60)),
+            settings.lease_reader("g"),
+            settings.lease_writer(Duration::from_millis(100)),
+            settings.lease_writer(Duration::from_secs(60)),
         ] {
             config.create_native_config().unwrap();
         }

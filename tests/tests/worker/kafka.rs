@@ -8,6 +8,7 @@ use blaze_tests::servers::{KafkaOptions, KafkaServer};
 use serde_json::{Value, json};
 
 use super::layer::{on_shared_kafka, rate};
+use super::secrets::{self, CANARY, clean, config};
 use super::stage::{PATIENCE, Stage, next, rest};
 
 fn value(record: &Record) -> Value {
@@ -172,4 +173,45 @@ async fn after_the_broker_was_killed_the_last_state_comes_and_nothing_older_afte
     }
     assert!(revisions.is_sorted(), "{revisions:?}");
     worker.stop();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_services_are_not_told_is_nowhere_on_kafka() {
+    let server = KafkaServer::start(KafkaOptions::default()).unwrap();
+    let stage = Stage::of_layer(&json!({ "kafka": { "bootstrap": [server.bootstrap()] } }));
+    let log = stage.path("main.log");
+    let _main = stage.main_at("trace", Some(&log));
+    secrets::documents(&stage).await;
+    let worker = stage.worker_with("server-1", json!({ "deliver_secrets": false }));
+    stage.equal(&worker, PATIENCE).await;
+    let mut service = stage.service().await;
+    let mut slam = service.listen("slam").await;
+    let mut plain = service
+        .ask(
+            json!({ "service": "slam", "instance": "0", "node": "robot-1" }),
+            PATIENCE,
+        )
+        .await;
+    assert!(clean("the answer", &plain.to_string()), "{plain}");
+    for number in [30, 40, 50] {
+        let revision = stage.put("/services/slam", json!({ "config": config(number) })).await;
+        plain = next(&mut slam).await;
+        while plain["revision"] != revision {
+            plain = next(&mut slam).await;
+        }
+        assert!(clean("the notice", &plain.to_string()), "{plain}");
+    }
+    stage.send(reqwest::Method::DELETE, "/services/nav", None).await;
+    stage.equal(&worker, PATIENCE).await;
+    assert_eq!(worker.process.count_in_memory(CANARY.as_bytes()).unwrap(), 0);
+    clean("the log of the worker", &worker.tail());
+    worker.stop();
+    server.kill().unwrap();
+    let stored = server.stored().unwrap();
+    assert!(
+        clean("Kafka", &String::from_utf8_lossy(&stored)),
+        "{} bytes hold no notice",
+        stored.len()
+    );
+    println!("Kafka holds {} bytes, none of them of a secret", stored.len());
 }

@@ -1,7 +1,7 @@
 //! The rules for all leases, on real servers.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use blaze_brokers::redis::RedisKeys;
 use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
@@ -9,8 +9,10 @@ use blaze_tests::servers::{
     KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer, drop_mongo_database,
     shared_mongo, unique_name,
 };
-use blaze_worker::lease::conformance::{Fixture, run_all, run_out};
+use blaze_worker::lease::conformance::{Fixture, run_all};
 use blaze_worker::lease::{KafkaLease, Lease, MongoLease, RedisLease};
+use rdkafka::ClientConfig;
+use rdkafka::admin::{AdminClient, AdminOptions};
 use serde_json::json;
 
 /// What an answer may take on a machine that does much else.
@@ -74,23 +76,19 @@ impl Fixture for OnMongo {
     }
 }
 
-struct OnKafka {
-    server: KafkaServer,
-    /// The least that the broker lets members ask for.
-    session: Duration,
-}
+struct OnKafka(KafkaServer);
 
 impl Fixture for OnKafka {
-    fn lease(&self, layer: &str, _owner: &str) -> Arc<dyn Lease> {
+    fn lease(&self, layer: &str, owner: &str) -> Arc<dyn Lease> {
         let file = json!({
             "layer": { "name": layer, "kind": "fog" },
             "node": { "name": "server-1" },
-            "brokers": { "layer": { "kafka": { "bootstrap": [self.server.bootstrap()], "prefix": "x." } } },
+            "brokers": { "layer": { "kafka": { "bootstrap": [self.0.bootstrap()], "prefix": "x." } } },
         });
         let Some(LayerBroker::Kafka(section)) = NodeFile::read(&file).unwrap().0.brokers.layer else {
             panic!("no Kafka in {file}");
         };
-        Arc::new(KafkaLease::open(&section, &layer.parse().unwrap(), self.time()).unwrap())
+        Arc::new(KafkaLease::open(&section, &layer.parse().unwrap(), owner.to_owned(), TIME).unwrap())
     }
 
     fn time(&self) -> Duration {
@@ -98,8 +96,7 @@ impl Fixture for OnKafka {
     }
 
     fn runs_out_within(&self) -> Duration {
-        // The member itself leaves when it is not asked for a session.
-        self.session.max(TIME) + BUSY
+        TIME + BUSY
     }
 
     fn given_within(&self) -> Duration {
@@ -107,8 +104,8 @@ impl Fixture for OnKafka {
     }
 
     fn first_within(&self) -> Duration {
-        // The first group makes the topic of all groups, and several sessions may be refused.
-        Duration::from_secs(30)
+        // The first one makes the topic of all.
+        Duration::from_secs(10)
     }
 }
 
@@ -147,29 +144,40 @@ async fn one_on_a_mongodb_that_is_alone_passes_the_suite() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_in_a_group_of_kafka_passes_the_suite() {
-    let options = KafkaOptions {
-        extra: vec!["group.min.session.timeout.ms=500".to_owned()],
-        ..KafkaOptions::default()
-    };
-    let fixture = OnKafka {
-        server: KafkaServer::start(options).unwrap(),
-        session: Duration::from_millis(500),
-    };
-    run_all(&fixture).await.unwrap();
+async fn one_in_a_topic_of_kafka_passes_the_suite() {
+    let server = KafkaServer::start(KafkaOptions::default()).unwrap();
+    run_all(&OnKafka(server)).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn one_in_a_group_of_a_kafka_with_its_defaults_passes_the_suite() {
-    let fixture = OnKafka {
-        server: KafkaServer::start(KafkaOptions::default()).unwrap(),
-        session: Duration::from_secs(6),
+async fn one_in_a_topic_of_kafka_outlives_the_broker_and_the_topic() {
+    let fixture = OnKafka(KafkaServer::start(KafkaOptions::default()).unwrap());
+    let (one, other) = (fixture.lease("a", "one"), fixture.lease("a", "other"));
+    let until = async |lease: &Arc<dyn Lease>, what: &str| {
+        let start = Instant::now();
+        while !lease.hold(TIME, None).await.is_ok_and(|held| held.is_held) {
+            assert!(start.elapsed() < Duration::from_secs(30), "{what}");
+            tokio::time::sleep(TIME / 20).await;
+        }
     };
-    // Each rule takes some sessions of six seconds.
-    let passed = if blaze_tests::long() {
-        run_all(&fixture).await
-    } else {
-        run_out(&fixture).await
-    };
-    passed.unwrap();
+    until(&one, "nobody has it").await;
+    fixture.0.kill().unwrap();
+    assert!(one.hold(TIME, None).await.is_err(), "nobody can know who has it");
+    fixture.0.restart().unwrap();
+    until(&other, "nobody has it after the broker came back").await;
+    assert!(!one.hold(TIME, None).await.unwrap_or_default().is_held, "two have it");
+    // Nobody asks for it any more, and the next process finds how old the last record is.
+    tokio::time::sleep(TIME).await;
+    let late = fixture.lease("a", "late");
+    let start = Instant::now();
+    until(&late, "who begins does not get what is over").await;
+    println!("who begins has what is over after {:?}", start.elapsed());
+    let mut config = ClientConfig::new();
+    let admin: AdminClient<_> = config.set("bootstrap.servers", fixture.0.bootstrap()).create().unwrap();
+    let deleted = admin
+        .delete_topics(&["x.blaze.worker.lease"], &AdminOptions::new())
+        .await;
+    assert!(deleted.unwrap().iter().all(Result::is_ok), "the topic is not deleted");
+    until(&one, "nobody has it after the topic was deleted").await;
+    assert!(!late.hold(TIME, None).await.unwrap_or_default().is_held, "two have it");
 }

@@ -22,20 +22,20 @@ use super::kit::{Robot, content};
 use super::stage::{PATIENCE, Stage, Worker, next};
 
 /// The beginning of every secret text, and of nothing else.
-const CANARY: &str = "kanarienvogel-93ab";
+pub(super) const CANARY: &str = "kanarienvogel-93ab";
 /// Stands beside the secrets: where this is, a secret would have been found too.
-const PLAIN: &str = "sperling-51cc";
+pub(super) const PLAIN: &str = "sperling-51cc";
 
 fn secret(number: u32) -> Value {
     json!({ "$secret": format!("{CANARY}-{number}") })
 }
 
-fn config(number: u32) -> Value {
+pub(super) fn config(number: u32) -> Value {
     json!({ "plain": PLAIN, "number": number, "db": { "password": secret(number) }, "list": [{ "key": secret(number + 1) }] })
 }
 
 /// Fails where a secret is found, also as a plain encoding of it. Gives whether what stands beside the secrets is there.
-fn clean(what: &str, text: &str) -> bool {
+pub(super) fn clean(what: &str, text: &str) -> bool {
     let encoded = (0..3).map(|skip| {
         let bytes = &CANARY.as_bytes()[skip..];
         STANDARD.encode(&bytes[..bytes.len() / 3 * 3])
@@ -107,7 +107,7 @@ fn dump(mongo: &MongoServer, database: &str) -> String {
 }
 
 /// Secrets in documents of each kind that can have them.
-async fn documents(stage: &Stage) {
+pub(super) async fn documents(stage: &Stage) {
     let documents = json!([
         { "kind": "Layer", "name": "edge", "spec": { "kind": "edge", "config": { "of_layer": config(10) }, "overrides": { "slam": { "more": config(12) } } } },
         { "kind": "Node", "name": "robot-1", "spec": { "layer": "edge", "config": { "of_node": config(14) } } },
@@ -160,7 +160,7 @@ async fn everything(stage: &Stage, robot: &Robot, worker: &Worker, is_shown: boo
 }
 
 /// What an operator sees: answers of the admin port and the log of a process.
-async fn operator_sees_none(worker: &Worker, logs: &[&Path]) {
+pub(super) async fn operator_sees_none(worker: &Worker, logs: &[&Path]) {
     for path in ["/v1/status", "/metrics", "/readyz", "/healthz", "/livez"] {
         clean(path, &worker.text(path).await);
     }

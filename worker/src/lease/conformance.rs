@@ -37,16 +37,6 @@ pub async fn run_all(fixture: &dyn Fixture) -> Result<(), String> {
     named("many at once", many_at_once(fixture).await)
 }
 
-/// Runs the one rule that a server's own times decide.
-///
-/// # Errors
-/// The rule, if it does not hold, for people.
-pub async fn run_out(fixture: &dyn Fixture) -> Result<(), String> {
-    what_runs_out(fixture)
-        .await
-        .map_err(|error| format!("what runs out: {error}"))
-}
-
 fn check(is_so: bool, what: impl Into<String>) -> Result<(), String> {
     if is_so { Ok(()) } else { Err(what.into()) }
 }
@@ -69,7 +59,7 @@ async fn take(lease: &dyn Lease, time: Duration, within: Duration) -> Result<(He
     }
 }
 
-/// Asks again as who has it. Where nobody knows for a moment, because a group is being shared out, it is asked for again as long
+/// Asks again as who has it. Where nobody knows for a moment, because a server is busy, it is asked for again as long
 /// as it is had.
 async fn renew(lease: &dyn Lease, time: Duration, told: Option<&Mark>) -> Result<Held, String> {
     let start = Instant::now();

@@ -1,43 +1,50 @@
-//! The lease as membership of a consumer group of Kafka: whoever has the one partition leads.
+//! The lease as the order of records in a topic of Kafka.
 
 use std::time::Duration;
 
 use async_trait::async_trait;
 use blaze_brokers::OpenError;
-use blaze_brokers::kafka::GroupLease;
+use blaze_brokers::kafka::{LogLease, LogLeaseOptions};
 use blaze_domain::LayerName;
 use blaze_domain::node_file::KafkaBroker as Section;
 
 use super::{Held, Lease, Mark};
 
-/// The topic whose partition the members of the groups of all layers share out; there is never anything in it.
+/// The topic with the leases of all layers.
 const TOPIC: &str = "blaze/worker/lease";
 
-/// A member of the group `blaze-worker-<layer>`.
+/// The lease of a layer, shown as the position of the group `blaze-worker-<layer>`.
 pub struct KafkaLease {
-    group: String,
-    member: GroupLease,
+    layer: LayerName,
+    lease: LogLease,
 }
 
 impl KafkaLease {
-    /// Begins to join the group of a layer. A member that is not asked to hold the lease for `time` leaves; the broker takes
-    /// one for dead after the same time, or after the least that it lets members ask for, if that is longer.
+    /// The lease of a layer, for a worker that holds it for `time` at a time. Begins to connect in the background.
     ///
     /// # Errors
     /// [`OpenError`] for a section that can never work.
-    pub fn open(section: &Section, layer: &LayerName, time: Duration) -> Result<Self, OpenError> {
-        let group = format!("blaze-worker-{layer}");
-        let member = GroupLease::open(section, &group, TOPIC, time)?;
-        Ok(Self { group, member })
+    pub fn open(section: &Section, layer: &LayerName, owner: String, time: Duration) -> Result<Self, OpenError> {
+        let options = LogLeaseOptions {
+            channel: TOPIC,
+            name: layer.to_string(),
+            group: format!("blaze-worker-{layer}"),
+            owner,
+            time,
+        };
+        Ok(Self {
+            layer: layer.clone(),
+            lease: LogLease::open(section, options)?,
+        })
     }
 }
 
 #[async_trait]
 impl Lease for KafkaLease {
-    /// The time is the one that the group was joined with.
+    /// The time is the one that it was opened with.
     async fn hold(&self, _time: Duration, told: Option<&Mark>) -> Result<Held, String> {
         let text = told.map(Mark::to_text);
-        let held = self.member.hold(text.as_deref()).await?;
+        let held = self.lease.hold(text.as_deref()).await?;
         Ok(Held {
             is_held: held.is_held,
             told: held.note.as_deref().and_then(Mark::parse),
@@ -45,10 +52,10 @@ impl Lease for KafkaLease {
     }
 
     async fn release(&self) {
-        self.member.release().await;
+        self.lease.release().await;
     }
 
     fn describe(&self) -> String {
-        format!("Kafka, group {}", self.group)
+        format!("Kafka, topic {TOPIC}, lease {}", self.layer)
     }
 }
