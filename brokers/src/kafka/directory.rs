@@ -216,7 +216,7 @@ impl Directory {
 }
 
 /// A topic that was just made has no leader for a moment.
-fn is_passing(error: &KafkaError) -> bool {
+pub(super) fn is_passing(error: &KafkaError) -> bool {
     matches!(
         error.rdkafka_error_code(),
         Some(

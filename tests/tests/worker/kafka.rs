@@ -3,10 +3,12 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use blaze_tests::flow::{FlowProcess, FlowSpec};
 use blaze_tests::plain::{KafkaReader, KafkaWriter, Record};
 use blaze_tests::servers::{KafkaOptions, KafkaServer};
 use serde_json::{Value, json};
 
+use super::flow::{has_limit, is_configured, layer, limit};
 use super::layer::{on_shared_kafka, rate};
 use super::secrets::{self, CANARY, clean, config};
 use super::stage::{PATIENCE, Stage, next, rest};
@@ -27,6 +29,8 @@ async fn a_plain_client_asks_and_reads_json_with_keys() {
     stage.robot().await;
     let worker = stage.worker("server-1");
     stage.equal(&worker, PATIENCE).await;
+    // Who asks once asks a worker that has the lease.
+    worker.until("it leads", |status| status["leader"] == true).await;
     let topic = |name: &str| format!("{prefix}{name}");
     let replies = KafkaReader::from_end(&bootstrap, &topic("blaze.reply")).unwrap();
     let changed = KafkaReader::from_beginning(&bootstrap, &topic("blaze.config.changed.slam")).unwrap();
@@ -214,4 +218,36 @@ async fn what_services_are_not_told_is_nowhere_on_kafka() {
         stored.len()
     );
     println!("Kafka holds {} bytes, none of them of a secret", stored.len());
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_flow_on_kafka_takes_its_settings_from_the_worker_of_the_layer_whoever_starts_first() {
+    let (section, bootstrap, prefix) = on_shared_kafka();
+    let stage = Stage::of_layer(&section);
+    let spec = || FlowSpec {
+        limit_mbps: 30.0,
+        ..FlowSpec::new("edge", "robot-1").on_kafka(&bootstrap, &prefix)
+    };
+    let flow = FlowProcess::start(spec()).unwrap();
+    has_limit(&flow, 30.0, PATIENCE);
+    let _main = stage.main();
+    stage.robot().await;
+    stage.put("/layers/edge", layer(&limit(12.0))).await;
+    let worker = stage.worker("server-1");
+    let first = has_limit(&flow, 12.0, PATIENCE);
+    is_configured(&worker).await;
+    let service = stage.service().await;
+    let mut slam = service.listen("slam").await;
+    rest(&mut slam).await;
+    stage.put("/layers/edge", layer(&limit(9.5))).await;
+    let took = has_limit(&flow, 9.5, PATIENCE);
+    drop(flow);
+    let again = FlowProcess::start(spec()).unwrap();
+    let started = has_limit(&again, 9.5, PATIENCE);
+    println!(
+        "a limit counts {first:?} after the worker is ready, {took:?} after a change, {started:?} after the flow is ready"
+    );
+    let others = rest(&mut slam).await;
+    assert!(others.is_empty(), "nobody else hears: {others:?}");
+    worker.stop();
 }

@@ -15,6 +15,7 @@ use std::time::Duration;
 use blaze_brokers::KeyedMessage;
 use blaze_domain::config::Kind;
 use blaze_domain::config::effective::At;
+use blaze_domain::config::spec::PROGRAMS;
 use blaze_domain::{InstanceName, ServiceName};
 use tokio::time::Instant;
 
@@ -38,11 +39,20 @@ struct Fading {
 }
 
 /// All of them, where the broker keeps anything.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Fades {
     places: BTreeMap<Place, Fading>,
     /// Services may have come or gone since channels were last asked for.
     channels_differ: bool,
+}
+
+impl Default for Fades {
+    fn default() -> Self {
+        Self {
+            places: BTreeMap::new(),
+            channels_differ: true,
+        }
+    }
 }
 
 /// The record key of a place.
@@ -100,6 +110,8 @@ impl Engine {
         }
         let of_documents = self.served.state().of_kind(Kind::Service, None);
         let mut services: BTreeSet<ServiceName> = of_documents.map(|(key, _)| ServiceName::from(key.name())).collect();
+        // Programs are there also without a document.
+        services.extend(PROGRAMS.iter().filter_map(|program| program.parse().ok()));
         services.extend(self.fades.places.keys().map(|place| place.service.clone()));
         channels.serve(services);
     }

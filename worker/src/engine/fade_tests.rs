@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use blaze_domain::ServiceName;
+use blaze_domain::config::spec::PROGRAMS;
 use parking_lot::Mutex;
 
 use super::*;
@@ -24,8 +25,11 @@ impl Channels for Made {
 impl Made {
     fn last(&self) -> Vec<String> {
         let all = self.0.lock();
-        let last = all.last().into_iter().flatten();
-        last.map(ToString::to_string).collect()
+        let last: Vec<String> = all.last().into_iter().flatten().map(ToString::to_string).collect();
+        let is_program = |service: &String| PROGRAMS.contains(&service.as_str());
+        let (programs, others): (Vec<String>, Vec<String>) = last.into_iter().partition(is_program);
+        assert_eq!(programs.len(), PROGRAMS.len(), "programs are there without a document");
+        others
     }
 }
 

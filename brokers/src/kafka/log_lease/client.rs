@@ -13,6 +13,7 @@ use rdkafka::{ClientContext, Offset, Timestamp, TopicPartitionList};
 
 use super::ledger::{Entry, Ledger, Place};
 use crate::kafka::context::{self, LastError};
+use crate::kafka::directory::is_passing;
 use crate::kafka::settings::Settings;
 
 /// How long the writer looks for an answer at a time.
@@ -60,6 +61,8 @@ pub(super) struct Link {
     layer: String,
     /// Offset of the next record.
     position: i64,
+    /// What there was when it began ends here, unless it was compacted away.
+    end: i64,
     is_caught_up: bool,
     ledger: Ledger,
     /// Others who have written of this lease.
@@ -82,16 +85,26 @@ impl Link {
         let context = || Context(Arc::clone(last_error));
         let reader: BaseConsumer<Context> = settings.lease_reader(group).create_with_context(context())?;
         let writer: BaseProducer<Context> = settings.lease_writer(patience).create_with_context(context())?;
+        // An empty partition would say so only after the longest wait of a fetch.
+        let deadline = Instant::now() + patience;
+        let (low, end) = loop {
+            match reader.fetch_watermarks(topic, PARTITION, patience) {
+                // It may just have been made.
+                Err(error) if is_passing(&error) && Instant::now() < deadline => std::thread::sleep(TURN),
+                found => break found?,
+            }
+        };
         let mut list = TopicPartitionList::new();
-        list.add_partition_offset(topic, PARTITION, Offset::Beginning)?;
+        list.add_partition_offset(topic, PARTITION, Offset::Offset(low))?;
         reader.assign(&list)?;
         Ok(Self {
             reader,
             writer,
             topic: Arc::clone(topic),
             layer: layer.to_owned(),
-            position: 0,
-            is_caught_up: false,
+            position: low,
+            end,
+            is_caught_up: low >= end,
             ledger: Ledger::default(),
             owners: Vec::new(),
         })
@@ -128,18 +141,23 @@ impl Link {
                         }
                         self.ledger.apply(&owner, entry, place);
                     }
-                }
-                Some(Err(KafkaError::PartitionEOF(_))) => {
-                    if !std::mem::replace(&mut self.is_caught_up, true) {
-                        self.ledger.is_caught_up();
+                    if self.position >= self.end {
+                        self.catch_up();
                     }
                 }
+                Some(Err(KafkaError::PartitionEOF(_))) => self.catch_up(),
                 Some(Err(error)) if is_broken(&error, self.reader.client().fatal_error().is_some()) => {
                     return Err(Broken(error.to_string()));
                 }
                 // The client tries again by itself.
                 Some(Err(error)) => tracing::debug!(%error, topic = %self.topic, "reading the lease"),
             }
+        }
+    }
+
+    fn catch_up(&mut self) {
+        if !std::mem::replace(&mut self.is_caught_up, true) {
+            self.ledger.is_caught_up();
         }
     }
 
