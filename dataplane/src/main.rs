@@ -8,6 +8,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::{Broker, Role, open_layer, open_node};
+use blaze_domain::InstanceName;
 use blaze_domain::node_file::{LayerBroker as LayerSection, NodeBroker, NodeFile};
 use blaze_flow::flow::node_file::{follow_node_file, schema};
 use blaze_flow::flow::service::FlowService;
@@ -18,7 +19,7 @@ use blaze_runtime::admin::Readiness;
 use blaze_runtime::config::{Loaded, Sources, WatchSettings, load_typed, parse_override, watch_with};
 use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
-use blaze_runtime::{logs, ready_line, say, state};
+use blaze_runtime::{environment, logs, ready_line, say, state};
 use clap::Parser;
 
 /// A shutdown takes at most this long.
@@ -49,10 +50,12 @@ fn main() -> ExitCode {
         overrides.push(("log.format".to_owned(), format.clone()));
     }
     let sources = Sources::of_process(arguments.config, overrides);
-    let loaded = match load_typed(&sources, &schema()) {
-        Ok(loaded) => loaded,
-        Err(faults) => {
-            faults.iter().for_each(|fault| say(format_args!("{fault}")));
+    let instance = environment::parsed::<InstanceName>("BLAZE_INSTANCE").err();
+    let loaded = match (load_typed(&sources, &schema()), instance) {
+        (Ok(loaded), None) => loaded,
+        (loaded, instance) => {
+            let faults = loaded.err().into_iter().flatten().chain(instance);
+            faults.for_each(|fault| say(format_args!("{fault}")));
             return ExitCode::from(exit_code::CONFIGURATION);
         }
     };
