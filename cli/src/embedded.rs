@@ -1,4 +1,5 @@
-//! The programs of BlazeConfig within this process: a main service without tokens, and workers on the brokers of its nodes.
+//! The programs of BlazeConfig within this process: a main service without tokens, workers on the brokers of its nodes, and flows
+//! that follow what it says.
 //!
 //! ```text
 //! node file ─► main service: REST, gRPC on loopback ◄── worker (one per node) ─► its broker ─► services
@@ -15,11 +16,17 @@ use blaze_brokers::Broker;
 use blaze_brokers::redis::RedisKeys;
 use blaze_config::process::Setup;
 use blaze_config::running::{Addresses, RunningMain};
-use blaze_domain::node_file::{ControlPlaneSection, NodeFile};
+use blaze_domain::node_file::{ControlPlaneSection, NodeFile, RedisBroker};
+use blaze_flow::flow::RunningFlow;
+use blaze_flow::flow::node_file::Followed;
+use blaze_flow::flow::service::FlowService;
+use blaze_runtime::config::Verdict;
+use blaze_runtime::logs::LogHandle;
 use blaze_runtime::{Readiness, Supervisor};
 use blaze_worker::admin::Shown;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::WorkerSettings;
+use serde_json::Value;
 use tokio::time::sleep;
 
 use crate::exit::CliError;
@@ -52,6 +59,30 @@ pub(crate) async fn start_main(
         }
     };
     Ok((main, addresses))
+}
+
+/// Makes a flow a service that follows BlazeConfig over its node file, as the program `blaze-flow` is. `cache` is where its sign
+/// of life goes; `judged` hears what became of what BlazeConfig says.
+///
+/// # Errors
+/// [`CliError::Usage`]: a node file that is none for a flow, or an instance that the environment names and that can be none.
+pub(crate) async fn follow(
+    flow: &Arc<RunningFlow>,
+    node_file: &Value,
+    cache: Option<&RedisBroker>,
+    log: Option<LogHandle>,
+    supervisor: &Supervisor,
+    judged: impl FnMut(&Verdict) + Send + 'static,
+) -> Result<FlowService, CliError> {
+    let id = flow.id();
+    let refused = |error: String| CliError::Usage(format!("the flow {id} cannot follow BlazeConfig: {error}"));
+    let followed = Followed::of_tree(&format!("node file of {id}"), node_file, log).map_err(|faults| {
+        let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
+        refused(lines.join("\n  "))
+    })?;
+    let service = FlowService::follow(flow, followed, cache.cloned(), supervisor, judged).await;
+    let service = service.map_err(|error| refused(error.to_string()))?;
+    service.ok_or_else(|| refused("it has no broker of its node or layer".to_owned()))
 }
 
 /// A worker that runs, and where it is asked.

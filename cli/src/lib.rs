@@ -18,7 +18,6 @@ mod embedded;
 mod ends;
 pub mod exit;
 pub mod http;
-mod live;
 pub mod local;
 mod node_file;
 pub mod output;

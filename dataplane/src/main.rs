@@ -8,17 +8,18 @@ use std::time::Duration;
 use anyhow::Context as _;
 use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::{Broker, Role, open_layer, open_node};
+use blaze_domain::InstanceName;
 use blaze_domain::node_file::{LayerBroker as LayerSection, NodeBroker, NodeFile};
-use blaze_flow::flow::node_file::{follow_node_file, schema};
+use blaze_flow::flow::node_file::{Followed, follow_node_file, schema};
 use blaze_flow::flow::service::FlowService;
 use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, LayerBroker, RunningFlow};
 use blaze_flow::world::LayerScopeId;
 use blaze_runtime::admin::Readiness;
-use blaze_runtime::config::{Loaded, Sources, WatchSettings, load_typed, parse_override, watch_with};
+use blaze_runtime::config::{Loaded, Sources, WatchSettings, load_typed, parse_override};
 use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
-use blaze_runtime::{logs, ready_line, say, state};
+use blaze_runtime::{environment, logs, ready_line, say, state};
 use clap::Parser;
 
 /// A shutdown takes at most this long.
@@ -49,10 +50,12 @@ fn main() -> ExitCode {
         overrides.push(("log.format".to_owned(), format.clone()));
     }
     let sources = Sources::of_process(arguments.config, overrides);
-    let loaded = match load_typed(&sources, &schema()) {
-        Ok(loaded) => loaded,
-        Err(faults) => {
-            faults.iter().for_each(|fault| say(format_args!("{fault}")));
+    let instance = environment::parsed::<InstanceName>("BLAZE_INSTANCE").err();
+    let loaded = match (load_typed(&sources, &schema()), instance) {
+        (Ok(loaded), None) => loaded,
+        (loaded, instance) => {
+            let faults = loaded.err().into_iter().flatten().chain(instance);
+            faults.for_each(|fault| say(format_args!("{fault}")));
             return ExitCode::from(exit_code::CONFIGURATION);
         }
     };
@@ -85,21 +88,13 @@ async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
             return ExitCode::from(exit_code::FAILED);
         }
     };
-    let program = service.as_ref().map(|service| service.program().clone());
-    let overlays = match &program {
-        Some(program) => program.overlays(),
-        None => tokio::sync::watch::channel(None).1,
-    };
-    let told = watch_with(
-        &supervisor,
+    let followed = Followed {
         sources,
-        schema(),
         loaded,
-        WatchSettings::default(),
-        overlays,
-    );
-    let follow = follow_node_file(Arc::clone(&flow), told, Some(log), program);
-    supervisor.spawn("reload", TaskPolicy::Essential, follow);
+        watch: WatchSettings::default(),
+        log: Some(log),
+    };
+    follow_node_file(&flow, followed, service.as_ref(), &supervisor, |_| {});
     let announced = Arc::clone(&flow);
     let stopping = supervisor.stopping_token();
     supervisor.spawn("ready line", TaskPolicy::MayEnd, async move {

@@ -1,10 +1,29 @@
 //! The environment of the process. Nothing else in the workspace reads it.
 
+use std::fmt::Display;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use crate::config::{LocatedFault, Place};
+
 /// A variable; `None` if it is absent, empty or not UTF-8.
 #[must_use]
 #[allow(clippy::disallowed_methods, reason = "the one place that reads the environment")]
 pub fn variable(name: &str) -> Option<String> {
     std::env::var(name).ok().filter(|value| !value.is_empty())
+}
+
+/// A variable that has a form of its own; `None` if it is absent or empty.
+///
+/// # Errors
+/// What is wrong with it, to be told with the faults of the configuration.
+pub fn parsed<T: FromStr<Err: Display>>(name: &str) -> Result<Option<T>, LocatedFault> {
+    let fault = |error: T::Err| LocatedFault {
+        place: Place::Environment(Arc::from(name)),
+        path: String::new(),
+        detail: error.to_string(),
+    };
+    variable(name).map(|text| text.parse().map_err(fault)).transpose()
 }
 
 /// All variables whose name starts with `prefix`, by name. Those that are not UTF-8 are left out.
@@ -35,5 +54,8 @@ mod tests {
         assert!(found.contains(&("PATH".to_owned(), path)));
         assert!(found.iter().all(|(name, _)| name.starts_with("PAT")));
         assert_eq!(variable("BLAZE_NO_SUCH_VARIABLE"), None);
+        assert_eq!(parsed::<u16>("BLAZE_NO_SUCH_VARIABLE"), Ok(None));
+        let fault = parsed::<u16>("PATH").unwrap_err().to_string();
+        assert_eq!(fault, "environment PATH: invalid digit found in string");
     }
 }

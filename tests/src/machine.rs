@@ -140,12 +140,12 @@ mod tests {
 
     #[test]
     fn the_deepest_mount_is_the_one_that_counts() {
-        let mounts = "/dev/vda / ext4 rw 0 0\ntmpfs /tmp tmpfs rw 0 0\n/dev/vdb /tmp/x xfs rw 0 0\n";
+        let mounts = "/dev/vda / ext4 rw 0 0\ntmpfs /var tmpfs rw 0 0\n/dev/vdb /var/lib xfs rw 0 0\n";
         for (folder, expected) in [
             ("/home/a", "ext4"),
-            ("/tmp/y", "tmpfs"),
-            ("/tmp/x/z", "xfs"),
-            ("/tmpx", "ext4"),
+            ("/var/log", "tmpfs"),
+            ("/var/lib/a", "xfs"),
+            ("/variety", "ext4"),
         ] {
             assert_eq!(file_system(mounts, Path::new(folder)), Some(expected), "{folder}");
         }

@@ -9,6 +9,7 @@ use anyhow::Context as _;
 use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, OpenError, Role, check_layer, open_layer, open_node};
+use blaze_domain::InstanceName;
 use blaze_domain::node_file::{Fault, LayerBroker, NodeBroker, NodeFile};
 use blaze_runtime::admin::Readiness;
 use blaze_runtime::config::{
@@ -16,7 +17,7 @@ use blaze_runtime::config::{
 };
 use blaze_runtime::logs::{LogFormat, LogHandle};
 use blaze_runtime::supervisor::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy, block_on, exit_code};
-use blaze_runtime::{forbid_core_dumps, logs, ready_line, say, state};
+use blaze_runtime::{environment, forbid_core_dumps, logs, ready_line, say, state};
 use blaze_worker::admin::Shown;
 use blaze_worker::lease;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
@@ -54,10 +55,12 @@ fn main() -> ExitCode {
         overrides.push(("log.format".to_owned(), format.clone()));
     }
     let sources = Sources::of_process(arguments.config, overrides);
-    let loaded = match load_typed(&sources, &schema()) {
-        Ok(loaded) => loaded,
-        Err(faults) => {
-            faults.iter().for_each(|fault| say(format_args!("{fault}")));
+    let instance = environment::parsed::<InstanceName>("BLAZE_INSTANCE").err();
+    let loaded = match (load_typed(&sources, &schema()), instance) {
+        (Ok(loaded), None) => loaded,
+        (loaded, instance) => {
+            let faults = loaded.err().into_iter().flatten().chain(instance);
+            faults.for_each(|fault| say(format_args!("{fault}")));
             return ExitCode::from(exit_code::CONFIGURATION);
         }
     };

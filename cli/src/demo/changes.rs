@@ -177,7 +177,7 @@ impl<S: Stage> Changing<'_, S> {
             from: self.plan.limit_mbps,
             to,
             at: PUBLISHING_NODE.flow(),
-            service: crate::live::SERVICE,
+            service: blaze_flow::flow::service::NAME,
             effect: PICTURES,
             before_per_s: before,
             ..Change::of(&taken)

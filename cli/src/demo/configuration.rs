@@ -14,7 +14,9 @@ use blaze_brokers::Broker;
 use blaze_config::running::RunningMain;
 use blaze_domain::node_file::{ControlPlaneSection, NodeBroker};
 use blaze_flow::flow::RunningFlow;
+use blaze_flow::flow::service::{FlowService, NAME};
 use blaze_runtime::Supervisor;
+use blaze_runtime::config::Verdict;
 use blaze_runtime::supervisor::ShutdownSteps;
 use serde_json::{Value, json};
 use tokio::sync::watch;
@@ -24,9 +26,8 @@ use super::changes::{Taken, Wanted};
 use super::options::DemoNode;
 use super::roles::{MOVING_SERVICE, PUBLISHING_NODE};
 use crate::config::seed;
-use crate::embedded::{Worker, start_main};
+use crate::embedded::{Worker, follow, start_main};
 use crate::exit::CliError;
-use crate::live::{FollowingFlow, SERVICE};
 
 /// How long workers may take to have what the demo begins with.
 const READY: Duration = Duration::from_secs(15);
@@ -49,7 +50,7 @@ pub(super) struct Configuration {
     main: RunningMain,
     rest: SocketAddr,
     workers: Vec<Worker>,
-    flow: FollowingFlow,
+    flow: FlowService,
     limit_taken: watch::Receiver<Option<CalledBack>>,
     supervisor: Supervisor,
 }
@@ -77,16 +78,16 @@ impl Configuration {
             workers.push(Worker::start(&file, Arc::clone(&place.broker), None, false, &supervisor).await?);
             if place.node == PUBLISHING_NODE {
                 let (tell, taken) = watch::channel(None);
-                let told = move |revision| {
-                    tell.send_replace(Some(CalledBack {
-                        revision,
-                        at: Instant::now(),
-                    }));
+                let judged = move |verdict: &Verdict| {
+                    if verdict.faults.is_none() {
+                        tell.send_replace(Some(CalledBack {
+                            revision: verdict.overlay.revision,
+                            at: Instant::now(),
+                        }));
+                    }
                 };
-                following = Some((
-                    FollowingFlow::start(flow, tree, place.broker, &supervisor, told).await?,
-                    taken,
-                ));
+                let service = follow(flow, &tree, file.cache_redis(), None, &supervisor, judged).await?;
+                following = Some((service, taken));
             }
         }
         let (flow, limit_taken) =
@@ -140,7 +141,7 @@ impl Configuration {
 
     /// Ends everything but the brokers. Services that follow it have ended before.
     pub(super) async fn shutdown(self, deadline: Duration) {
-        self.flow.shutdown().await;
+        self.flow.stop().await;
         for worker in &self.workers {
             worker.drain().await;
         }
@@ -165,10 +166,9 @@ fn documents() -> Vec<Value> {
         ["edge", "fog", "cloud"].map(|layer| json!({ "kind": "Layer", "name": layer, "spec": { "kind": layer } }));
     let others = DemoNode::ALL.into_iter().filter(|node| *node != PUBLISHING_NODE);
     let nodes = others.map(|node| json!({ "kind": "Node", "name": node.name(), "spec": { "layer": node.layer() } }));
-    let flow = json!({ "kind": "Service", "name": SERVICE, "spec": {} });
     let mut all = layers.to_vec();
     all.extend(nodes);
-    all.extend([robot(None), service(DEFAULT_WINDOW), flow]);
+    all.extend([robot(None), service(DEFAULT_WINDOW)]);
     all
 }
 
@@ -180,7 +180,7 @@ fn service(window: u32) -> Value {
 fn robot(limit_mbps: Option<f64>) -> Value {
     let mut spec = json!({ "layer": PUBLISHING_NODE.layer(), "type": "mobile" });
     if let Some(limit_mbps) = limit_mbps {
-        spec["overrides"] = json!({ SERVICE: { "flow": { "bandwidth": { "limit_mbps": limit_mbps } } } });
+        spec["overrides"] = json!({ NAME: { "flow": { "bandwidth": { "limit_mbps": limit_mbps } } } });
     }
     json!({ "kind": "Node", "name": PUBLISHING_NODE.name(), "spec": spec })
 }

@@ -1,7 +1,7 @@
 //! What `blaze dev` is put together of, and in which order it begins and ends.
 //!
 //! ```text
-//! broker ─► main service ─► documents ─► worker ─► flow ─► flow follows BlazeConfig ─► ready
+//! broker ─► main service ─► documents ─► worker ─► flow, which follows BlazeConfig ─► ready
 //! end: flow drained ─► worker's copies ─► requests of the main service, its store ─► broker
 //! ```
 
@@ -15,6 +15,7 @@ use blaze_brokers::{Broker, Role, open_node};
 use blaze_config::running::{Addresses, RunningMain};
 use blaze_domain::FlowId;
 use blaze_domain::node_file::{NodeBroker, NodeFile};
+use blaze_flow::flow::service::FlowService;
 use blaze_flow::flow::settings::FlowSettings;
 use blaze_flow::flow::{Beginning, Epochs, FlowOptions, RunningFlow};
 use blaze_runtime::Supervisor;
@@ -26,9 +27,8 @@ use super::options::{DevBroker, DevOptions};
 use super::redis;
 use crate::config::files::Source;
 use crate::config::seed;
-use crate::embedded::{Worker, start_main};
+use crate::embedded::{Worker, follow, start_main};
 use crate::exit::CliError;
-use crate::live::{FollowingFlow, SERVICE};
 
 /// How long worker and flow may take.
 const READY: Duration = Duration::from_secs(30);
@@ -39,7 +39,7 @@ pub(super) struct Dev {
     addresses: Addresses,
     worker: Arc<Worker>,
     flow: Arc<RunningFlow>,
-    following: FollowingFlow,
+    service: FlowService,
     /// URL of the Redis; `None`: memory.
     redis: Option<String>,
 }
@@ -48,7 +48,8 @@ pub(super) struct Dev {
 pub(super) async fn start(options: &DevOptions, sources: &[Source], supervisor: &Supervisor) -> Result<Dev, CliError> {
     // Faults of the options are told before anything runs.
     let (file, _) = options.node_file(None, None)?;
-    logs::init(file.log.level.as_str(), LogFormat::Text).map_err(|error| CliError::Failed(error.to_string()))?;
+    let log = logs::init(file.log.level.as_str(), LogFormat::Text);
+    let log = log.map_err(|error| CliError::Failed(error.to_string()))?;
     if let Some(folder) = &options.data {
         make_folder(folder)?;
     }
@@ -62,7 +63,7 @@ pub(super) async fn start(options: &DevOptions, sources: &[Source], supervisor: 
     let folder = options.data.as_ref().map(|folder| folder.join("worker"));
     let worker = Worker::start(&file, brokers.open(&Role::Worker)?, folder, true, supervisor).await?;
     let flow = Arc::new(start_flow(&file, &brokers, options.data.as_deref(), supervisor).await?);
-    let following = FollowingFlow::start(&flow, tree, brokers.open(&Role::Service)?, supervisor, |_| {}).await?;
+    let service = follow(&flow, &tree, file.cache_redis(), Some(log), supervisor, |_| {}).await?;
     worker.has(revision, READY).await?;
     tokio::time::timeout(READY, flow.ready()).await.map_err(|_| {
         let (waited, admin) = (READY.as_secs(), flow.admin());
@@ -75,7 +76,7 @@ pub(super) async fn start(options: &DevOptions, sources: &[Source], supervisor: 
         addresses,
         worker: Arc::new(worker),
         flow,
-        following,
+        service,
         redis,
     })
 }
@@ -104,12 +105,11 @@ async fn broker_of(options: &DevOptions, supervisor: &Supervisor) -> Result<Opti
     }
 }
 
-/// Layer, node and the service whose configuration the flow takes, unless they are there, and what `-f` says. Gives the revision after it.
+/// Layer and node, unless they are there, and what `-f` says. Gives the revision after it.
 async fn documents(options: &DevOptions, sources: &[Source], rest: SocketAddr) -> Result<u64, CliError> {
     let own = [
         json!({ "kind": "Layer", "name": options.layer, "spec": { "kind": options.kind() } }),
         json!({ "kind": "Node", "name": options.node, "spec": { "layer": options.layer } }),
-        json!({ "kind": "Service", "name": SERVICE, "spec": {} }),
     ];
     seed::apply(rest, &own, sources).await
 }
@@ -214,12 +214,16 @@ impl Dev {
             main,
             worker,
             flow,
-            following,
+            service,
             ..
         } = self;
+        let readiness = flow.readiness().clone();
         let steps = ShutdownSteps::new(deadline)
-            .on(ShutdownPhase::EndStreams, "following", following.shutdown())
-            .on(ShutdownPhase::Drain, "flow", async move { flow.drain().await })
+            .on(ShutdownPhase::NotReady, "flow", async move { readiness.stop() })
+            .on(ShutdownPhase::Drain, "flow", async move {
+                service.stop().await;
+                flow.drain().await;
+            })
             .on(ShutdownPhase::Drain, "worker", async move { worker.drain().await });
         supervisor.shutdown_with(main.shutdown_steps(steps)).await;
     }

@@ -162,12 +162,9 @@ mod tests {
         assert_eq!(tree["config"]["server"], "http://127.0.0.1:7");
         assert_eq!((file.flow.bandwidth.limit_mbps, options.kind()), (7.0, "fog"));
         assert!(file.state_dir.is_none());
-        let kept = parse(&["--data", "/tmp/x"]).unwrap();
+        let kept = parse(&["--data", "kept"]).unwrap();
         let (_, tree) = kept.node_file(Some("redis://127.0.0.1:1"), None).unwrap();
-        assert_eq!(
-            tree["control_plane"]["store"]["sqlite"]["path"],
-            "/tmp/x/blaze-config.db"
-        );
+        assert_eq!(tree["control_plane"]["store"]["sqlite"]["path"], "kept/blaze-config.db");
         assert_eq!(tree["brokers"]["node"]["redis"]["url"], "redis://127.0.0.1:1");
         let faulty = parse(&["--set", "flow.bandwith.limit_mbps=7"]).unwrap();
         assert_eq!(faulty.node_file(None, None).unwrap_err().exit() as u8, 2);

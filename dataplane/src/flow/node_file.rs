@@ -4,12 +4,16 @@ use std::sync::Arc;
 
 use blaze_brokers::{OpenError, check_layer};
 use blaze_domain::node_file::{Fault, NodeFile};
-use blaze_runtime::config::{Current, Follower, Keys, Schema, follow};
+use blaze_runtime::config::{
+    Follower, Keys, Loaded, LocatedFault, Schema, Sources, Verdict, WatchSettings, follow, load_typed, watch_with,
+};
 use blaze_runtime::logs::{self, LogHandle};
-use blaze_sdk::ProgramConfig;
+use blaze_runtime::{Supervisor, TaskPolicy};
+use serde_json::Value;
 use tokio::sync::watch;
 
 use super::RunningFlow;
+use super::service::FlowService;
 use super::settings::LiveSettings;
 
 /// What a flow reads of the file, and what of it changes while it runs.
@@ -95,21 +99,63 @@ fn needs_restart(started: &NodeFile, file: &NodeFile) -> bool {
     same != *file
 }
 
-/// Takes over what may change while the flow runs, until the watch of its configuration ends. What is faulty changes nothing
-/// and shows on `/readyz`; what BlazeConfig said is acknowledged, where the flow is a service.
-pub async fn follow_node_file(
-    flow: Arc<RunningFlow>,
-    told: watch::Receiver<Current<NodeFile>>,
-    log: Option<LogHandle>,
-    program: Option<ProgramConfig>,
+/// The node file that a flow follows.
+pub struct Followed {
+    /// Where it comes from.
+    pub sources: Sources,
+    /// What it said.
+    pub loaded: Loaded<NodeFile>,
+    /// How a change is noticed.
+    pub watch: WatchSettings,
+    /// Takes `log.level`; `None`: the log is not the flow's.
+    pub log: Option<LogHandle>,
+}
+
+impl Followed {
+    /// A node file that is no file, as of a flow within another program: it stays as it is.
+    ///
+    /// # Errors
+    /// Every fault; they are told with `name` as that of a file.
+    pub fn of_tree(name: &str, tree: &Value, log: Option<LogHandle>) -> Result<Self, Vec<LocatedFault>> {
+        let sources = Sources::of_text(name, &tree.to_string());
+        Ok(Self {
+            loaded: load_typed(&sources, &schema())?,
+            sources,
+            watch: WatchSettings::of_text(),
+            log,
+        })
+    }
+}
+
+/// Takes over what may change while the flow runs, as long as the supervisor does: what the node file says, and over it what
+/// BlazeConfig says where the flow is a service. What is faulty changes nothing and shows on `/readyz`; what BlazeConfig said is
+/// acknowledged, and `judged` hears what became of it.
+pub fn follow_node_file(
+    flow: &Arc<RunningFlow>,
+    followed: Followed,
+    service: Option<&FlowService>,
+    supervisor: &Supervisor,
+    mut judged: impl FnMut(&Verdict) + Send + 'static,
 ) {
+    let Followed {
+        sources,
+        loaded,
+        watch,
+        log,
+    } = followed;
+    let program = service.map(|service| service.program().clone());
+    let overlays = match &program {
+        Some(program) => program.overlays(),
+        None => watch::channel(None).1,
+    };
     let follower = Follower {
-        told,
+        told: watch_with(supervisor, sources, schema(), loaded, watch, overlays),
         readiness: flow.readiness().clone(),
         keys: KEYS,
         needs_restart,
     };
-    let take = |loaded: &blaze_runtime::config::Loaded<NodeFile>| {
+    let flow = Arc::clone(flow);
+    let take = move |loaded: &Loaded<NodeFile>| {
         let file = &loaded.value;
         flow.reload(LiveSettings::from(&file.flow));
         if let Some(Err(error)) = log.as_ref().map(|log| log.set_level(&file.log.level)) {
@@ -117,12 +163,15 @@ pub async fn follow_node_file(
         }
         tracing::info!(limit_mbps = file.flow.bandwidth.limit_mbps, "configuration reloaded");
     };
-    follow(follower, take, |verdict, besides| {
+    let tell = move |verdict: Option<&Verdict>, besides: &str| {
         if let Some(program) = &program {
             program.judged(verdict, besides);
         }
-    })
-    .await;
+        if let Some(verdict) = verdict {
+            judged(verdict);
+        }
+    };
+    supervisor.spawn("reload", TaskPolicy::Essential, follow(follower, take, tell));
 }
 
 #[cfg(test)]
@@ -155,7 +204,7 @@ mod tests {
         assert!(!needs_restart(&started, &file(live)));
         let of_others = json!({
             "admin": {"worker": "127.0.0.1:9999"}, "worker": {"lease_ms": 1000}, "config": {"server": "https://10.0.0.1:50051"},
-            "database": {"embedded": {"path": "/tmp/x"}}, "monitor": {"ping_period_s": 5},
+            "database": {"embedded": {"path": "worker.db"}}, "monitor": {"ping_period_s": 5},
         });
         assert!(!needs_restart(&started, &file(of_others)));
         for other in [

@@ -13,11 +13,15 @@ use std::time::Duration;
 
 use blaze_domain::node_file::RedisBroker;
 use blaze_domain::{Scope, ServiceName};
+use blaze_runtime::config::Verdict;
 use blaze_runtime::{Readiness, Supervisor, TaskPolicy};
 use blaze_sdk::{CacheManager, ProgramConfig, SdkError, ServiceManager, ServiceOptions, ServiceState};
 
 use super::RunningFlow;
+use super::node_file::{Followed, follow_node_file};
 
+/// The name under which flows have their configuration.
+pub const NAME: &str = "blaze-flow";
 /// How long a flow that was ready is not, before others hear of it: a broker that comes back is met in steps.
 const UNHEALTHY_AFTER: Duration = Duration::from_secs(3);
 /// How long the end waits for the sign of life to be taken away.
@@ -47,7 +51,7 @@ impl FlowService {
         let Some((scope, broker)) = local else {
             return Ok(None);
         };
-        let Ok(name) = "blaze-flow".parse::<ServiceName>() else {
+        let Ok(name) = NAME.parse::<ServiceName>() else {
             return Ok(None);
         };
         let options = ServiceOptions::new(shared.me.layer.clone(), name, Arc::clone(broker), scope)
@@ -73,6 +77,22 @@ impl FlowService {
         });
         let program = manager.program_config();
         Ok(Some(Self { manager, program }))
+    }
+
+    /// The same, and the flow follows its configuration from then on, as [`follow_node_file`] says.
+    ///
+    /// # Errors
+    /// As [`FlowService::start`].
+    pub async fn follow(
+        flow: &Arc<RunningFlow>,
+        followed: Followed,
+        cache: Option<RedisBroker>,
+        supervisor: &Supervisor,
+        judged: impl FnMut(&Verdict) + Send + 'static,
+    ) -> Result<Option<Self>, SdkError> {
+        let service = Self::start(flow, cache, supervisor).await?;
+        follow_node_file(flow, followed, service.as_ref(), supervisor, judged);
+        Ok(service)
     }
 
     /// What BlazeConfig says.

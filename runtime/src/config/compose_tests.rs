@@ -178,6 +178,25 @@ fn an_emptied_file_counts_as_faulty_also_under_an_overlay() {
 }
 
 #[test]
+fn a_text_counts_as_a_file_does() {
+    let name = "node file of a";
+    let sources = Sources::of_text(name, "limit: 1\nmode: low\n");
+    assert_eq!(sources.resolve_file(), None, "there is nothing to watch");
+    let loaded = load_typed(&sources, &schema()).unwrap();
+    let mut composition = compose::Composition::new(sources.clone(), schema(), &loaded.document);
+    assert!(!composition.see(sources.read_file()), "it stays as it is");
+    let mut limit = |over| {
+        composition.lay_over(over);
+        composition.judge().loaded.map(|loaded| loaded.value.0)
+    };
+    assert_eq!(limit(overlay(1, json!({ "limit": 5 }))), Some(5.0));
+    assert_eq!(limit(overlay(2, json!({ "limit": 11 }))), None);
+    assert_eq!(limit(None), Some(1.0));
+    let faults = load_typed(&Sources::of_text(name, "speed: 1\n"), &schema()).unwrap_err();
+    assert_eq!(faults[0].to_string(), "node file of a:1: speed: unknown key");
+}
+
+#[test]
 fn environment_and_options_stand_above_the_overlay() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("blaze.yaml");

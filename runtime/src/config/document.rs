@@ -15,14 +15,16 @@ pub const MAX_FILE_BYTES: u64 = 1024 * 1024;
 /// Names of variables that override the file start with this.
 const PREFIX: &str = "BLAZE__";
 
-/// Name and content of a file.
-pub(super) type NamedText = (Arc<str>, Arc<str>);
+/// Name and content of a file, or of what counts as one.
+pub type NamedText = (Arc<str>, Arc<str>);
 
 /// Where a configuration comes from. Precedence: overrides > environment > [overlay](Overlay) > file > defaults of the schema.
 #[derive(Debug, Clone, Default)]
 pub struct Sources {
     /// The file that was asked for (`--config`, else `BLAZE_CONFIG`). It must exist.
     pub file: Option<PathBuf>,
+    /// A text that is read in place of any file, as programs have that make their configuration themselves.
+    pub text: Option<NamedText>,
     /// Files to look for if none was asked for; the first that exists is taken.
     pub search: Vec<PathBuf>,
     /// Variables `BLAZE__SECTION__KEY` and their values, which are YAML.
@@ -42,7 +44,7 @@ impl Sources {
             search: vec![PathBuf::from("./blaze.yaml"), PathBuf::from("/etc/blaze/blaze.yaml")],
             environment: environment::variables(PREFIX),
             overrides,
-            file_may_be_absent: false,
+            ..Self::default()
         }
     }
 
@@ -55,9 +57,21 @@ impl Sources {
         }
     }
 
+    /// One text, nothing else. Faults are told with `name` as that of a file.
+    #[must_use]
+    pub fn of_text(name: &str, text: &str) -> Self {
+        Self {
+            text: Some((Arc::from(name), Arc::from(text))),
+            ..Self::default()
+        }
+    }
+
     /// The file that is read now, if there is one.
     #[must_use]
     pub fn resolve_file(&self) -> Option<PathBuf> {
+        if self.text.is_some() {
+            return None;
+        }
         self.file
             .clone()
             .or_else(|| self.search.iter().find(|file| file.exists()).cloned())
@@ -74,6 +88,9 @@ impl Sources {
 
     /// The text of the file; `Ok(None)` if there is none and none is needed.
     pub(super) fn read_file(&self) -> Result<Option<NamedText>, LocatedFault> {
+        if self.text.is_some() {
+            return Ok(self.text.clone());
+        }
         let Some(file) = self.resolve_file() else {
             if self.file_may_be_absent {
                 return Ok(None);
@@ -204,7 +221,7 @@ impl Document {
         &self.value
     }
 
-    /// The file that was read, if any.
+    /// The file that was read, or the name of the text in place of one.
     #[must_use]
     pub fn file(&self) -> Option<&Path> {
         self.file.as_deref()

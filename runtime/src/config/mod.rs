@@ -30,7 +30,7 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-pub use document::{Document, MAX_FILE_BYTES, Sources, parse_override};
+pub use document::{Document, MAX_FILE_BYTES, NamedText, Sources, parse_override};
 pub use follow::{Follower, Keys, follow};
 pub use overlay::{Overlay, Verdict};
 pub use place::{LocatedFault, Place};

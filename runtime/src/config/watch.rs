@@ -42,6 +42,19 @@ impl Default for WatchSettings {
     }
 }
 
+impl WatchSettings {
+    /// For a [text](Sources::text): nothing changes it, and SIGHUP is for the program around it.
+    #[must_use]
+    pub fn of_text() -> Self {
+        Self {
+            poll: Duration::from_secs(3600),
+            directory_events: false,
+            hangup: false,
+            ..Self::default()
+        }
+    }
+}
+
 /// The configuration that holds now.
 #[derive(Debug)]
 pub struct Current<T> {

@@ -31,10 +31,18 @@ const ANY: [&str; 9] = [
 ];
 const ANY_MAIN: [&str; 2] = ["--set", "control_plane.admin.listen=127.0.0.1:0"];
 
-fn dev(arguments: &[&str], path: Option<&OsStr>) -> Process {
+pub(crate) fn dev(arguments: &[&str], path: Option<&OsStr>) -> Process {
     let words: Vec<&str> = ANY.iter().chain(&ANY_MAIN).chain(arguments).copied().collect();
     let environment: Vec<(&str, &OsStr)> = path.map(|path| ("PATH", path)).into_iter().collect();
     Process::start_with("blaze", &words, &environment).unwrap()
+}
+
+/// `blaze dev` with a Redis of its own.
+pub(crate) fn dev_on_redis(arguments: &[&str]) -> Process {
+    let path = RedisServer::program_folder(RedisKind::Redis).unwrap();
+    let path = format!("{}:/usr/bin:/bin", path.display());
+    let words = [&["--broker", "redis"], arguments].concat();
+    dev(&words, Some(OsStr::new(&path)))
 }
 
 /// A service of another process than the one of `blaze dev`.
@@ -55,7 +63,7 @@ async fn service(url: &str) -> ServiceManager {
         .unwrap()
 }
 
-async fn put(rest: &str, path: &str, body: &Value) -> u64 {
+pub(crate) async fn put(rest: &str, path: &str, body: &Value) -> u64 {
     let request = reqwest::Client::new().put(format!("http://{rest}/api/v1{path}"));
     let answer = request.header("if-match", "*").json(body).send().await.unwrap();
     let (status, text) = (answer.status(), answer.text().await.unwrap());
@@ -65,7 +73,7 @@ async fn put(rest: &str, path: &str, body: &Value) -> u64 {
         .unwrap()
 }
 
-async fn bandwidth(flow: &str) -> Option<f64> {
+pub(crate) async fn bandwidth(flow: &str) -> Option<f64> {
     let metrics = reqwest::get(format!("http://{flow}/metrics"))
         .await
         .ok()?
@@ -88,12 +96,7 @@ async fn a_change_over_rest_is_heard_by_a_service_and_by_the_flow() {
         "slam.yaml",
         "kind: Service\nname: slam\nspec: { config: { rate_hz: 10 } }\n",
     );
-    let path = RedisServer::program_folder(RedisKind::Redis).unwrap();
-    let path = format!("{}:/usr/bin:/bin", path.display());
-    let mut process = dev(
-        &["--broker", "redis", "-f", file.to_str().unwrap()],
-        Some(OsStr::new(&path)),
-    );
+    let mut process = dev_on_redis(&["-f", file.to_str().unwrap()]);
     let places = ready(&process);
     for (name, place) in places.iter().filter(|(name, _)| *name != "broker") {
         assert!(

@@ -11,5 +11,6 @@
 
 mod apply_wait;
 mod dev;
+mod dev_flow;
 mod node_join;
 mod stage;

@@ -208,6 +208,32 @@ fn options_and_environment_go_before_the_file() {
     }
 }
 
+#[test]
+fn an_instance_that_can_be_none_is_a_fault_of_the_configuration() {
+    let folder = tempfile::tempdir().unwrap();
+    let server = "config: { server: \"http://127.0.0.1:9\" }\n";
+    let content = small_file(folder.path(), "40").replace("memory: {}", "redis: { url: \"redis://127.0.0.1:9\" }");
+    let path = written(folder.path(), "blaze.yaml", &(content + server));
+    for program in ["blaze-flow", "blaze-worker"] {
+        let run = |arguments: &[&str], instance: &str| {
+            let mut command = Command::new(binary(program).unwrap());
+            let output = command
+                .args(arguments)
+                .env("BLAZE_INSTANCE", instance)
+                .output()
+                .unwrap();
+            (output.status.code(), text(&output.stderr))
+        };
+        let check = ["--config", path.as_str(), "--check"];
+        assert_eq!(run(&check, "left").0, Some(0), "{program}: {:?}", run(&check, "left"));
+        for arguments in [&check[..], &check[..2]] {
+            let (code, told) = run(arguments, "Left!");
+            assert_eq!(code, Some(64), "{program}: {told}");
+            assert!(told.contains("environment BLAZE_INSTANCE: "), "{program}: {told}");
+        }
+    }
+}
+
 /// A `blaze-flow` that has printed its ready line.
 pub(crate) fn started(arguments: &[&str]) -> (Process, Admin) {
     let process = Process::start("blaze-flow", arguments, None).unwrap();
