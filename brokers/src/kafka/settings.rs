@@ -216,6 +216,9 @@ impl Settings {
                 ("allow.auto.create.topics", "false"),
                 // Another log under the same name must never be taken for this one.
                 ("auto.offset.reset", "error"),
+                // Whoever closes waits so long for a group that nobody answers for.
+                ("session.timeout.ms", "1000"),
+                ("heartbeat.interval.ms", "300"),
             ],
         )
     }
@@ -224,10 +227,13 @@ impl Settings {
     pub(super) fn lease_writer(&self, patience: Duration) -> ClientConfig {
         let timeout = patience.as_millis().max(1).to_string();
         self.with(
-            &[("linger.ms", "0")],
+            &[],
             &[
                 ("acks", "all"),
+                ("allow.auto.create.topics", "false"),
                 ("compression.type", "none"),
+                ("linger.ms", "0"),
+                ("max.in.flight", "1"),
                 ("message.timeout.ms", &timeout),
             ],
         )

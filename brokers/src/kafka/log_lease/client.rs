@@ -20,8 +20,8 @@ use crate::kafka::settings::Settings;
 const TURN: Duration = Duration::from_millis(10);
 /// The partition that all is in.
 const PARTITION: i32 = 0;
-/// Owners whose records are taken away by the next one; beyond that they stay.
-const MAX_OWNERS: usize = 1024;
+/// The least time that the server has to tell where the log begins and ends: a new client connects first.
+const OPEN: Duration = Duration::from_secs(2);
 
 /// What became of a record: its offset, or why it was not taken.
 type Answer = Arc<Mutex<Option<Result<i64, KafkaError>>>>;
@@ -34,22 +34,23 @@ impl ClientContext for Context {
     }
 
     fn error(&self, error: KafkaError, reason: &str) {
-        self.0.note(format!("{error}: {reason}"));
+        // The end of the log is no fault of anything.
+        if !matches!(error, KafkaError::PartitionEOF(_)) {
+            self.0.note(format!("{error}: {reason}"));
+        }
     }
 }
 
 impl ConsumerContext for Context {}
 
 impl ProducerContext for Context {
-    type DeliveryOpaque = Box<Option<Answer>>;
+    type DeliveryOpaque = Box<Answer>;
 
     fn delivery(&self, result: &DeliveryResult<'_>, answer: Self::DeliveryOpaque) {
-        if let Some(answer) = *answer {
-            *answer.lock() = Some(match result {
-                Ok(message) => Ok(message.offset()),
-                Err((error, _)) => Err(error.clone()),
-            });
-        }
+        *answer.lock() = Some(match result {
+            Ok(message) => Ok(message.offset()),
+            Err((error, _)) => Err(error.clone()),
+        });
     }
 }
 
@@ -65,8 +66,6 @@ pub(super) struct Link {
     end: i64,
     is_caught_up: bool,
     ledger: Ledger,
-    /// Others who have written of this lease.
-    owners: Vec<String>,
 }
 
 /// Why the log must be read from its beginning again.
@@ -86,9 +85,10 @@ impl Link {
         let reader: BaseConsumer<Context> = settings.lease_reader(group).create_with_context(context())?;
         let writer: BaseProducer<Context> = settings.lease_writer(patience).create_with_context(context())?;
         // An empty partition would say so only after the longest wait of a fetch.
-        let deadline = Instant::now() + patience;
+        let timeout = patience.max(OPEN);
+        let deadline = Instant::now() + timeout;
         let (low, end) = loop {
-            match reader.fetch_watermarks(topic, PARTITION, patience) {
+            match reader.fetch_watermarks(topic, PARTITION, timeout) {
                 // It may just have been made.
                 Err(error) if is_passing(&error) && Instant::now() < deadline => std::thread::sleep(TURN),
                 found => break found?,
@@ -106,7 +106,6 @@ impl Link {
             end,
             is_caught_up: low >= end,
             ledger: Ledger::default(),
-            owners: Vec::new(),
         })
     }
 
@@ -117,6 +116,8 @@ impl Link {
     /// Reads what is there, and waits until everything before `least` was read, or until `deadline`; `None`: all that there
     /// was when it began. Returns whether that was reached.
     pub(super) fn read(&mut self, least: Option<i64>, deadline: Instant) -> Result<bool, Broken> {
+        // What it has to say waits for that.
+        self.writer.poll(Duration::ZERO);
         loop {
             let is_enough = self.is_caught_up && least.is_none_or(|least| self.position >= least);
             let wait = if is_enough {
@@ -130,16 +131,13 @@ impl Link {
                 None => {}
                 Some(Ok(message)) => {
                     self.position = message.offset() + 1;
-                    if let Some((owner, entry)) = of_layer(&self.layer, &message) {
+                    if let Some(entry) = of_layer(&self.layer, &message) {
                         let place = Place {
                             offset: message.offset(),
                             appended_ms: appended_ms(message.timestamp()),
                             read: Instant::now(),
                         };
-                        if !self.owners.iter().any(|known| *known == owner) && self.owners.len() < MAX_OWNERS {
-                            self.owners.push(owner.clone());
-                        }
-                        self.ledger.apply(&owner, entry, place);
+                        self.ledger.apply(entry, place);
                     }
                     if self.position >= self.end {
                         self.catch_up();
@@ -173,9 +171,11 @@ impl Link {
             Err(error) => return Ok(Err(error)),
         };
         let answer = Answer::default();
-        let key = key(&self.layer, owner);
-        let record = BaseRecord::with_opaque_to(&self.topic, Box::new(Some(Arc::clone(&answer))));
-        if let Err((error, _)) = self.writer.send(record.partition(PARTITION).key(&key).payload(&bytes)) {
+        let record = BaseRecord::with_opaque_to(&self.topic, Box::new(Arc::clone(&answer)));
+        if let Err((error, _)) = self
+            .writer
+            .send(record.partition(PARTITION).key(&self.layer).payload(&bytes))
+        {
             return Ok(Err(error.to_string()));
         }
         let taken = loop {
@@ -203,19 +203,6 @@ impl Link {
         }
     }
 
-    /// Takes away what others have written: whoever has the lease has written all that counts.
-    pub(super) fn forget_others(&mut self, owner: &str) {
-        for other in std::mem::take(&mut self.owners) {
-            if other == owner {
-                continue;
-            }
-            let key = key(&self.layer, &other);
-            let record: BaseRecord<'_, str, [u8], _> = BaseRecord::with_opaque_to(&self.topic, Box::new(None));
-            // What stays is a record that nobody counts.
-            let _ = self.writer.send(record.partition(PARTITION).key(&key));
-        }
-    }
-
     /// Shows the tools of Kafka, by the position of the group, who reads here and how far. Nothing rests on it.
     pub(super) fn show_position(&self) {
         let mut list = TopicPartitionList::new();
@@ -228,20 +215,16 @@ impl Link {
     }
 }
 
-fn key(layer: &str, owner: &str) -> String {
-    format!("{layer}/{owner}")
-}
-
-/// The owner and what it says, if that is of this layer.
-fn of_layer(layer: &str, message: &BorrowedMessage<'_>) -> Option<(String, Entry)> {
-    let key = std::str::from_utf8(message.key()?).ok()?;
-    let owner = key.strip_prefix(layer)?.strip_prefix('/')?;
-    // One without a payload takes away what no longer counts.
+/// What it says, if that is of this layer.
+fn of_layer(layer: &str, message: &BorrowedMessage<'_>) -> Option<Entry> {
+    if message.key()? != layer.as_bytes() {
+        return None;
+    }
     let entry = Entry::parse(message.payload()?);
     if entry.is_none() {
-        tracing::debug!(offset = message.offset(), key, "this is no record of a lease");
+        tracing::debug!(offset = message.offset(), layer, "this is no record of a lease");
     }
-    Some((owner.to_owned(), entry?))
+    entry
 }
 
 fn appended_ms(timestamp: Timestamp) -> Option<i64> {

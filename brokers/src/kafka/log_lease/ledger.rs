@@ -7,6 +7,9 @@
 //!
 //! Two claims of one term, or a claim and a renewal, meet in the log, and the first of them counts. So nobody can take what
 //! was renewed in time, and nobody can renew what was taken.
+//!
+//! All records of a lease have one key. So of what was compacted there is one record, and after it all that followed. Whether
+//! that one counted nobody can say who did not read what it rests on: a claim is believed until somebody goes on with a term.
 
 use std::time::{Duration, Instant};
 
@@ -20,6 +23,8 @@ const MAX_BYTES: usize = 4096;
 /// A record of the log.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Entry {
+    /// Who writes.
+    pub(super) owner: String,
     /// Which term: each is one more than the one before.
     pub(super) term: u64,
     pub(super) act: Act,
@@ -95,8 +100,8 @@ struct Term {
     time: Duration,
     /// The last record of it.
     last: Place,
-    /// Whether its owner has written anything since its claim.
-    is_renewed: bool,
+    /// It is a claim, and what it rests on was not read.
+    is_doubtful: bool,
     is_released: bool,
 }
 
@@ -144,20 +149,20 @@ impl Ledger {
     }
 
     /// Takes a record in.
-    pub(super) fn apply(&mut self, owner: &str, entry: Entry, place: Place) {
+    pub(super) fn apply(&mut self, entry: Entry, place: Place) {
+        let is_claim = matches!(entry.act, Act::Claim { .. });
         let counts = match (entry.act, &self.term) {
-            (Act::Claim { after, .. }, None) => after.is_none(),
+            // What came before was compacted away, or there was nothing.
+            (_, None) => true,
             (Act::Claim { after, has_waited }, Some(term)) => {
                 entry.term == term.number.saturating_add(1)
                     && after.is_some_and(|after| after >= term.last.offset)
                     && (has_waited || term.is_released || is_over(term, &place))
             }
-            // What came before may have been compacted away.
-            (Act::Renew | Act::Release, None) => true,
             (Act::Renew | Act::Release, Some(term)) => {
-                // Whoever renews has read what its claim rests on, which this reader may not find any more.
-                let is_rival = entry.term == term.number && !term.is_renewed;
-                entry.term > term.number || is_rival || (entry.term == term.number && owner == term.owner)
+                // Whoever goes on with a term has read that it counts.
+                let is_same = entry.term == term.number && entry.owner == term.owner;
+                term.is_doubtful || is_same || entry.term > term.number
             }
         };
         if !counts {
@@ -166,10 +171,10 @@ impl Ledger {
         self.is_of_before = false;
         self.term = Some(Term {
             number: entry.term,
-            owner: owner.to_owned(),
             time: entry.time(),
+            owner: entry.owner,
             last: place,
-            is_renewed: !matches!(entry.act, Act::Claim { .. }),
+            is_doubtful: is_claim && self.term.is_none(),
             is_released: entry.act == Act::Release,
         });
         self.note = entry.note;

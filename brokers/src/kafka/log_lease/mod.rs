@@ -19,7 +19,7 @@ mod ledger;
 mod tests;
 
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::time::{Duration, Instant};
 
 use blaze_domain::node_file::KafkaBroker as Section;
@@ -41,8 +41,11 @@ const TURN: Duration = Duration::from_millis(50);
 const AGAIN: Duration = Duration::from_millis(250);
 /// The least time that the server has for an answer.
 const LEAST_PATIENCE: Duration = Duration::from_millis(100);
+/// The longest.
+const LONGEST_PATIENCE: Duration = Duration::from_secs(5);
 /// Questions that wait for the thread.
 const QUEUE: usize = 4;
+const GIVEN_UP: &str = "the lease was given up";
 
 /// What became of asking for the lease.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -66,6 +69,18 @@ pub struct LogLeaseOptions {
     pub owner: String,
     /// How long it is held without being renewed.
     pub time: Duration,
+}
+
+impl LogLeaseOptions {
+    fn entry(&self, term: u64, act: Act, note: Option<String>) -> Entry {
+        Entry {
+            owner: self.owner.clone(),
+            term,
+            act,
+            time_ms: u64::try_from(self.time.as_millis()).unwrap_or(u64::MAX),
+            note,
+        }
+    }
 }
 
 enum Question {
@@ -96,7 +111,7 @@ impl LogLease {
         let reader = Reader {
             settings,
             topic: names.reserved(options.channel),
-            patience: (options.time / 4).max(LEAST_PATIENCE),
+            patience: (options.time / 4).clamp(LEAST_PATIENCE, LONGEST_PATIENCE),
             options,
             last_error: Arc::default(),
             is_made: false,
@@ -129,11 +144,11 @@ impl LogLease {
             note: note.map(str::to_owned),
             answer,
         };
-        let busy = |_| "the broker has not answered the last question yet".to_owned();
-        self.questions.try_send(question).map_err(busy)?;
-        answered
-            .await
-            .unwrap_or_else(|_| Err("the lease was given up".to_owned()))
+        self.questions.try_send(question).map_err(|error| match error {
+            TrySendError::Full(_) => "the broker has not answered the last questions yet".to_owned(),
+            TrySendError::Disconnected(_) => GIVEN_UP.to_owned(),
+        })?;
+        answered.await.unwrap_or_else(|_| Err(GIVEN_UP.to_owned()))
     }
 
     /// Gives it up, so that another one has it at once; it is not asked for again.
@@ -205,8 +220,14 @@ impl Reader {
         if self.link.is_none() {
             self.make_topic()?;
             let place = (&self.topic, &*self.options.name, &*self.options.group);
-            let link = Link::open(&self.settings, &self.last_error, place, self.patience);
-            self.link = Some(link.map_err(|error| error.to_string())?);
+            match Link::open(&self.settings, &self.last_error, place, self.patience) {
+                Ok(link) => self.link = Some(link),
+                Err(error) => {
+                    // It may have been taken away.
+                    self.is_made = false;
+                    return Err(self.last_error.take().unwrap_or_else(|| error.to_string()));
+                }
+            }
         }
         self.with_link(|link, _| link.read(None, Instant::now()).map(|_| ()))
             .map(|_| ())
@@ -242,7 +263,7 @@ impl Reader {
             match code {
                 // Somebody with more rights may have made it.
                 RDKafkaErrorCode::TopicAuthorizationFailed | RDKafkaErrorCode::ClusterAuthorizationFailed => {
-                    tracing::warn!(%topic, %code, "the topic of the lease must be made by an administrator, with one partition and cleanup.policy=compact");
+                    tracing::warn!(%topic, %code, "the topic of the lease must be made by an administrator, as the documentation of the worker says");
                 }
                 _ => return Err(format!("the topic {topic} could not be made: {code}")),
             }
@@ -267,18 +288,10 @@ impl Reader {
                 Step::Claim { term, act } if !is_too_early => (term, act, left),
                 Step::Claim { .. } | Step::Wait => return Ok(Ok(None)),
             };
-            let entry = Entry {
-                term,
-                act,
-                time_ms: u64::try_from(options.time.as_millis()).unwrap_or(u64::MAX),
-                note,
-            };
-            let written = link.write(&options.owner, &entry, deadline)?;
+            let entry = options.entry(term, act, note);
+            let written = link.write(&entry, deadline)?;
             Ok(written.map(|offset| {
                 let is_held = link.ledger().own_term(&options.owner) == Some((term, offset));
-                if is_held && act != Act::Renew {
-                    link.forget_others(&options.owner);
-                }
                 if is_held {
                     link.show_position();
                 }
@@ -298,19 +311,12 @@ impl Reader {
 
     fn release(&mut self) {
         let deadline = Instant::now() + self.patience;
-        let time_ms = u64::try_from(self.options.time.as_millis()).unwrap_or(u64::MAX);
         let released = self.with_link(|link, options| {
             let note = link.ledger().note().map(str::to_owned);
             let Some((term, _)) = link.ledger().own_term(&options.owner) else {
                 return Ok(Ok(0));
             };
-            let entry = Entry {
-                term,
-                act: Act::Release,
-                time_ms,
-                note,
-            };
-            link.write(&options.owner, &entry, deadline)
+            link.write(&options.entry(term, Act::Release, note), deadline)
         });
         if let Err(error) | Ok(Err(error)) = released {
             tracing::debug!(
