@@ -73,6 +73,8 @@ pub struct Engine {
     wants_all: bool,
     /// The text of a secret is not here.
     lacks_texts: bool,
+    /// It has come, and nobody has been told yet.
+    owes_texts: bool,
     /// Until then whoever has secrets gets everything, also if the hash is the same: the texts have come just now.
     texts_until: Option<Instant>,
     signs: Signs,
@@ -132,6 +134,7 @@ impl Engine {
             notes: Notes::default(),
             wants_all: false,
             lacks_texts: false,
+            owes_texts: false,
             texts_until: None,
             signs: Signs::new(identity.site.clone()),
             gate: Gate::default(),
@@ -219,10 +222,13 @@ impl Engine {
                     let term = *inputs.leader.borrow_and_update();
                     self.lead(term);
                 }
+                // What is due is done before what comes, of which there may always be more. Each of these is due again only later.
                 () = sleep_until(self.look_at) => {
                     self.look_at_signs();
                     self.look_at_fading();
                 }
+                () = sleep_until(settle_at.unwrap_or_else(Instant::now)), if settle_at.is_some() => self.settle(),
+                () = sleep_until(self.ack_at) => self.acknowledge(),
                 Some(event) = inputs.sync.recv() => self.on_sync(event),
                 Some(sign) = inputs.signs.recv() => self.on_sign(sign),
                 Some(request) = inputs.gets.recv() => self.on_get(&request),
@@ -230,8 +236,6 @@ impl Engine {
                     let status = inputs.defaults.borrow_and_update().clone();
                     self.take_defaults(&status);
                 }
-                () = sleep_until(settle_at.unwrap_or_else(Instant::now)), if settle_at.is_some() => self.settle(),
-                () = sleep_until(self.ack_at) => self.acknowledge(),
             }
         }
     }

@@ -112,6 +112,7 @@ impl Engine {
             }
         }
         self.tell(told);
+        self.tell_texts();
         if is_first && self.tells {
             self.outputs.speaker.sweep_keys();
         }
@@ -131,7 +132,7 @@ impl Engine {
     }
 
     /// The texts of secrets have come, which were not there before: whoever has them redacted has the right hash, and yet not
-    /// what it needs.
+    /// what it needs. They are told with the change that they came with.
     pub(super) fn note_texts(&mut self, change: &Change) {
         let lacked = self.lacks_texts;
         // What is not changed is looked at only as long as something is missing.
@@ -142,11 +143,15 @@ impl Engine {
                 changed.any(|held| lacks_text(&held.document.spec))
             }
         };
-        if self.identity.delivery == Delivery::Redacted || !lacked || self.lacks_texts {
+        self.owes_texts |= self.identity.delivery == Delivery::Text && lacked && !self.lacks_texts;
+    }
+
+    /// Has them told, with what is shown now.
+    fn tell_texts(&mut self) {
+        if !std::mem::take(&mut self.owes_texts) {
             return;
         }
         self.texts_until = Some(Instant::now() + TEXTS);
-        self.flush();
         let told: Vec<Told> = self
             .places()
             .iter()

@@ -134,7 +134,7 @@ fn world_on(
     delivery: Delivery,
     channels: Option<Arc<dyn Channels>>,
 ) -> World {
-    let (sync, sync_in) = mpsc::channel(64);
+    let (sync, sync_in) = mpsc::channel(QUEUE);
     let (gets, gets_in) = mpsc::channel(64);
     let (signs, signs_in) = mpsc::channel(64);
     let (queries, queries_in) = mpsc::channel(64);
