@@ -10,7 +10,7 @@ use crate::copy::{LocalCopy, Target};
 use crate::core::testing::labelled;
 
 /// A roll-out of another rate of `slam` on `robot-1`, watched for 60 s.
-fn rollout(revision: u64, uid: &str, rate: u64) -> Document {
+pub(super) fn rollout(revision: u64, uid: &str, rate: u64) -> Document {
     let spec = json!({ "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "rate_hz": rate } },
         "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 } });
     let mut out = document("Rollout/faster", revision, spec);
@@ -19,7 +19,7 @@ fn rollout(revision: u64, uid: &str, rate: u64) -> Document {
     out
 }
 
-fn canary_documents() -> Vec<Document> {
+pub(super) fn canary_documents() -> Vec<Document> {
     let mut out = documents(30);
     out.retain(|document| document.key.to_string() != "Node/robot-1");
     out.push(labelled(
@@ -63,7 +63,7 @@ impl World {
     }
 
     /// Rates that the instance `0` was told of.
-    async fn rates(&mut self) -> Vec<Value> {
+    pub(super) async fn rates(&mut self) -> Vec<Value> {
         let told = self.rest().await.into_iter().filter_map(|seen| match seen {
             Seen::Notice(_, notice) if notice["instance"] == "0" => Some(notice["config"]["rate_hz"].clone()),
             Seen::Notice(..) | Seen::Key(..) | Seen::TakenAway(..) => None,
@@ -71,7 +71,7 @@ impl World {
         told.collect()
     }
 
-    async fn acks(&self, instance: &str, hash: &Value, status: &str) {
+    pub(super) async fn acks(&self, instance: &str, hash: &Value, status: &str) {
         let ack = json!({ "service": "slam", "instance": instance, "node": "robot-1", "revision": 9, "hash": hash,
             "status": status, "detail": "too fast" });
         self.signs.send(Sign::Ack(Bytes::from(ack.to_string()))).await.unwrap();

@@ -91,6 +91,8 @@ pub struct Engine {
     led_at: Instant,
     /// It leads and knows enough to tell services of it.
     tells: bool,
+    /// A roll-out was undone here, and the state without it is not shown yet.
+    has_undone: bool,
     /// How far services were told, by whomever.
     noted: Option<Mark>,
     /// The state that is shown.
@@ -145,6 +147,7 @@ impl Engine {
             leads: None,
             led_at: now,
             tells: false,
+            has_undone: false,
             noted: None,
             shown: None,
             flushed: None,

@@ -12,6 +12,7 @@ use bytes::Bytes;
 use tokio::time::Instant;
 
 use super::fade::record_key;
+use super::missed::Since;
 use super::{Engine, TOGETHER, lacks_texts, now};
 use crate::copy::{Notes, Told as Noted, lacks_text};
 use crate::core::messages::{self, Delivery, GetRequest};
@@ -72,6 +73,10 @@ impl Engine {
         } = self.served.flush(instant.into_std());
         self.counts.notices += notices.len() as u64;
         self.shown = self.mark();
+        let since = Since {
+            mark: self.shown.clone(),
+            is_undone: std::mem::take(&mut self.has_undone),
+        };
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
         // First what goes: an instance that moves has the same key there.
         for place in &untracked {
@@ -93,7 +98,7 @@ impl Engine {
         {
             match self.tells {
                 true => told.extend(self.of_notice(notice)),
-                false => self.missed.note(notice, self.shown.clone(), instant),
+                false => self.missed.note(notice, since.clone(), instant),
             }
             if !untracked.contains(&notice.place) {
                 self.note(&notice.place, notice.revision, notice.hash.clone());
