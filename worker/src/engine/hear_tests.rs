@@ -247,3 +247,32 @@ async fn a_record_that_is_gone_from_redis_fails_it_and_an_outage_does_not() {
     w.signs.send(scan(Vec::new(), true)).await.unwrap();
     assert_eq!(w.rates().await, [json!(30)]);
 }
+
+#[tokio::test(start_paused = true)]
+async fn its_window_begins_when_services_are_told_of_it_and_not_before() {
+    let mut w = world().with_canary().await;
+    w.up.send_replace(false);
+    assert_eq!(w.tries(3, "u-1", 500).await, [] as [Value; 0]);
+    tokio::time::sleep(Duration::from_secs(120)).await;
+    assert_eq!(w.status().await.json["rollouts"][0]["phase"], "pending");
+    w.up.send_replace(true);
+    assert_eq!(w.rates().await, [json!(500)]);
+    assert_eq!(w.reported("applied").await.uid, "u-1");
+    tokio::time::sleep(Duration::from_secs(40)).await;
+    w.acks("0", &json!(null), "rejected").await;
+    assert_eq!(w.rates().await, [json!(30)]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn where_nobody_leads_a_window_begins_with_the_next_leader() {
+    let mut w = world_from(None, false);
+    let mut documents = canary_documents();
+    documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
+    w.opens(documents, 2).await;
+    assert_eq!(w.tries(3, "u-1", 500).await, [] as [Value; 0]);
+    tokio::time::sleep(Duration::from_secs(120)).await;
+    w.leader.send_replace(Some(1));
+    assert_eq!(w.rates().await, [json!(500)]);
+    w.acks("0", &json!(null), "rejected").await;
+    assert_eq!(w.rates().await, [json!(30)]);
+}

@@ -46,6 +46,7 @@ impl Engine {
     /// Services were told so far, whoever did it.
     pub(super) fn note_told(&mut self, mark: Option<Mark>) {
         self.noted = mark;
+        self.follow_rollouts();
         self.settle_soon();
     }
 
@@ -200,6 +201,7 @@ impl Engine {
         if self.tells {
             self.leave_mark();
         }
+        self.follow_rollouts();
         let is_done = is_all_told && self.unnoted.is_empty() && self.farewells.is_empty() && self.missed.len() == 0;
         if !is_done {
             self.settle_soon();
