@@ -1,6 +1,8 @@
 //! What only a worker of BlazeConfig does on its broker, beside messages: channels that must be there before somebody listens
 //! on them, and values that the broker keeps for those who come later.
 
+use std::collections::BTreeSet;
+
 use async_trait::async_trait;
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
@@ -21,10 +23,18 @@ pub struct KeyedMessage {
 /// Why messages were not written, or nobody knows whether they were.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum WriteError {
-    /// As everywhere: [`BrokerError::Away`] also while a channel is still being made, [`BrokerError::Name`] for one that was
-    /// not prepared or that the server does not make.
+    /// As everywhere: [`BrokerError::Name`] also for a channel that was not prepared or that the server does not make.
     #[error(transparent)]
     Broker(#[from] BrokerError),
+    /// Channels are still being made, or the server cannot make them just now. Nothing was written; what is for others need not
+    /// wait for them.
+    #[error("{} channels are not there yet: {reason}", channels.len())]
+    NotYet {
+        /// All of them.
+        channels: BTreeSet<ChannelName>,
+        /// What one of them waits for.
+        reason: String,
+    },
     /// One is more than the server takes, and would be again.
     #[error("channel {channel}: {bytes} bytes are more than the broker carries")]
     TooLarge {

@@ -20,8 +20,8 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
 use crate::copy::{
-    Copies, Counts as CopyCounts, DATABASE_LIMIT, DATABASE_NAME, FileCopy, LocalCopy, Notes, SqliteCopy, Start, Target,
-    Vault, choose, defaults,
+    Copies, Counts as CopyCounts, DATABASE_LIMIT, DATABASE_NAME, FileCopy, Found, LocalCopy, Notes, SqliteCopy, Start,
+    Target, Vault, choose, defaults,
 };
 use crate::core::Site;
 use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
@@ -32,6 +32,8 @@ use crate::serve::{BrokerOutlet, Channels, Speaker, SpeakerCounts};
 use crate::settings::WorkerSettings;
 use crate::sync::{MainService, follow};
 
+/// Copies that may be read late: database and file.
+const COPIES: usize = 2;
 /// Between two looks at the mounted file.
 const LOOK_AT_FILE: Duration = Duration::from_millis(500);
 /// How long the end waits for the copies.
@@ -87,7 +89,8 @@ impl RunningWorker {
         } = options;
         let vault = Vault::load(settings.key_file.as_deref()).context("worker.key_file")?;
         let kept = Kept::open(&settings, folder, &vault, supervisor).await?;
-        let (copies, start) = kept.begin(supervisor).await;
+        let (find, found) = mpsc::channel(COPIES);
+        let (copies, start) = kept.begin(supervisor, &find).await;
         if let Some(from) = &start.from {
             tracing::info!(from, "services get their last configuration");
         }
@@ -144,6 +147,7 @@ impl RunningWorker {
             leader: leadership.leader,
             noted: leadership.noted,
             queries: asked,
+            found,
         };
         let stop = supervisor.shutdown_token();
         let spawn = |name: &str, task: futures::future::BoxFuture<'static, ()>| {
@@ -307,15 +311,17 @@ impl Kept {
     }
 
     /// Reads what is there and keeps it up to date from now on.
-    async fn begin(self, supervisor: &Supervisor) -> (Option<Copies>, Start) {
+    async fn begin(self, supervisor: &Supervisor, find: &mpsc::Sender<Found>) -> (Option<Copies>, Start) {
         let start = choose(self.database.as_ref(), self.file.as_ref(), DATABASE_LIMIT).await;
         let notes = start.loaded.as_ref().map(|loaded| Arc::clone(&loaded.notes));
         let current = [start.is_database_current, start.is_file_current];
         let targets = [self.database, self.file].into_iter().zip(current);
         let targets: Vec<Target> = targets
             .filter_map(|(copy, is_current)| {
+                let copy = copy?;
                 Some(Target {
-                    copy: copy?,
+                    is_read: !start.is_unread(&*copy),
+                    copy,
                     is_current,
                 })
             })
@@ -324,7 +330,7 @@ impl Kept {
             return (None, start);
         }
         let notes = notes.unwrap_or_else(|| Arc::new(Notes::default()));
-        (Some(Copies::start(supervisor, targets, &notes)), start)
+        (Some(Copies::start(supervisor, targets, &notes, find)), start)
     }
 }
 

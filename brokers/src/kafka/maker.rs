@@ -18,8 +18,32 @@ use crate::port::BrokerError;
 
 /// What the server refused to make is asked for again after this.
 const TRY_AGAIN: Duration = Duration::from_secs(10);
+/// The same where it could not make it just then.
+const TRY_SOON: Duration = Duration::from_secs(1);
 /// Topics that are asked for in one request: the server makes one after the other, and has a second and a half for all.
 const AT_ONCE: usize = 100;
+
+/// Whether a server that refuses to make a topic would refuse it again, for what it is or for who asks. All else passes: too few
+/// brokers for as many replicas as it gives, a controller that changes, no answer in time.
+pub(super) fn is_final(code: RDKafkaErrorCode) -> bool {
+    matches!(
+        code,
+        RDKafkaErrorCode::InvalidTopic
+            | RDKafkaErrorCode::TopicAuthorizationFailed
+            | RDKafkaErrorCode::ClusterAuthorizationFailed
+            | RDKafkaErrorCode::PolicyViolation
+    )
+}
+
+/// Whether what the server refused so long ago is to be asked for again.
+fn is_due(code: RDKafkaErrorCode, ago: Duration) -> bool {
+    match code {
+        // An impossible name stays one; what the server did not want may come to be wanted.
+        RDKafkaErrorCode::InvalidTopic => false,
+        code if is_final(code) => ago >= TRY_AGAIN,
+        _ => ago >= TRY_SOON,
+    }
+}
 
 /// What a round has made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -132,9 +156,8 @@ impl Maker {
             .chain(wanted)
             .filter(|(name, _)| !there.contains(*name))
             .filter(|(name, _)| match refused.get(*name) {
-                // An impossible name stays one; what the server did not want may come to be wanted.
                 Some((RDKafkaErrorCode::InvalidTopic, _)) => false,
-                Some((_, at)) => self.is_needed(name) || at.elapsed() >= TRY_AGAIN,
+                Some((code, at)) => self.is_needed(name) || is_due(*code, at.elapsed()),
                 None => true,
             })
             .map(|(name, purpose)| (Arc::clone(name), purpose))
@@ -271,5 +294,36 @@ impl Inner {
             (None, Some(worker)) => worker.maker.make(self, listing).map(|(made, _)| made),
             (None, None) => Ok(Made::Nothing),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_passes_is_tried_again_soon_and_what_is_refused_for_good_is_not() {
+        let second = Duration::from_secs(1);
+        for passing in [
+            RDKafkaErrorCode::InvalidReplicationFactor,
+            RDKafkaErrorCode::RequestTimedOut,
+            RDKafkaErrorCode::OperationTimedOut,
+            RDKafkaErrorCode::NotController,
+            RDKafkaErrorCode::BrokerNotAvailable,
+        ] {
+            assert!(!is_final(passing) && is_due(passing, second), "{passing}");
+        }
+        for refused in [
+            RDKafkaErrorCode::PolicyViolation,
+            RDKafkaErrorCode::TopicAuthorizationFailed,
+            RDKafkaErrorCode::ClusterAuthorizationFailed,
+        ] {
+            assert!(
+                is_final(refused) && !is_due(refused, second) && is_due(refused, TRY_AGAIN),
+                "{refused}"
+            );
+        }
+        let name = RDKafkaErrorCode::InvalidTopic;
+        assert!(is_final(name) && !is_due(name, TRY_AGAIN * 100));
     }
 }

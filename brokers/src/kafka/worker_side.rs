@@ -4,6 +4,7 @@
 //! written when the server has acknowledged it. What it has not within some seconds is given up, so that the newest takes its
 //! place.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use async_trait::async_trait;
@@ -13,7 +14,7 @@ use tokio::sync::oneshot;
 
 use super::admin::Purpose;
 use super::inner::{Inner, MAX_CHANNELS};
-use super::maker::Maker;
+use super::maker::{Maker, is_final};
 use super::names::{Names, OF_WORKER};
 use super::producer::Producer;
 use super::settings::Lot;
@@ -46,19 +47,26 @@ pub(super) struct KafkaWorkerSide {
 
 impl KafkaWorkerSide {
     /// The topic of a message; `None`: there is nothing to be written.
-    fn topic_of(&self, message: &KeyedMessage) -> Result<Option<Arc<Topic>>, BrokerError> {
+    fn topic_of(&self, message: &KeyedMessage) -> Result<Option<Arc<Topic>>, WriteError> {
         let name = self.inner.names.topic(&message.channel)?;
         let refuse = |reason: String| {
-            Err(BrokerError::Name {
+            Err(WriteError::from(BrokerError::Name {
                 channel: message.channel.to_string(),
+                reason,
+            }))
+        };
+        let wait = |reason: String| {
+            Err(WriteError::NotYet {
+                channels: BTreeSet::from([message.channel.clone()]),
                 reason,
             })
         };
         match self.state.maker.with(&name, |prepared| Arc::clone(&prepared.topic)) {
             Some(topic) if topic.partitions().is_some() => Ok(Some(topic)),
             Some(_) => match self.state.maker.refusal(&name) {
-                Some(code) => refuse(format!("the server does not make its topic {name}: {code}")),
-                None => Err(BrokerError::Away(format!("topic {name} is being made"))),
+                Some(code) if is_final(code) => refuse(format!("the server does not make its topic {name}: {code}")),
+                Some(code) => wait(format!("the server cannot make its topic {name} now: {code}")),
+                None => wait(format!("topic {name} is being made")),
             },
             None if message.value.is_none() => Ok(None),
             None => refuse("it was not prepared, or its topic has the name of another one".to_owned()),
@@ -105,13 +113,27 @@ impl WorkerSide for KafkaWorkerSide {
             return Err(BrokerError::Away(self.inner.status.borrow().detail.clone()).into());
         }
         let producer = self.producer()?;
-        let mut ready = Vec::with_capacity(messages.len());
+        let (mut ready, mut missing) = (Vec::with_capacity(messages.len()), BTreeSet::new());
+        let mut waits_for = String::new();
         // Nothing is written before all can be, so that what is tried again keeps its order.
         for message in messages {
             if bytes_of(message) > MAX_PAYLOAD_BYTES {
                 return Err(too_large(message));
             }
-            ready.extend(self.topic_of(message)?.map(|topic| (message, topic)));
+            match self.topic_of(message) {
+                Ok(topic) => ready.extend(topic.map(|topic| (message, topic))),
+                Err(WriteError::NotYet { channels, reason }) => {
+                    missing.extend(channels);
+                    waits_for = reason;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        if !missing.is_empty() {
+            return Err(WriteError::NotYet {
+                channels: missing,
+                reason: waits_for,
+            });
         }
         let mut answers = Vec::with_capacity(ready.len());
         for (message, topic) in ready {

@@ -142,6 +142,12 @@ fn a_server_that_signs_nothing_is_told_what_to_do_about_it() {
     assert_eq!(without.code, 0, "{without:?}");
     assert_eq!(without.json()["node"]["action"], "unchanged");
     assert_eq!(without.json()["node_file"]["config"].get("token_file"), None);
+    // Where it is need not be said again.
+    let join = "node join robot-2 --layer edge --no-token --peer 10.0.3.1";
+    let first = stage.blaze(&main, &format!("{join} --address 10.0.1.1"));
+    let again = stage.blaze(&main, join);
+    assert!(first.code == 0 && first.stdout.contains("inter:"), "{first:?}");
+    assert_eq!((again.code, &again.stdout), (0, &first.stdout), "{again:?}");
     let key = stage.path("own.key");
     let key = key.to_str().unwrap();
     assert_eq!(

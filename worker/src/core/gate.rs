@@ -1,16 +1,20 @@
 //! Judges the roll-outs that are tried here by what the services say that they changed.
 //!
 //! ```text
-//! flush ──Trials──▶ a window for each roll-out and canary node ──▶ applied
+//! flush ──Trials──▶ a window for each roll-out and canary node ──▶ pending
+//!                              │ services were told
+//!                              ▼
+//!                            open, for as long as the gate says ──▶ applied
 //!                              │ Complaint of a place that it changed, within the window
 //!                              ▼
 //!                   more than max_unhealthy ──▶ failed: undone here, whoever else is there or not
 //! ```
 //!
-//! A window begins when the changed configuration is told here; in a new life of the worker it begins anew.
+//! A window begins when the changed configuration was told here, by whomever; in a new life of the worker it begins anew. As
+//! long as nobody tells it, nobody has it.
 
 use std::collections::BTreeMap;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use blaze_domain::{DocumentName, NodeName};
 
@@ -28,7 +32,7 @@ const MAX_NAMED: usize = 5;
 pub enum RolloutPhase {
     /// It is undone here, because too many services are in trouble with it.
     Failed,
-    /// It is undone here, because it failed on another node.
+    /// It is undone here, because it failed on another node; or services have not been told yet.
     Pending,
     /// Services are told.
     Applied,
@@ -75,7 +79,11 @@ pub struct Failure {
 #[derive(Debug)]
 struct Window {
     name: DocumentName,
-    until: Instant,
+    length: Duration,
+    /// Revision of the documents that it came with: what services were told of an earlier state does not open it.
+    since: u64,
+    /// `None`: services were not told yet.
+    until: Option<Instant>,
     max_unhealthy: u64,
     /// What was said against it, by place.
     troubled: BTreeMap<Place, String>,
@@ -92,8 +100,8 @@ pub struct Gate {
 }
 
 impl Gate {
-    /// Looks at the shown documents, right after they were told. Gives whether the reports are others.
-    pub fn follow(&mut self, served: &Served, now: Instant) -> bool {
+    /// Looks at the shown documents. Gives whether the reports are others.
+    pub fn follow(&mut self, served: &Served) -> bool {
         let mut old = std::mem::take(&mut self.windows);
         let mut is_changed = false;
         self.unwatched = 0;
@@ -104,14 +112,31 @@ impl Gate {
                     continue;
                 }
                 let key = (node.clone(), trial.uid.clone());
-                let window = old.remove(&key).unwrap_or_else(|| {
+                let window = old.remove(&key);
+                // That it failed may become known later, from a copy.
+                let window = window.filter(|window| !trial.has_failed || window.phase != RolloutPhase::Applied);
+                let window = window.unwrap_or_else(|| {
                     is_changed = true;
-                    Window::new(&trial, now)
+                    Window::new(&trial, served.state().revision())
                 });
                 self.windows.insert(key, window);
             }
         }
         is_changed || !old.is_empty()
+    }
+
+    /// Opens the windows of what services were told of by now: everything up to this revision. Gives whether the reports are
+    /// others.
+    pub fn open(&mut self, told: Option<u64>, now: Instant) -> bool {
+        let Some(told) = told else { return false };
+        let mut is_changed = false;
+        for window in self.windows.values_mut() {
+            if window.until.is_none() && window.since <= told {
+                window.until = Some(now + window.length);
+                is_changed = true;
+            }
+        }
+        is_changed
     }
 
     /// Judges by a complaint. Gives the roll-outs that fail because of it: they are to be undone and remembered.
@@ -121,8 +146,10 @@ impl Gate {
         let Some(node) = &place.node else { return failures };
         let of_node = self.windows.range_mut((node.clone(), String::new())..);
         for ((_, uid), window) in of_node.take_while(|((at, _), _)| at == node) {
-            let is_open = window.phase == RolloutPhase::Applied && now <= window.until;
+            // Whoever names the configuration has it, although it is not known to be told to all.
+            let is_open = window.until.map_or(complaint.hash.is_some(), |until| now <= until);
             if is_open
+                && window.phase == RolloutPhase::Applied
                 && !window.troubled.contains_key(place)
                 && !is_of_another_configuration(served, complaint)
                 && served.is_changed_by(uid, place)
@@ -163,8 +190,8 @@ impl Gate {
                 uid: uid.clone(),
                 name: window.name.clone(),
                 node: node.clone(),
-                phase: window.phase,
-                reason: window.reason.clone(),
+                phase: window.shown_phase(),
+                reason: window.shown_reason(),
             })
             .collect();
         out.sort_by_key(|state| state.phase);
@@ -179,18 +206,39 @@ impl Gate {
 }
 
 impl Window {
-    fn new(trial: &Trial, now: Instant) -> Self {
+    fn new(trial: &Trial, since: u64) -> Self {
         let (phase, reason) = match trial.has_failed {
             true => (RolloutPhase::Failed, "it failed here before".to_owned()),
             false => (RolloutPhase::Applied, String::new()),
         };
         Self {
             name: trial.name.clone(),
-            until: now + trial.window,
+            length: trial.window,
+            since,
+            until: None,
             max_unhealthy: trial.max_unhealthy,
             troubled: BTreeMap::new(),
             phase,
             reason,
+        }
+    }
+
+    fn is_untold(&self) -> bool {
+        self.phase == RolloutPhase::Applied && self.until.is_none()
+    }
+
+    fn shown_phase(&self) -> RolloutPhase {
+        if self.is_untold() {
+            RolloutPhase::Pending
+        } else {
+            self.phase
+        }
+    }
+
+    fn shown_reason(&self) -> String {
+        match self.is_untold() {
+            true => "services have not been told yet".to_owned(),
+            false => self.reason.clone(),
         }
     }
 

@@ -48,7 +48,8 @@ fn world(node: Option<&str>, rollouts: Vec<Document>) -> World {
     let (mut served, mut gate, start) = (Served::new(site(node)), Gate::default(), Instant::now());
     served.load(state(10, documents(rollouts)), Source::Copy).unwrap();
     served.flush(start);
-    gate.follow(&served, start);
+    gate.follow(&served);
+    gate.open(Some(10), start);
     World { served, gate, start }
 }
 
@@ -129,6 +130,40 @@ fn after_the_window_nothing_fails_any_more() {
 }
 
 #[test]
+fn a_window_opens_when_services_were_told_and_before_only_who_names_the_configuration_counts() {
+    let mut w = world(Some("robot-1"), vec![rollout("slam", 0, "canary")]);
+    w.gate = Gate::default();
+    w.gate.follow(&w.served);
+    for told in [None, Some(9)] {
+        assert!(!w.gate.open(told, w.start));
+        assert_eq!(w.phases(), named(&[("robot-1", "pending")]));
+    }
+    assert_eq!(w.hears(&complaint("slam/0@robot-1", Trouble::Lost), 1), []);
+    let later = w.start + Duration::from_secs(600);
+    assert!(w.gate.open(Some(10), later) && !w.gate.open(Some(11), later));
+    assert_eq!(w.phases(), named(&[("robot-1", "applied")]));
+    assert_eq!(w.hears(&complaint("slam/0@robot-1", Trouble::Lost), 660).len(), 1);
+
+    w.gate = Gate::default();
+    w.gate.follow(&w.served);
+    let of_it = Complaint {
+        hash: w.served.told_to(&place("slam/0@robot-1")).unwrap().hash.clone(),
+        ..complaint("slam/0@robot-1", Trouble::Rejected)
+    };
+    assert_eq!(w.hears(&of_it, 1).len(), 1, "it has asked");
+}
+
+#[test]
+fn that_it_failed_may_become_known_later() {
+    let mut w = world(Some("robot-1"), vec![rollout("slam", 0, "canary")]);
+    w.served.fail_rollout("Rollout/slam-slower");
+    w.served.flush(w.start);
+    assert!(w.gate.follow(&w.served));
+    assert_eq!(w.phases(), named(&[("robot-1", "failed")]));
+    assert!(!w.gate.follow(&w.served), "nothing is new");
+}
+
+#[test]
 fn what_is_said_of_the_configuration_before_does_not_count() {
     let mut w = world(Some("robot-1"), vec![rollout("slam", 0, "canary")]);
     let told = w.served.told_to(&place("slam/0@robot-1")).unwrap().clone();
@@ -180,12 +215,12 @@ fn on_the_broker_of_a_layer_each_node_is_judged_and_one_that_fails_undoes_it_for
 #[test]
 fn one_that_has_ended_is_forgotten_and_one_that_failed_before_is_not_tried() {
     let mut w = world(Some("robot-1"), vec![rollout("slam", 0, "canary")]);
-    assert!(!w.gate.follow(&w.served, w.start), "nothing is new");
+    assert!(!w.gate.follow(&w.served), "nothing is new");
     w.served
         .load(state(11, documents(vec![rollout("slam", 0, "promoted")])), Source::Copy)
         .unwrap();
     w.served.flush(w.start);
-    assert!(w.gate.follow(&w.served, w.start));
+    assert!(w.gate.follow(&w.served));
     assert_eq!(w.phases(), []);
 
     let mut served = Served::new(site(Some("robot-1")));
@@ -195,7 +230,7 @@ fn one_that_has_ended_is_forgotten_and_one_that_failed_before_is_not_tried() {
         .unwrap();
     served.flush(w.start);
     let mut gate = Gate::default();
-    gate.follow(&served, w.start);
+    gate.follow(&served);
     w = World { served, gate, ..w };
     assert_eq!(w.phases(), named(&[("robot-1", "failed")]));
     assert_eq!(w.hears(&complaint("slam/0@robot-1", Trouble::Rejected), 1), []);

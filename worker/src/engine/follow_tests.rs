@@ -145,3 +145,64 @@ async fn why_a_stream_was_ended_is_known_afterwards() {
     w.rest().await;
     assert_eq!(w.reason().await.unwrap(), "the service is ending");
 }
+
+#[tokio::test(start_paused = true)]
+async fn what_is_due_is_not_put_off_by_what_keeps_coming() {
+    let mut w = world();
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.acks.borrow_and_update();
+    // Always more than is taken at once.
+    for _ in 0..60 {
+        while let Ok(room) = w.sync.try_reserve() {
+            let (revision, digest) = (2, String::new());
+            room.send(SyncEvent::Said(Incoming::Bookmark { revision, digest }));
+        }
+        tokio::time::advance(Duration::from_millis(50)).await;
+    }
+    assert!(
+        w.acks.has_changed().unwrap(),
+        "the main service is told within three seconds"
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn texts_that_come_in_the_middle_of_what_was_missed_are_told_with_the_rest() {
+    let secret = |revision, value: Value| {
+        let spec = json!({ "config": { "rate_hz": revision, "password": { "$secret": value } } });
+        document("Service/slam", revision, spec)
+    };
+    let mut all = documents(30);
+    all[3] = secret(2, json!({ "redacted": true, "version": 2 }));
+    let loaded = Loaded {
+        position: Position {
+            store_id: "s".to_owned(),
+            layer: "edge".parse().unwrap(),
+            revision: 2,
+            as_of: Timestamp::from_millis(1_000),
+        },
+        documents: all.into_iter().map(Arc::new).collect(),
+        notes: Arc::default(),
+    };
+    let mut w = world_from(Some(loaded), true);
+    w.rest().await;
+    w.goes_on(PROTOCOL, 5).await;
+    w.says(commit(
+        3,
+        2,
+        vec![(Op::Update, secret(3, json!({ "text": "canary", "version": 2 })))],
+    ))
+    .await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(w.slam().await["config"]["rate_hz"], 2, "no step is shown");
+    for revision in 4..=5 {
+        let later = secret(revision, json!({ "text": "canary", "version": 2 }));
+        w.says(commit(revision, revision - 1, vec![(Op::Update, later)])).await;
+    }
+    let told = w.rest().await;
+    assert!(
+        rates(&told).iter().all(|rate| *rate == 5) && !told.is_empty(),
+        "{told:?}"
+    );
+    assert_eq!(w.slam().await["config"]["password"], "canary");
+}

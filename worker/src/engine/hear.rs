@@ -89,6 +89,7 @@ impl Engine {
                 tracing::warn!(rollout = %failure.name, reason, "a roll-out has failed here and is undone");
                 self.counts.failed_rollouts += 1;
                 self.served.fail_rollout(&failure.uid);
+                self.has_undone = true;
                 self.notes.fail(&failure.uid);
                 // A new life must not try it again, whether it tells anybody of the former configuration or not.
                 self.keep_notes();
@@ -101,11 +102,24 @@ impl Engine {
         }
     }
 
-    /// Roll-outs that began or ended with what was told just now.
+    /// Roll-outs that began or ended with what is shown, and windows of those that services were told of by now.
     pub(super) fn follow_rollouts(&mut self) {
-        if self.gate.follow(&self.served, Instant::now().into_std()) {
+        let now = Instant::now().into_std();
+        let is_changed = self.gate.follow(&self.served);
+        if self.gate.open(self.told_up_to(), now) || is_changed {
             self.acknowledge_soon();
         }
+    }
+
+    /// Everything up to this revision services have been told: by this worker, or, where it does not tell, by others.
+    fn told_up_to(&self) -> Option<u64> {
+        let shown = self.served.state().revision();
+        if self.tells {
+            let untold = self.outputs.speaker.untold();
+            return Some(untold.map_or(shown, |first| first.saturating_sub(1)));
+        }
+        let (noted, shown) = (self.noted.as_ref()?, self.shown.as_ref()?);
+        (noted.store_id == shown.store_id).then_some(noted.revision)
     }
 
     /// The main service is to know soon, together with what comes until then.

@@ -10,7 +10,7 @@ use crate::copy::{LocalCopy, Target};
 use crate::core::testing::labelled;
 
 /// A roll-out of another rate of `slam` on `robot-1`, watched for 60 s.
-fn rollout(revision: u64, uid: &str, rate: u64) -> Document {
+pub(super) fn rollout(revision: u64, uid: &str, rate: u64) -> Document {
     let spec = json!({ "target": { "kind": "Service", "name": "slam" }, "patch": { "config": { "rate_hz": rate } },
         "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 60, "max_unhealthy": 0 } });
     let mut out = document("Rollout/faster", revision, spec);
@@ -19,7 +19,7 @@ fn rollout(revision: u64, uid: &str, rate: u64) -> Document {
     out
 }
 
-fn canary_documents() -> Vec<Document> {
+pub(super) fn canary_documents() -> Vec<Document> {
     let mut out = documents(30);
     out.retain(|document| document.key.to_string() != "Node/robot-1");
     out.push(labelled(
@@ -37,8 +37,9 @@ fn copies() -> (Supervisor, Arc<Fake>, Copies) {
     let target = Target {
         copy: Arc::clone(&fake) as Arc<dyn LocalCopy>,
         is_current: false,
+        is_read: true,
     };
-    let copies = Copies::start(&supervisor, vec![target], &Arc::default());
+    let copies = Copies::start(&supervisor, vec![target], &Arc::default(), &mpsc::channel(1).0);
     (supervisor, fake, copies)
 }
 
@@ -63,7 +64,7 @@ impl World {
     }
 
     /// Rates that the instance `0` was told of.
-    async fn rates(&mut self) -> Vec<Value> {
+    pub(super) async fn rates(&mut self) -> Vec<Value> {
         let told = self.rest().await.into_iter().filter_map(|seen| match seen {
             Seen::Notice(_, notice) if notice["instance"] == "0" => Some(notice["config"]["rate_hz"].clone()),
             Seen::Notice(..) | Seen::Key(..) | Seen::TakenAway(..) => None,
@@ -71,7 +72,7 @@ impl World {
         told.collect()
     }
 
-    async fn acks(&self, instance: &str, hash: &Value, status: &str) {
+    pub(super) async fn acks(&self, instance: &str, hash: &Value, status: &str) {
         let ack = json!({ "service": "slam", "instance": instance, "node": "robot-1", "revision": 9, "hash": hash,
             "status": status, "detail": "too fast" });
         self.signs.send(Sign::Ack(Bytes::from(ack.to_string()))).await.unwrap();
@@ -245,5 +246,34 @@ async fn a_record_that_is_gone_from_redis_fails_it_and_an_outage_does_not() {
     w.signs.send(scan(Vec::new(), false)).await.unwrap();
     assert_eq!(w.rates().await, [] as [Value; 0]);
     w.signs.send(scan(Vec::new(), true)).await.unwrap();
+    assert_eq!(w.rates().await, [json!(30)]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn its_window_begins_when_services_are_told_of_it_and_not_before() {
+    let mut w = world().with_canary().await;
+    w.up.send_replace(false);
+    assert_eq!(w.tries(3, "u-1", 500).await, [] as [Value; 0]);
+    tokio::time::sleep(Duration::from_secs(120)).await;
+    assert_eq!(w.status().await.json["rollouts"][0]["phase"], "pending");
+    w.up.send_replace(true);
+    assert_eq!(w.rates().await, [json!(500)]);
+    assert_eq!(w.reported("applied").await.uid, "u-1");
+    tokio::time::sleep(Duration::from_secs(40)).await;
+    w.acks("0", &json!(null), "rejected").await;
+    assert_eq!(w.rates().await, [json!(30)]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn where_nobody_leads_a_window_begins_with_the_next_leader() {
+    let mut w = world_from(None, false);
+    let mut documents = canary_documents();
+    documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
+    w.opens(documents, 2).await;
+    assert_eq!(w.tries(3, "u-1", 500).await, [] as [Value; 0]);
+    tokio::time::sleep(Duration::from_secs(120)).await;
+    w.leader.send_replace(Some(1));
+    assert_eq!(w.rates().await, [json!(500)]);
+    w.acks("0", &json!(null), "rejected").await;
     assert_eq!(w.rates().await, [json!(30)]);
 }

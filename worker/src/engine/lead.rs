@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::missed::Left;
+use super::missed::{Left, Since};
 use super::{Engine, SETTLE, WAIT_FOR_OTHERS};
 use crate::core::Notice;
 use crate::lease::Mark;
@@ -46,6 +46,7 @@ impl Engine {
     /// Services were told so far, whoever did it.
     pub(super) fn note_told(&mut self, mark: Option<Mark>) {
         self.noted = mark;
+        self.follow_rollouts();
         self.settle_soon();
     }
 
@@ -127,7 +128,17 @@ impl Engine {
         if !std::mem::replace(&mut self.tells, false) {
             return;
         }
-        let (now, shown) = (Instant::now(), self.shown.clone());
+        let now = Instant::now();
+        let is_all = |mark: &Option<Mark>| {
+            mark.as_ref()
+                .zip(self.shown.as_ref())
+                .is_some_and(|(mark, shown)| mark.covers(shown))
+        };
+        let since = Since {
+            mark: self.shown.clone(),
+            // What waits although all of this state was marked as told came without a commit, or is told once more.
+            is_undone: is_all(&self.noted) || is_all(&self.outputs.told.borrow()),
+        };
         let speaker = &self.outputs.speaker;
         for place in self
             .unnoted
@@ -136,11 +147,11 @@ impl Engine {
         {
             let before = self.notes.told(&place.at(&self.identity.site));
             let before = before.and_then(|before| before.hash.as_deref()).map(str::to_owned);
-            self.missed.note_unknown(place, before, shown.clone(), now);
+            self.missed.note_unknown(place, before, since.clone(), now);
         }
         for (place, notice) in std::mem::take(&mut self.farewells) {
             if speaker.is_waiting(&place.to_string()) {
-                self.missed.note(&notice, shown.clone(), now);
+                self.missed.note(&notice, since.clone(), now);
             }
         }
         speaker.clear();
@@ -190,6 +201,7 @@ impl Engine {
         if self.tells {
             self.leave_mark();
         }
+        self.follow_rollouts();
         let is_done = is_all_told && self.unnoted.is_empty() && self.farewells.is_empty() && self.missed.len() == 0;
         if !is_done {
             self.settle_soon();

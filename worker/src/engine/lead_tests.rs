@@ -1,5 +1,6 @@
 //! Who tells, and what a new leader makes up for.
 
+use super::hear::{canary_documents, rollout};
 use super::*;
 use crate::serve::SpeakerCounts;
 
@@ -122,6 +123,44 @@ async fn only_the_paths_that_changed_since_it_was_told_are_told() {
         (&json!(["/rate_hz"]), &json!(["service"]))
     );
     assert!(notice["previous_hash"].is_string());
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_was_undone_at_the_very_revision_of_the_mark_is_told_if_the_leader_dies_over_it() {
+    let mut w = world_from(None, false);
+    let mut documents = canary_documents();
+    documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
+    w.opens(documents, 2).await;
+    w.says(commit(3, 2, vec![(Op::Update, rollout(3, "u-1", 500))])).await;
+    w.rest().await;
+    w.noted.send_replace(Some(mark(3)));
+    tokio::time::sleep(Duration::from_secs(20)).await;
+    w.acks("0", &json!(null), "rejected").await;
+    // Whoever leads has heard the same, and is frozen before it tells what it is again.
+    tokio::time::sleep(Duration::from_secs(600)).await;
+    assert_eq!(w.rest().await, []);
+    w.leader.send_replace(Some(1));
+    assert_eq!(w.rates().await, [json!(30)]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_was_undone_is_not_told_again_once_a_later_mark_says_that_it_was_told() {
+    let mut w = world_from(None, false);
+    let mut documents = canary_documents();
+    documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
+    w.opens(documents, 2).await;
+    w.says(commit(3, 2, vec![(Op::Update, rollout(3, "u-1", 500))])).await;
+    w.rest().await;
+    w.noted.send_replace(Some(mark(3)));
+    w.acks("0", &json!(null), "rejected").await;
+    w.rest().await;
+    let mut failed = rollout(4, "u-1", 500);
+    failed.status = Some(json!({ "phase": "failed" }));
+    w.says(commit(4, 3, vec![(Op::Update, failed)])).await;
+    w.noted.send_replace(Some(mark(4)));
+    tokio::time::sleep(Duration::from_secs(60)).await;
+    w.leader.send_replace(Some(1));
+    assert_eq!(w.rates().await, [] as [Value; 0]);
 }
 
 #[tokio::test(start_paused = true)]

@@ -5,6 +5,9 @@
 //!                                             └───── this worker begins to tell ─▶ one notice each, of how it is by then
 //! ```
 //!
+//! A roll-out is undone without any commit: a mark of the very state may have been left before, so that only a later one says
+//! that it was told ([`Since`]).
+//!
 //! Of each place only what differs is kept, no configuration: it is the one that counts when it is told.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -22,6 +25,24 @@ const RECENT: Duration = Duration::from_secs(15);
 const MAX_PLACES: usize = 20_000;
 /// Paths that are kept of one place; beyond, all of its configuration counts as changed.
 const MAX_PATHS: usize = 1_000;
+
+/// What a place is to hear follows from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Since {
+    /// The state; `None`: none of a main service.
+    pub(super) mark: Option<Mark>,
+    /// Something was undone in this state, after it may have been marked as told.
+    pub(super) is_undone: bool,
+}
+
+impl Since {
+    fn is_covered_by(&self, told: &Mark) -> bool {
+        self.mark.as_ref().is_some_and(|mark| match self.is_undone {
+            true => told.covers(mark) && told.revision > mark.revision,
+            false => told.covers(mark),
+        })
+    }
+}
 
 /// How a place's configuration differs from what it was told last, as far as this worker knows.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -57,8 +78,7 @@ struct Entry {
     /// In which order it was noted.
     number: u64,
     at: Instant,
-    /// The state that it follows from; `None`: none of a main service.
-    mark: Option<Mark>,
+    since: Since,
     difference: Difference,
     /// That its service is deleted.
     gone: Option<Notice>,
@@ -82,42 +102,38 @@ pub(super) struct Missed {
 
 impl Missed {
     /// Notes that a place should hear of this.
-    pub(super) fn note(&mut self, notice: &Notice, mark: Option<Mark>, now: Instant) {
+    pub(super) fn note(&mut self, notice: &Notice, mut since: Since, now: Instant) {
         let mut difference = Difference::of(notice);
         let place = notice.place.clone();
         if let Some(before) = self.remove(&place) {
             let mut whole = before.difference;
             whole.and(difference);
             difference = whole;
+            // Whoever leads may have told of the change before it undid the other.
+            since.is_undone |= before.since.is_undone;
         }
         let gone = notice.hash.is_none().then(|| notice.clone());
-        self.insert(place, now, mark, difference, gone);
+        self.insert(place, now, since, difference, gone);
     }
 
     /// Notes that a place should hear how it is, because nobody knows what it has heard since.
-    pub(super) fn note_unknown(
-        &mut self,
-        place: &Place,
-        previous_hash: Option<String>,
-        mark: Option<Mark>,
-        now: Instant,
-    ) {
+    pub(super) fn note_unknown(&mut self, place: &Place, previous_hash: Option<String>, since: Since, now: Instant) {
         self.remove(place);
         let difference = Difference {
             previous_hash,
             paths: None,
             scopes: BTreeSet::new(),
         };
-        self.insert(place.clone(), now, mark, difference, None);
+        self.insert(place.clone(), now, since, difference, None);
     }
 
-    fn insert(&mut self, place: Place, at: Instant, mark: Option<Mark>, difference: Difference, gone: Option<Notice>) {
+    fn insert(&mut self, place: Place, at: Instant, since: Since, difference: Difference, gone: Option<Notice>) {
         self.numbers += 1;
         self.order.insert(self.numbers, place.clone());
         let entry = Entry {
             number: self.numbers,
             at,
-            mark,
+            since,
             difference,
             gone,
         };
@@ -145,13 +161,14 @@ impl Missed {
 
     /// Services were told so far, whoever did it.
     pub(super) fn confirm(&mut self, told: &Mark, now: Instant) {
-        self.forget_old(now, |entry| entry.mark.as_ref().is_some_and(|mark| told.covers(mark)));
+        self.forget_old(now, |entry| entry.since.is_covered_by(told));
     }
 
     /// What followed from no store, or another one than this, is over.
     pub(super) fn confirm_others(&mut self, store_id: &str, now: Instant) {
         self.forget_old(now, |entry| {
-            entry.mark.as_ref().is_none_or(|mark| mark.store_id != store_id)
+            let mark = entry.since.mark.as_ref();
+            mark.is_none_or(|mark| mark.store_id != store_id)
         });
     }
 
@@ -224,6 +241,20 @@ mod tests {
         }
     }
 
+    fn since(revision: u64) -> Since {
+        Since {
+            mark: Some(mark(revision)),
+            is_undone: false,
+        }
+    }
+
+    fn since_nothing() -> Since {
+        Since {
+            mark: None,
+            is_undone: false,
+        }
+    }
+
     fn mark(revision: u64) -> Mark {
         Mark {
             store_id: "s".to_owned(),
@@ -234,9 +265,9 @@ mod tests {
     #[test]
     fn several_changes_of_a_place_become_one_from_the_first_to_the_last() {
         let (mut missed, now) = (Missed::default(), Instant::now());
-        missed.note(&notice("slam", "a", &["/x"], Some("b")), Some(mark(1)), now);
-        missed.note(&notice("nav", "p", &["/n"], Some("q")), Some(mark(1)), now);
-        missed.note(&notice("slam", "b", &["/y"], Some("c")), Some(mark(2)), now);
+        missed.note(&notice("slam", "a", &["/x"], Some("b")), since(1), now);
+        missed.note(&notice("nav", "p", &["/n"], Some("q")), since(1), now);
+        missed.note(&notice("slam", "b", &["/y"], Some("c")), since(2), now);
         let left = missed.take();
         let names: Vec<&str> = left.iter().map(|left| left.place.service.as_str()).collect();
         assert_eq!(names, ["nav", "slam"], "in the order of the last changes");
@@ -252,9 +283,9 @@ mod tests {
     #[test]
     fn what_is_marked_as_told_is_forgotten_once_it_is_old() {
         let (mut missed, now) = (Missed::default(), Instant::now());
-        missed.note(&notice("slam", "a", &[], Some("b")), Some(mark(5)), now);
-        missed.note(&notice("nav", "a", &[], Some("b")), Some(mark(6)), now);
-        missed.note(&notice("file", "a", &[], Some("b")), None, now);
+        missed.note(&notice("slam", "a", &[], Some("b")), since(5), now);
+        missed.note(&notice("nav", "a", &[], Some("b")), since(6), now);
+        missed.note(&notice("file", "a", &[], Some("b")), since_nothing(), now);
         missed.confirm(&mark(5), now);
         assert_eq!(missed.len(), 3, "the broker may have lost it");
         let later = now + RECENT + Duration::from_millis(1);
@@ -267,7 +298,7 @@ mod tests {
         missed.confirm(&other, later);
         missed.confirm(&mark(99), later);
         assert!(missed.contains(&place("file")) && missed.len() == 1);
-        missed.note(&notice("own", "a", &[], Some("b")), Some(mark(100)), now);
+        missed.note(&notice("own", "a", &[], Some("b")), since(100), now);
         missed.confirm_others("s", now);
         assert_eq!(missed.len(), 2, "whoever told it may have died over it");
         missed.confirm_others("s", later);
@@ -275,10 +306,30 @@ mod tests {
     }
 
     #[test]
+    fn what_was_undone_is_told_only_by_a_mark_of_a_later_state() {
+        let (mut missed, now) = (Missed::default(), Instant::now());
+        let undone = Since {
+            is_undone: true,
+            ..since(5)
+        };
+        missed.note(&notice("slam", "a", &[], Some("b")), undone, now);
+        missed.note(&notice("nav", "a", &[], Some("b")), since(5), now);
+        let later = now + RECENT + Duration::from_millis(1);
+        missed.confirm(&mark(5), later);
+        assert!(missed.contains(&place("slam")) && !missed.contains(&place("nav")));
+        // A change that comes on top may have been told before that.
+        missed.note(&notice("slam", "b", &[], Some("c")), since(6), now);
+        missed.confirm(&mark(6), later);
+        assert!(missed.contains(&place("slam")));
+        missed.confirm(&mark(7), later);
+        assert!(!missed.contains(&place("slam")));
+    }
+
+    #[test]
     fn a_deletion_is_told_also_where_nobody_is_told_of_changes_any_more() {
         let (mut missed, now) = (Missed::default(), Instant::now());
-        missed.note(&notice("gone", "a", &[], None), Some(mark(1)), now);
-        missed.note(&notice("slam", "a", &[], Some("b")), Some(mark(1)), now);
+        missed.note(&notice("gone", "a", &[], None), since(1), now);
+        missed.note(&notice("slam", "a", &[], Some("b")), since(1), now);
         missed.forget(&place("gone"));
         missed.forget(&place("slam"));
         let left = missed.take();
@@ -290,7 +341,11 @@ mod tests {
     fn the_places_are_bounded_and_what_is_left_out_is_counted() {
         let (mut missed, now) = (Missed::default(), Instant::now());
         for number in 0..=MAX_PLACES {
-            missed.note(&notice(&format!("s{number}"), "a", &[], Some("b")), None, now);
+            missed.note(
+                &notice(&format!("s{number}"), "a", &[], Some("b")),
+                since_nothing(),
+                now,
+            );
         }
         assert_eq!(
             (missed.len(), missed.dropped(), missed.order.len()),
@@ -304,8 +359,8 @@ mod tests {
         let (mut missed, now) = (Missed::default(), Instant::now());
         let many: Vec<String> = (0..=MAX_PATHS).map(|number| format!("/p{number}")).collect();
         let many: Vec<&str> = many.iter().map(String::as_str).collect();
-        missed.note(&notice("slam", "a", &many, Some("b")), None, now);
-        missed.note(&notice("slam", "b", &["/x"], Some("c")), None, now);
+        missed.note(&notice("slam", "a", &many, Some("b")), since_nothing(), now);
+        missed.note(&notice("slam", "b", &["/x"], Some("c")), since_nothing(), now);
         assert_eq!(missed.take()[0].difference.paths, None);
     }
 }

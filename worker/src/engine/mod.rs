@@ -6,6 +6,7 @@
 //! broker: get ──────────────▶│ Engine │──reply─────────▶ broker
 //! acks, watchdogs: Sign ────▶│        │
 //! mounted file ─────────────▶│        │──Told──────────▶ serve::Speaker ─▶ keys, notices
+//! copies: Found ────────────▶│        │
 //! lease: leader? ───────────▶│        │──Update────────▶ copy::Copies
 //! admin: Query ─────────────▶└────────┘
 //! ```
@@ -13,6 +14,7 @@
 mod ask;
 mod fade;
 mod follow;
+mod found;
 mod hear;
 mod lead;
 mod missed;
@@ -29,7 +31,7 @@ use std::time::Duration;
 
 use blaze_domain::LayerName;
 use blaze_domain::config::state::State;
-use blaze_domain::config::{Kind, Timestamp};
+use blaze_domain::config::{Document, Kind, Timestamp};
 use blaze_proto::v1;
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
@@ -73,6 +75,8 @@ pub struct Engine {
     wants_all: bool,
     /// The text of a secret is not here.
     lacks_texts: bool,
+    /// It has come, and nobody has been told yet.
+    owes_texts: bool,
     /// Until then whoever has secrets gets everything, also if the hash is the same: the texts have come just now.
     texts_until: Option<Instant>,
     signs: Signs,
@@ -89,6 +93,8 @@ pub struct Engine {
     led_at: Instant,
     /// It leads and knows enough to tell services of it.
     tells: bool,
+    /// A roll-out was undone here, and the state without it is not shown yet.
+    has_undone: bool,
     /// How far services were told, by whomever.
     noted: Option<Mark>,
     /// The state that is shown.
@@ -132,6 +138,7 @@ impl Engine {
             notes: Notes::default(),
             wants_all: false,
             lacks_texts: false,
+            owes_texts: false,
             texts_until: None,
             signs: Signs::new(identity.site.clone()),
             gate: Gate::default(),
@@ -142,6 +149,7 @@ impl Engine {
             leads: None,
             led_at: now,
             tells: false,
+            has_undone: false,
             noted: None,
             shown: None,
             flushed: None,
@@ -175,10 +183,7 @@ impl Engine {
             as_of,
             ..
         } = loaded.position;
-        let mut state = State::new(revision, []);
-        for document in loaded.documents {
-            state.put(self.identity.delivery.kept(document));
-        }
+        let state = self.state_of(revision, loaded.documents);
         let told = tell::told_of(&loaded.notes);
         let failed: Vec<String> = loaded.notes.failed().map(str::to_owned).collect();
         self.served.restore(told, failed, now.into_std());
@@ -190,10 +195,23 @@ impl Engine {
         }
         self.lacks_texts = lacks_texts(self.replica.state());
         self.fade_from_notes();
-        self.note_services([Kind::Service]);
+        self.note_all_services();
         self.flush_at = Some(now);
         // The one of the copies that is behind the other catches up.
         self.keep(Changed::Keys(Vec::new()));
+    }
+
+    /// Documents of a copy or of a file, as they are kept here.
+    fn state_of(&self, revision: u64, documents: impl IntoIterator<Item = Arc<Document>>) -> State {
+        let mut state = State::new(revision, []);
+        for document in documents {
+            state.put(self.identity.delivery.kept(document));
+        }
+        state
+    }
+
+    fn note_all_services(&mut self) {
+        self.note_services([Kind::Service]);
     }
 
     /// Works until `stop`.
@@ -210,6 +228,7 @@ impl Engine {
                 () = stop.cancelled() => return,
                 () = sleep_until(flush_at.unwrap_or_else(Instant::now)), if flush_at.is_some() => self.flush(),
                 Some(query) = inputs.queries.recv() => self.answer_query(query),
+                Some(found) = inputs.found.recv() => self.on_found(found),
                 // Before the term that it is of: whoever takes over tells what others have not.
                 Ok(()) = inputs.noted.changed() => {
                     let mark = inputs.noted.borrow_and_update().clone();
@@ -219,10 +238,13 @@ impl Engine {
                     let term = *inputs.leader.borrow_and_update();
                     self.lead(term);
                 }
+                // What is due is done before what comes, of which there may always be more. Each of these is due again only later.
                 () = sleep_until(self.look_at) => {
                     self.look_at_signs();
                     self.look_at_fading();
                 }
+                () = sleep_until(settle_at.unwrap_or_else(Instant::now)), if settle_at.is_some() => self.settle(),
+                () = sleep_until(self.ack_at) => self.acknowledge(),
                 Some(event) = inputs.sync.recv() => self.on_sync(event),
                 Some(sign) = inputs.signs.recv() => self.on_sign(sign),
                 Some(request) = inputs.gets.recv() => self.on_get(&request),
@@ -230,8 +252,6 @@ impl Engine {
                     let status = inputs.defaults.borrow_and_update().clone();
                     self.take_defaults(&status);
                 }
-                () = sleep_until(settle_at.unwrap_or_else(Instant::now)), if settle_at.is_some() => self.settle(),
-                () = sleep_until(self.ack_at) => self.acknowledge(),
             }
         }
     }
@@ -286,13 +306,10 @@ impl Engine {
     fn take_defaults(&mut self, status: &defaults::Status) {
         self.defaults_problem = status.problem.as_ref().map(ToString::to_string);
         let Some(current) = &status.current else { return };
-        let mut state = State::new(0, []);
-        for document in &current.documents {
-            state.put(self.identity.delivery.kept(Arc::clone(document)));
-        }
+        let state = self.state_of(0, current.documents.iter().cloned());
         // What came from the main service or a copy of it is better.
         if self.served.load(state, Source::File).is_ok() {
-            self.note_services([Kind::Service]);
+            self.note_all_services();
             self.flush_soon();
         }
     }

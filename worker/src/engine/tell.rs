@@ -12,6 +12,7 @@ use bytes::Bytes;
 use tokio::time::Instant;
 
 use super::fade::record_key;
+use super::missed::Since;
 use super::{Engine, TOGETHER, lacks_texts, now};
 use crate::copy::{Notes, Told as Noted, lacks_text};
 use crate::core::messages::{self, Delivery, GetRequest};
@@ -72,6 +73,10 @@ impl Engine {
         } = self.served.flush(instant.into_std());
         self.counts.notices += notices.len() as u64;
         self.shown = self.mark();
+        let since = Since {
+            mark: self.shown.clone(),
+            is_undone: std::mem::take(&mut self.has_undone),
+        };
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
         // First what goes: an instance that moves has the same key there.
         for place in &untracked {
@@ -93,7 +98,7 @@ impl Engine {
         {
             match self.tells {
                 true => told.extend(self.of_notice(notice)),
-                false => self.missed.note(notice, self.shown.clone(), instant),
+                false => self.missed.note(notice, since.clone(), instant),
             }
             if !untracked.contains(&notice.place) {
                 self.note(&notice.place, notice.revision, notice.hash.clone());
@@ -112,6 +117,7 @@ impl Engine {
             }
         }
         self.tell(told);
+        self.tell_texts();
         if is_first && self.tells {
             self.outputs.speaker.sweep_keys();
         }
@@ -131,7 +137,7 @@ impl Engine {
     }
 
     /// The texts of secrets have come, which were not there before: whoever has them redacted has the right hash, and yet not
-    /// what it needs.
+    /// what it needs. They are told with the change that they came with.
     pub(super) fn note_texts(&mut self, change: &Change) {
         let lacked = self.lacks_texts;
         // What is not changed is looked at only as long as something is missing.
@@ -142,11 +148,15 @@ impl Engine {
                 changed.any(|held| lacks_text(&held.document.spec))
             }
         };
-        if self.identity.delivery == Delivery::Redacted || !lacked || self.lacks_texts {
+        self.owes_texts |= self.identity.delivery == Delivery::Text && lacked && !self.lacks_texts;
+    }
+
+    /// Has them told, with what is shown now.
+    fn tell_texts(&mut self) {
+        if !std::mem::take(&mut self.owes_texts) {
             return;
         }
         self.texts_until = Some(Instant::now() + TEXTS);
-        self.flush();
         let told: Vec<Told> = self
             .places()
             .iter()

@@ -30,6 +30,14 @@ pub enum OutletError {
     /// The broker does not answer.
     #[error("the broker is away: {0}")]
     Away(String),
+    /// The broker has these channels not yet; it may have others. The keys were changed, no message was published.
+    #[error("{} channels are not there yet: {reason}", channels.len())]
+    NotYet {
+        /// Where it was to go.
+        channels: BTreeSet<ChannelName>,
+        /// What one of them waits for.
+        reason: String,
+    },
     /// It is more than the broker carries.
     #[error("{bytes} bytes are more than the broker carries")]
     TooLarge {
@@ -57,7 +65,7 @@ impl OutletError {
                 BrokerError::Name { .. } | BrokerError::Collision { .. } => true,
                 BrokerError::Closed | BrokerError::Away(_) | BrokerError::TooManyChannels(_) => false,
             },
-            Self::Away(_) | Self::Led | Self::Keys(KeyError::Away { .. }) => false,
+            Self::Away(_) | Self::NotYet { .. } | Self::Led | Self::Keys(KeyError::Away { .. }) => false,
         }
     }
 }
@@ -66,6 +74,7 @@ impl From<WriteError> for OutletError {
     fn from(error: WriteError) -> Self {
         match error {
             WriteError::Broker(error) => Self::Broker(error),
+            WriteError::NotYet { channels, reason } => Self::NotYet { channels, reason },
             WriteError::TooLarge { bytes, .. } => Self::TooLarge { bytes },
         }
     }

@@ -9,6 +9,7 @@ use blaze_brokers::KeyedMessage;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::Notify;
+use tokio::time::{Instant, sleep_until};
 
 use super::outlet::{Outlet, OutletError};
 use super::waiting::State;
@@ -18,6 +19,8 @@ use crate::lease::Term;
 const BATCH: usize = 256;
 /// Upper bounds of the pause after a failure, which doubles; full jitter.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(20), Duration::from_millis(500));
+/// What is for a channel that is not there yet is set aside for so long, so that it does not hold up the rest.
+const ASIDE: Duration = Duration::from_millis(200);
 
 /// What is told of one place.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -131,7 +134,7 @@ impl Speaker {
             keys: count(&self.shared.keys),
             failures: count(&self.shared.failures),
             dropped: count(&self.shared.dropped),
-            waiting: self.shared.state.lock().order.len() as u64,
+            waiting: self.shared.state.lock().waiting.len() as u64,
         }
     }
 
@@ -152,7 +155,12 @@ impl Speaker {
 
     async fn speak(&self, outlet: &dyn Outlet) {
         let (mut pause, mut most) = (PAUSE.0, BATCH);
+        let mut aside: Option<Instant> = None;
         loop {
+            if aside.is_some_and(|until| until <= Instant::now()) {
+                aside = None;
+                self.shared.state.lock().bring_back();
+            }
             if self.term.is_on() {
                 self.sweep(outlet).await;
             }
@@ -166,7 +174,10 @@ impl Speaker {
                 (batch, changes)
             };
             if batch.is_empty() {
-                self.shared.more.notified().await;
+                tokio::select! {
+                    () = self.shared.more.notified() => {}
+                    () = sleep_until(aside.unwrap_or_else(Instant::now)), if aside.is_some() => {}
+                }
                 continue;
             }
             let messages: Vec<_> = batch
@@ -192,6 +203,14 @@ impl Speaker {
                     tracing::error!(%error, place, keys = ?batch.keys, "a service is not told of its configuration");
                     self.shared.state.lock().on_the_way.clear();
                     self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+                }
+                Err(OutletError::NotYet { channels, reason }) => {
+                    tracing::debug!(channels = channels.len(), reason, "services could not be told yet");
+                    self.shared.failures.fetch_add(1, Ordering::Relaxed);
+                    aside.get_or_insert(Instant::now() + ASIDE);
+                    let mut state = self.shared.state.lock();
+                    state.put_back(batch.without_keys());
+                    state.set_aside(&channels);
                 }
                 Err(error) => {
                     tracing::debug!(%error, "services could not be told");

@@ -17,6 +17,8 @@ struct Fake {
     own: Vec<String>,
     /// A channel that it refuses.
     refused: Option<&'static str>,
+    /// A channel that it has not yet.
+    missing: Option<&'static str>,
 }
 
 #[async_trait]
@@ -30,6 +32,15 @@ impl Outlet for Fake {
             .any(|message| Some(message.channel.as_str()) == self.refused)
         {
             return Err(OutletError::TooLarge { bytes: 1 });
+        }
+        let missing = messages
+            .iter()
+            .find(|message| Some(message.channel.as_str()) == self.missing);
+        if let Some(message) = missing {
+            return Err(OutletError::NotYet {
+                channels: [message.channel.clone()].into(),
+                reason: "told so".to_owned(),
+            });
         }
         self.delivered
             .send((changes.to_vec(), messages.to_vec()))
@@ -69,6 +80,7 @@ fn world(is_up: bool) -> World {
         delivered: send,
         own: vec!["blaze:config:old".to_owned(), "blaze:config:slam".to_owned()],
         refused: Some("blaze/config/changed/refused"),
+        missing: Some("blaze/config/changed/missing"),
     });
     let mut run = tokio::task::JoinSet::new();
     run.spawn(speaker.clone().run(outlet));
@@ -228,4 +240,25 @@ fn what_was_forgotten_does_not_come_back_and_is_not_missed() {
     state.put_back(batch);
     assert_eq!(state.untold(), None);
     assert!(state.take(BATCH).is_empty());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_channel_that_is_not_there_yet_holds_up_no_other_one_and_waits_on() {
+    let mut w = world(true);
+    w.speaker.tell([told("missing", "1"), told("slam", "1")]);
+    let mut notices = Vec::new();
+    while notices.is_empty() {
+        let (_, messages) = w.delivered.recv().await.unwrap();
+        notices.extend(messages.iter().map(|message| message.channel.to_string()));
+    }
+    assert_eq!(notices, ["blaze/config/changed/slam"]);
+    // It is tried again and again, and what comes meanwhile is told.
+    tokio::time::sleep(Duration::from_secs(10)).await;
+    w.speaker.tell([told("nav", "2")]);
+    let (_, messages) = w.delivered.recv().await.unwrap();
+    assert_eq!(messages[0].channel.as_str(), "blaze/config/changed/nav");
+    let counts = w.speaker.counts();
+    assert!((20..200).contains(&counts.failures), "{counts:?}");
+    assert_eq!((counts.waiting, counts.dropped), (1, 0));
+    assert!(w.speaker.is_waiting("missing") && w.speaker.untold() == Some(1));
 }

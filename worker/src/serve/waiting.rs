@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use blaze_brokers::KeyedMessage;
 use blaze_brokers::redis::KeyChange;
+use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 
 use super::Told;
@@ -27,7 +28,7 @@ pub(super) struct State {
     wanted: BTreeMap<String, Bytes>,
     /// Keys that are not as they should be; those that are not wanted are to go.
     dirty: BTreeSet<String>,
-    /// Places in the order in which they are told of; each stands here once.
+    /// Places in the order in which they are told of; each stands here once, but for those that were set aside.
     pub(super) order: BTreeMap<i64, String>,
     pub(super) waiting: BTreeMap<String, (i64, Waiting)>,
     /// Of the last that was put at the end, and of the first.
@@ -55,6 +56,12 @@ impl Batch {
 
     pub(super) fn len(&self) -> usize {
         self.keys.len() + self.waiting.len()
+    }
+
+    /// The same once its keys are as they should be.
+    pub(super) fn without_keys(mut self) -> Self {
+        self.keys.clear();
+        self
     }
 }
 
@@ -171,6 +178,22 @@ impl State {
                 }
             }
         }
+    }
+
+    /// What waits for these channels is not told until [`Self::bring_back`]; it waits on.
+    pub(super) fn set_aside(&mut self, channels: &BTreeSet<ChannelName>) {
+        let waiting = &self.waiting;
+        let is_of_these = |place: &String| {
+            let found = waiting.get(place);
+            found.is_some_and(|(_, waiting)| channels.contains(&waiting.notice.channel))
+        };
+        self.order.retain(|_, place| !is_of_these(place));
+    }
+
+    /// What was set aside is told again, where it stood.
+    pub(super) fn bring_back(&mut self) {
+        let places = self.waiting.iter().map(|(place, (at, _))| (*at, place.clone()));
+        self.order.extend(places);
     }
 
     /// All keys are to be written again, and those that came back are to go.

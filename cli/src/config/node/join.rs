@@ -90,6 +90,13 @@ async fn prepare(
     place: TokenPlace,
 ) -> Result<Plan, CliError> {
     let kind = kind_of(options, client).await?;
+    let key = key_of(Kind::Node, options.name.as_str())?;
+    let existing = client.existing(&key).await?;
+    // Whoever joins again need not say again where the node is.
+    let addresses = match &existing {
+        Some(answer) if options.addresses.is_empty() => plan::addresses_of(&answer.body),
+        Some(_) | None => options.addresses.clone(),
+    };
     let around = Around {
         server: &endpoint.url,
         ca_file: endpoint.ca_file.as_deref(),
@@ -98,10 +105,9 @@ async fn prepare(
             TokenPlace::File(file) => Some(file),
             TokenPlace::None | TokenPlace::Stdout => None,
         },
+        addresses: &addresses,
     };
     let (node_file, notes) = plan::node_file(options, &around)?;
-    let key = key_of(Kind::Node, options.name.as_str())?;
-    let existing = client.existing(&key).await?;
     let node = plan::document(options, existing.as_ref().map(|answer| &answer.body))?;
     let kept = match &place {
         TokenPlace::File(file) if !options.renew => token_file::inspect(file, options.layer.as_str(), now_ms())?,

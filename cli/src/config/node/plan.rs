@@ -91,6 +91,15 @@ pub(super) struct Around<'a> {
     pub(super) kind: &'a str,
     /// The token on this machine, if it is kept in a file.
     pub(super) token_file: Option<&'a Path>,
+    /// Addresses of the node: those of the options, else those that its document has.
+    pub(super) addresses: &'a [IpAddr],
+}
+
+/// Addresses that a document has. What is none is left out: it is the document's to say, and nothing of it is written.
+pub(super) fn addresses_of(document: &Value) -> Vec<IpAddr> {
+    let all = document.pointer("/spec/addresses").and_then(Value::as_array);
+    let texts = all.into_iter().flatten().filter_map(Value::as_str);
+    texts.filter_map(|text| text.parse().ok()).collect()
 }
 
 /// The node file, and what should be known of it.
@@ -111,7 +120,7 @@ pub(super) fn node_file(options: &JoinOptions, around: &Around<'_>) -> Result<(V
     let file = json!({
         "layer": { "name": options.layer, "kind": around.kind },
         "node": { "name": options.name },
-        "brokers": brokers(options, around.kind, &mut notes),
+        "brokers": brokers(options, around, &mut notes),
         "config": config,
         "state_dir": options.state_dir,
     });
@@ -151,9 +160,9 @@ fn grpc(options: &JoinOptions, around: &Around<'_>, notes: &mut Vec<String>) -> 
     Ok(url.as_str().trim_end_matches('/').to_owned())
 }
 
-fn brokers(options: &JoinOptions, kind: &str, notes: &mut Vec<String>) -> Value {
-    let is_edge = kind == "edge";
-    let own = options.addresses.iter().find_map(|address| match address {
+fn brokers(options: &JoinOptions, around: &Around<'_>, notes: &mut Vec<String>) -> Value {
+    let is_edge = around.kind == "edge";
+    let own = around.addresses.iter().find_map(|address| match address {
         IpAddr::V4(address) => Some(*address),
         IpAddr::V6(_) => None,
     });

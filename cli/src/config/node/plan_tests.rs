@@ -16,14 +16,20 @@ fn options(line: &str) -> JoinOptions {
 }
 
 fn file(line: &str, kind: &str) -> Result<(Value, Vec<String>), CliError> {
+    let options = options(line);
+    file_at(&options, kind, &options.addresses)
+}
+
+fn file_at(options: &JoinOptions, kind: &str, addresses: &[IpAddr]) -> Result<(Value, Vec<String>), CliError> {
     let server = "https://10.0.3.1:8443".parse().unwrap();
     let around = Around {
         server: &server,
         ca_file: Some(Path::new("/etc/blaze/ca.pem")),
         kind,
         token_file: Some(Path::new("/etc/blaze/token")),
+        addresses,
     };
-    node_file(&options(line), &around)
+    node_file(options, &around)
 }
 
 #[test]
@@ -49,6 +55,18 @@ fn an_edge_node_has_redis_and_fog_and_cloud_have_kafka() {
             json!({ "layer": { "kafka": { "bootstrap": ["127.0.0.1:9092"] } } })
         );
         assert!(notes[0].contains("--address"), "{notes:?}");
+    }
+}
+
+#[test]
+fn whoever_joins_again_without_an_address_gets_the_same_file() {
+    let first = "--address fe80::1 --address 10.0.1.1 --peer 10.0.3.1";
+    let there = document(&options(first), None).unwrap().body;
+    let addresses = addresses_of(&there);
+    let again = file_at(&options("--peer 10.0.3.1"), "edge", &addresses).unwrap();
+    assert_eq!(again, file(first, "edge").unwrap());
+    for none in [json!({}), json!({ "spec": { "addresses": ["robot-1.local", 7] } })] {
+        assert_eq!(addresses_of(&none), [] as [IpAddr; 0]);
     }
 }
 

@@ -39,7 +39,7 @@ impl Worker {
     async fn write(&self, messages: &[KeyedMessage]) {
         eventually("it is written", async || match self.side.write(messages).await {
             Ok(()) => true,
-            Err(WriteError::Broker(BrokerError::Away(_))) => false,
+            Err(WriteError::Broker(BrokerError::Away(_)) | WriteError::NotYet { .. }) => false,
             Err(error) => panic!("{error}"),
         })
         .await;
