@@ -159,13 +159,8 @@ impl Link {
         }
     }
 
-    /// Writes a record, and reads up to it; `false`: nobody knows what became of it.
-    pub(super) fn write(
-        &mut self,
-        owner: &str,
-        entry: &Entry,
-        deadline: Instant,
-    ) -> Result<Result<i64, String>, Broken> {
+    /// Writes a record, and reads up to it: its offset, or why nobody knows what became of it.
+    pub(super) fn write(&mut self, entry: &Entry, deadline: Instant) -> Result<Result<i64, String>, Broken> {
         let bytes = match entry.to_bytes() {
             Ok(bytes) => bytes,
             Err(error) => return Ok(Err(error)),
