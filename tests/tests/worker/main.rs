@@ -13,6 +13,7 @@
 //! kafka      what is special to Kafka
 //! leases     the suite of leases on real servers
 //! several    two workers of one layer, of which one is killed, stopped, or ended
+//! late       a database that answers only after the start
 //! killed     worker, broker and database killed behind a cut link
 //! rollouts   roll-outs that services judge
 //! secrets    what services are not told is nowhere
@@ -35,6 +36,7 @@ mod flow_live;
 mod kafka;
 mod killed;
 mod kit;
+mod late;
 mod layer;
 mod leases;
 mod outages;

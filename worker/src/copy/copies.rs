@@ -3,7 +3,8 @@
 //! ```text
 //! store(update) ──▶ slot of the database ──▶ task ──▶ advance, or replace after a failure
 //!               └─▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time, and once a second
-//!                                                      at most while the database has everything
+//!                                                      at most while the database keeps up
+//! could not be read at the start ─▶ task: load until it can be ──▶ Found ──▶ engine
 //! ```
 //!
 //! A slot holds one update: a newer one is merged into it and counted. So whoever stores never waits, a copy that is slow or
@@ -18,6 +19,7 @@ use std::time::Duration;
 use blaze_domain::config::Key;
 use blaze_domain::config::state::State;
 use blaze_runtime::{Supervisor, TaskPolicy};
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::Instant;
 
 use super::slot::{Next, Slot};
@@ -29,9 +31,11 @@ const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_
 const REST: u32 = 4;
 const REST_BOUNDS: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(10));
 
-/// It rests at least so long while another copy holds everything, and so may be this old when that one is lost: to write all documents for each change of one wears out
+/// It rests at least so long while another copy keeps up, and so may be this old when that one is lost: to write all documents for each change of one wears out
 /// flash memory, and is most of what a change costs a worker that it does not concern.
 const REST_BESIDE: Duration = Duration::from_secs(1);
+/// A copy keeps up that holds what was stored so long ago: what comes later is on its way there.
+const KEEPS_UP: Duration = Duration::from_millis(100);
 
 /// Where only the time of the position moves on, such a copy is written again when it is this old.
 const MAX_AGE: Duration = Duration::from_secs(300);
@@ -65,6 +69,21 @@ pub struct Target {
     pub copy: Arc<dyn LocalCopy>,
     /// It holds what the first update is counted from; else the first write is everything.
     pub is_current: bool,
+    /// What it holds is known, or that nobody here can read it; else it is read before anything is written.
+    pub is_read: bool,
+}
+
+/// What a copy holds that was not known at the start.
+#[derive(Debug)]
+pub struct Found {
+    /// Which copy.
+    pub place: String,
+    /// What it holds; perhaps something newer than what is served.
+    pub loaded: Loaded,
+    /// Another worker of the layer has written it meanwhile; else nobody knew what it holds.
+    pub is_of_another: bool,
+    /// To be told once that is taken into account: only then the copy is written.
+    pub taken: oneshot::Sender<()>,
 }
 
 /// What became of the updates, since the start.
@@ -93,16 +112,21 @@ pub struct Copies {
 }
 
 impl Copies {
-    /// Starts one task per copy. `notes` are those that the copies were started from.
+    /// Starts one task per copy. `notes` are those that the copies were started from; `found` takes what is read later.
     #[must_use]
-    pub fn start(supervisor: &Supervisor, targets: Vec<Target>, notes: &Arc<Notes>) -> Self {
+    pub fn start(
+        supervisor: &Supervisor,
+        targets: Vec<Target>,
+        notes: &Arc<Notes>,
+        found: &mpsc::Sender<Found>,
+    ) -> Self {
         let slot = |target: &Target| Arc::new(Slot::new(target.copy.describe(), notes));
         let slots: Arc<[Arc<Slot>]> = targets.iter().map(slot).collect();
         for (target, slot) in targets.into_iter().zip(&*slots) {
             let name = format!("copy to {}", slot.place);
             let (stop, writer) = (
                 supervisor.shutdown_token(),
-                Writer::new(target, Arc::clone(slot), Arc::clone(&slots)),
+                Writer::new(target, Arc::clone(slot), Arc::clone(&slots), found.clone()),
             );
             supervisor.spawn(name, TaskPolicy::Essential, async move {
                 tokio::select! {
@@ -173,6 +197,9 @@ struct Writer {
     slot: Arc<Slot>,
     /// Of all copies, this one too.
     all: Arc<[Arc<Slot>]>,
+    found: mpsc::Sender<Found>,
+    /// What the copy holds is known, or newer than nothing that is served.
+    is_read: bool,
     /// The copy holds what the next update is counted from.
     is_current: bool,
     failures: u32,
@@ -181,11 +208,13 @@ struct Writer {
 }
 
 impl Writer {
-    fn new(target: Target, slot: Arc<Slot>, all: Arc<[Arc<Slot>]>) -> Self {
+    fn new(target: Target, slot: Arc<Slot>, all: Arc<[Arc<Slot>]>, found: mpsc::Sender<Found>) -> Self {
         Self {
             copy: target.copy,
             slot,
             all,
+            found,
+            is_read: target.is_read,
             is_current: target.is_current,
             failures: 0,
             written: None,
@@ -194,54 +223,102 @@ impl Writer {
 
     async fn run(mut self) {
         loop {
-            let next = self.slot.waiting.lock().next.take();
-            match next {
+            if !self.is_read {
+                self.read(false).await;
+            }
+            match self.slot.take() {
                 None => self.slot.wake.notified().await,
-                Some(next) => {
-                    let pause = self.write_one(next).await;
-                    tokio::select! {
-                        () = tokio::time::sleep(pause) => {}
-                        () = self.slot.hurry.notified() => {}
-                    }
-                }
+                Some(next) => self.write_one(next).await,
             }
         }
     }
 
-    /// Writes, and says how long to rest.
-    async fn write_one(&mut self, next: Next) -> Duration {
+    /// Reads what is there, as soon as that can be done, and has it taken into account: it may be newer than what is served,
+    /// and then is not to be written over.
+    async fn read(&mut self, is_of_another: bool) {
+        loop {
+            match self.copy.load().await {
+                Ok(None) => break,
+                Ok(Some(loaded)) => {
+                    self.recovered();
+                    let (taken, is_taken) = oneshot::channel();
+                    let place = self.slot.place.clone();
+                    let found = Found {
+                        place,
+                        loaded,
+                        is_of_another,
+                        taken,
+                    };
+                    // Nobody is there only at the end.
+                    let _ = self.found.send(found).await;
+                    let _ = is_taken.await;
+                    break;
+                }
+                // What becomes of it is for the first write to decide.
+                Err(error) if error.is_unreadable() => break,
+                Err(error) => {
+                    let pause = self.failed(&error);
+                    self.pause(pause).await;
+                }
+            }
+        }
+        self.is_read = true;
+        self.recovered();
+    }
+
+    /// Writes, and rests for as long as that one is to.
+    async fn write_one(&mut self, next: Next) {
         if self.is_spared(&next) {
-            self.slot.done.send_replace(next.number);
-            return Duration::ZERO;
+            self.slot.finish(next.number);
+            return;
         }
         let began = Instant::now();
         let written = self.write(&next).await;
         self.is_current = written.is_ok();
         match written {
             Ok(()) => {
-                self.succeeded(next.number);
+                self.slot.written.fetch_add(1, Ordering::Relaxed);
+                self.recovered();
+                self.slot.finish(next.number);
                 self.written = Some(next.position);
                 if self.copy.writes_whole() {
-                    self.rest_after(began.elapsed())
-                } else {
-                    Duration::ZERO
+                    self.rest(began).await;
                 }
+            }
+            // Another process of this layer writes it and knows more, so that nothing of this is missing there.
+            Err(CopyError::Newer { .. }) => {
+                self.slot.finish(next.number);
+                self.read(true).await;
             }
             Err(error) => {
                 self.slot.put_back(next);
-                self.failed(&error)
+                let pause = self.failed(&error);
+                self.pause(pause).await;
             }
         }
     }
 
-    /// How long a copy rests that always writes everything.
-    fn rest_after(&self, taken: Duration) -> Duration {
-        let rest = (taken * REST).clamp(REST_BOUNDS.0, REST_BOUNDS.1);
+    /// How long a copy rests that always writes everything. By time alone: whether another one holds the newest at this very
+    /// instant is chance.
+    async fn rest(&self, began: Instant) {
+        let wrote = Instant::now();
+        let rest = ((wrote - began) * REST).clamp(REST_BOUNDS.0, REST_BOUNDS.1);
+        let mut is_over = self.pause(rest).await;
+        while !is_over && wrote.elapsed() < REST_BESIDE && self.another_keeps_up() {
+            is_over = self.pause(REST_BOUNDS.0).await;
+        }
+    }
+
+    fn another_keeps_up(&self) -> bool {
         let mut others = self.all.iter().filter(|slot| !Arc::ptr_eq(slot, &self.slot));
-        if others.any(|slot| slot.is_current()) {
-            rest.max(REST_BESIDE)
-        } else {
-            rest
+        others.any(|slot| slot.error.lock().is_none() && slot.lag() < KEEPS_UP)
+    }
+
+    /// Waits, unless somebody waits for this copy; returns whether somebody does.
+    async fn pause(&self, pause: Duration) -> bool {
+        tokio::select! {
+            () = tokio::time::sleep(pause) => false,
+            () = self.slot.hurry.notified() => true,
         }
     }
 
@@ -285,14 +362,13 @@ impl Writer {
         self.copy.replace(&whole).await
     }
 
-    fn succeeded(&mut self, number: u64) {
+    /// It can be used, whatever was the matter before.
+    fn recovered(&mut self) {
         let slot = &self.slot;
-        slot.written.fetch_add(1, Ordering::Relaxed);
         if slot.error.lock().take().is_some() {
-            tracing::info!(copy = slot.place, failures = self.failures, "the copy is written again");
+            tracing::info!(copy = slot.place, failures = self.failures, "the copy is there again");
         }
         self.failures = 0;
-        slot.done.send_replace(number);
     }
 
     fn failed(&mut self, error: &CopyError) -> Duration {

@@ -69,6 +69,16 @@ pub enum CopyError {
         /// Why.
         detail: String,
     },
+    /// It holds a later state of the same store, which nothing older replaces.
+    #[error("{place} is at revision {held} of this store, so that {offered} is not written over it")]
+    Newer {
+        /// Which copy.
+        place: String,
+        /// Its revision.
+        held: u64,
+        /// Of what was to be written.
+        offered: u64,
+    },
     /// `worker.key_file` is no key.
     #[error("worker.key_file: {detail}")]
     Key {
@@ -86,7 +96,12 @@ impl CopyError {
     pub fn is_unreadable(&self) -> bool {
         match self {
             Self::Broken { .. } | Self::OtherKey { .. } | Self::OtherLayer { .. } | Self::NewerFormat { .. } => true,
-            Self::Away { .. } | Self::Refused { .. } | Self::Behind { .. } | Self::Key { .. } | Self::Sealing => false,
+            Self::Away { .. }
+            | Self::Refused { .. }
+            | Self::Behind { .. }
+            | Self::Newer { .. }
+            | Self::Key { .. }
+            | Self::Sealing => false,
         }
     }
 }

@@ -66,8 +66,10 @@ impl LocalCopy for Fake {
 
     async fn replace(&self, whole: &Loaded) -> Result<(), CopyError> {
         self.call().await?;
+        let mut held = self.held.lock();
+        progress::check_whole(held.as_ref().map(|held| &held.position), &whole.position, self.name)?;
         self.replaced.fetch_add(1, Ordering::Relaxed);
-        *self.held.lock() = Some(whole.clone());
+        *held = Some(whole.clone());
         Ok(())
     }
 

@@ -7,14 +7,13 @@
 //! ```
 //!
 //! Reading changes nothing: a worker that was started with the wrong key finds its file when it is started with the right
-//! one. Only the first write moves away what cannot be read.
+//! one. Only the first write moves away what cannot be read. What is of a later revision of the same store stays.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read as _, Write as _};
 use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use async_trait::async_trait;
 use blaze_domain::LayerName;
@@ -42,8 +41,8 @@ struct Inner {
     steps: Steps,
     /// Held during a write.
     writing: Mutex<()>,
-    /// What is there is known to be readable, so that it may be written over.
-    is_known: AtomicBool,
+    /// How far what is there is, so that it is known what may be written over it; `None`: nobody has looked yet.
+    known: Mutex<Option<Position>>,
 }
 
 impl FileCopy {
@@ -60,7 +59,7 @@ impl FileCopy {
             vault,
             steps,
             writing: Mutex::new(()),
-            is_known: AtomicBool::new(false),
+            known: Mutex::default(),
         };
         Self { inner: Arc::new(inner) }
     }
@@ -153,7 +152,7 @@ impl Inner {
         if lost > 0 {
             tracing::warn!(file = %self.path.display(), lost, "secrets of the last-known-good file do not open");
         }
-        self.is_known.store(true, Ordering::Relaxed);
+        *self.known.lock() = Some(whole.position.clone());
         Ok(Some(whole))
     }
 
@@ -166,8 +165,17 @@ impl Inner {
             });
         }
         let _writing = self.writing.lock();
-        let is_known = self.is_known.load(Ordering::Relaxed);
-        let is_unreadable = !is_known && self.load().is_err_and(|error| error.is_unreadable());
+        let known = self.known.lock().clone();
+        let is_unreadable = match known {
+            Some(_) => false,
+            None => match self.load() {
+                Ok(_) => false,
+                Err(error) if error.is_unreadable() => true,
+                // It may hold anything.
+                Err(error) => return Err(error),
+            },
+        };
+        progress::check_whole(self.known.lock().as_ref(), &whole.position, &self.place())?;
         let temporary = beside(&self.path, "new");
         self.write_temporary(&temporary, &content)?;
         self.steps.pass()?;
@@ -176,7 +184,7 @@ impl Inner {
         }
         self.steps.pass()?;
         fs::rename(&temporary, &self.path).map_err(|error| self.failed(&error))?;
-        self.is_known.store(true, Ordering::Relaxed);
+        *self.known.lock() = Some(whole.position.clone());
         self.steps.pass()?;
         // The rename itself is in the folder.
         let folder = self.path.parent().unwrap_or(Path::new("."));

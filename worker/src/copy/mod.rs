@@ -6,7 +6,10 @@
 //!                      └─[newest state, coalesced]─▶ writer ──▶ FileCopy                    (last-known-good file)
 //!
 //! at the start:  local database, else last-known-good file  ([`choose`]), else mounted file  ([`defaults`])
+//! later:         a copy that could not be read at the start ──[Found]──▶ engine, before anything is written there
 //! ```
+//!
+//! A copy is never replaced by an older state of the same store: what was read in time may be older than what was not.
 //!
 //! A write is all or nothing: whoever dies in the middle of it leaves the old content or the new one, whole. Serving never
 //! waits for a write. A file that cannot be read is never written over: the first write moves it aside. In MongoDB a copy that
@@ -55,7 +58,7 @@ use blaze_domain::LayerName;
 use blaze_domain::config::secret::{self, Secret};
 use blaze_domain::config::{Document, Key, Timestamp};
 
-pub use copies::{Changed, Copies, Counts, Target, Update};
+pub use copies::{Changed, Copies, Counts, Found, Target, Update};
 pub use error::CopyError;
 pub use file::{FILE_NAME, FileCopy};
 pub use json::{FormError, document_from_json};
@@ -143,10 +146,10 @@ pub trait LocalCopy: Send + Sync {
     /// [`CopyError`].
     async fn load(&self) -> Result<Option<Loaded>, CopyError>;
 
-    /// Makes this the content, whatever was there before.
+    /// Makes this the content, whatever was there before but a later state of the same store.
     ///
     /// # Errors
-    /// [`CopyError`]; the old content is still there, or, where the answer was lost, the new one.
+    /// [`CopyError::Newer`] for that one; else [`CopyError`]: the old content is still there, or, where the answer was lost, the new one.
     async fn replace(&self, whole: &Loaded) -> Result<(), CopyError>;
 
     /// Takes over one or many commits at once: documents that are new or changed, and those that are gone. Notes that are

@@ -15,6 +15,8 @@
 //! A write whose answer is lost may reach the server late. So after a failure, and after a start, the next write is a
 //! `replace`, with a generation of its own: rows that come late belong to one that counts no more, and a head that comes
 //! late finds a newer generation and changes nothing. Generations begin with the time, later than that of the head.
+//!
+//! A head that names a later revision of the same store stays: another process wrote it, or this one in an earlier life.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -152,10 +154,11 @@ impl MongoCopy {
         }
         let tables = self.server.tables().await?;
         let present = self.head(&tables, ReadPreference::Primary).await?;
-        let read = present.as_ref().map(|present| rows::read_head(present, &self.place));
-        if let Some(Err(error @ CopyError::NewerFormat { .. })) = read {
+        match present.as_ref().map(|present| rows::read_head(present, &self.place)) {
             // An older version would lose what the newer one keeps there.
-            return Err(error);
+            Some(Err(error @ CopyError::NewerFormat { .. })) => return Err(error),
+            Some(Ok(held)) => progress::check_whole(Some(&held.position), &whole.position, &self.place)?,
+            Some(Err(_)) | None => {}
         }
         let present = present.as_ref().and_then(|present| present.get_str("generation").ok());
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
@@ -168,12 +171,9 @@ impl MongoCopy {
             position: whole.position.clone(),
         };
         self.steps.pass()?;
-        let newer = doc! { "$not": { "$gte": &generation } };
         let update = doc! { "$set": rows::write_head(&head) };
-        let moved = tables
-            .head
-            .update_one(doc! { "_id": &self.copy, "generation": newer }, update)
-            .upsert(true);
+        let older = rows::older_head(&self.copy, &head);
+        let moved = tables.head.update_one(older, update).upsert(true);
         match self.server.within(moved).await? {
             Err(error) if is_duplicate(&error) => return Err(self.taken(&whole.position)),
             moved => moved.map_err(|error| self.server.failed(&error)).map(|_| ())?,

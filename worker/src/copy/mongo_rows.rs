@@ -97,6 +97,19 @@ pub(super) fn write_head(head: &Head) -> Document {
     }
 }
 
+/// Filter for a head that this one may take the place of, with whatever is in it, unless it is of a later generation, or of a
+/// later revision of the same store.
+pub(super) fn older_head(copy: &str, head: &Head) -> Document {
+    let revision = i64::try_from(head.position.revision).unwrap_or(i64::MAX);
+    doc! {
+        "_id": copy, "generation": { "$not": { "$gte": &head.generation } },
+        "$or": [
+            { "store_id": { "$ne": &head.position.store_id } },
+            { "revision": { "$not": { "$gt": revision } } },
+        ],
+    }
+}
+
 /// Reads a head.
 ///
 /// # Errors

@@ -1,4 +1,4 @@
-//! What it takes to add a commit to a copy.
+//! What it takes to add a commit to a copy, or to replace what it holds.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -23,6 +23,21 @@ pub(super) fn check(held: Option<&Position>, to: &Position, place: &str) -> Resu
         revision: to.revision,
         detail,
     })
+}
+
+/// Whether what a copy holds may be replaced by a whole state.
+///
+/// # Errors
+/// [`CopyError::Newer`].
+pub(super) fn check_whole(held: Option<&Position>, to: &Position, place: &str) -> Result<(), CopyError> {
+    match held {
+        Some(held) if held.store_id == to.store_id && held.revision > to.revision => Err(CopyError::Newer {
+            place: place.to_owned(),
+            held: held.revision,
+            offered: to.revision,
+        }),
+        Some(_) | None => Ok(()),
+    }
 }
 
 /// A copy with commits added to it.

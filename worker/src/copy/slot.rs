@@ -3,11 +3,13 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use blaze_domain::config::Key;
 use blaze_domain::config::state::State;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
+use tokio::time::Instant;
 
 use super::copies::{Changed, Counts, Update};
 use super::{Notes, Position};
@@ -34,6 +36,8 @@ pub(super) struct Slot {
 
 pub(super) struct Waiting {
     pub(super) next: Option<Next>,
+    /// Since when what is being written just now has waited.
+    pub(super) in_hand: Option<Instant>,
     /// The newest, for a write of everything.
     pub(super) notes: Arc<Notes>,
 }
@@ -42,6 +46,8 @@ pub(super) struct Waiting {
 pub(super) struct Next {
     /// How many updates are in it, with all before.
     pub(super) number: u64,
+    /// When the first of them was stored.
+    pub(super) since: Instant,
     pub(super) position: Position,
     pub(super) state: State,
     pub(super) notes: Arc<Notes>,
@@ -69,6 +75,7 @@ impl Slot {
             place,
             waiting: Mutex::new(Waiting {
                 next: None,
+                in_hand: None,
                 notes: Arc::clone(notes),
             }),
             wake: Notify::new(),
@@ -91,11 +98,12 @@ impl Slot {
         if before.is_some() {
             self.coalesced.fetch_add(1, Ordering::Relaxed);
         }
-        let (keys, had_notes) = before.map_or((Some(BTreeSet::new()), false), |next| {
-            (next.keys, next.have_notes_changed)
+        let (keys, had_notes, since) = before.map_or((Some(BTreeSet::new()), false, Instant::now()), |next| {
+            (next.keys, next.have_notes_changed, next.since)
         });
         let mut next = Next {
             number: self.stored.fetch_add(1, Ordering::AcqRel) + 1,
+            since,
             position: update.position.clone(),
             state: update.state.clone(),
             notes: Arc::clone(&waiting.notes),
@@ -108,14 +116,37 @@ impl Slot {
         self.wake.notify_one();
     }
 
+    /// What is to be written now.
+    pub(super) fn take(&self) -> Option<Next> {
+        let mut waiting = self.waiting.lock();
+        let next = waiting.next.take();
+        waiting.in_hand = next.as_ref().map(|next| next.since);
+        next
+    }
+
+    /// The copy holds so many updates, or something newer.
+    pub(super) fn finish(&self, number: u64) {
+        self.waiting.lock().in_hand = None;
+        self.done.send_replace(number);
+    }
+
     /// A write that failed waits again, unless a newer one does: that one is then to write everything anyway.
     pub(super) fn put_back(&self, next: Next) {
         let mut waiting = self.waiting.lock();
-        if waiting.next.is_some() {
+        waiting.in_hand = None;
+        if let Some(newer) = &mut waiting.next {
+            newer.since = next.since;
             self.coalesced.fetch_add(1, Ordering::Relaxed);
         } else {
             waiting.next = Some(next);
         }
+    }
+
+    /// How long something has been waiting to be in the copy.
+    pub(super) fn lag(&self) -> Duration {
+        let waiting = self.waiting.lock();
+        let since = waiting.in_hand.or(waiting.next.as_ref().map(|next| next.since));
+        since.map_or(Duration::ZERO, |since| since.elapsed())
     }
 
     /// Whether the copy holds all that was stored.

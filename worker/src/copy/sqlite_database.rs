@@ -89,9 +89,11 @@ impl Database {
         let sealed = self.facts.sealed(&whole.documents)?;
         let checked = match self.unreadable.take() {
             Some(error) => Err(error),
-            None => self
-                .open()
-                .and_then(|(facts, connection)| facts.head(connection).map(|_| ())),
+            None => self.open().and_then(|(facts, connection)| {
+                let held = facts.head(connection)?;
+                let held = held.as_ref().map(|(held, _)| held);
+                progress::check_whole(held, &whole.position, &facts.place)
+            }),
         };
         match checked {
             Err(error) if error.is_unreadable() => self.move_aside(&error)?,

@@ -5,6 +5,8 @@
 //!                     ├─▶ of one store the higher revision, of two the later time; notes of both
 //! file ───────────────┘
 //! ```
+//!
+//! What could not be read in time is read before it is first written ([`Start::is_unread`], [`Found`](super::Found)).
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -96,6 +98,14 @@ pub async fn choose(
 }
 
 impl Start {
+    /// Whether nobody knows what a copy holds: it may be newer than what is served. What nobody here can read is not.
+    #[must_use]
+    pub fn is_unread(&self, copy: &dyn LocalCopy) -> bool {
+        let place = copy.describe();
+        let mut problems = self.problems.iter().filter(|problem| problem.place == place);
+        problems.any(|problem| !problem.error.is_unreadable())
+    }
+
     fn note(&mut self, copy: Option<&Arc<dyn LocalCopy>>, loaded: Result<Option<Loaded>, CopyError>) -> Option<Loaded> {
         match loaded {
             Ok(loaded) => loaded,

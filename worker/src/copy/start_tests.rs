@@ -55,8 +55,9 @@ async fn a_database_that_does_not_answer_costs_one_second() {
     let began = tokio::time::Instant::now();
     let start = choose(Some(&database), Some(&file), DATABASE_LIMIT).await;
     assert_eq!(began.elapsed().as_secs(), DATABASE_LIMIT.as_secs());
-    assert_eq!(start.loaded.unwrap().position.revision, 5);
+    assert_eq!(start.loaded.as_ref().unwrap().position.revision, 5);
     assert!(start.is_from_file && start.is_file_current && !start.is_database_current);
+    assert!(start.is_unread(&*database) && !start.is_unread(&*file));
     assert!(matches!(&start.problems[..], [Problem { place, error: CopyError::Away { .. } }] if place == "database"));
 }
 

@@ -2,6 +2,7 @@
 //! it knows.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use blaze_domain::config::Document;
 use proptest::prelude::*;

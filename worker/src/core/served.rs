@@ -13,12 +13,13 @@
 //! Answers come from the documents of the last [`Served::flush`], as notices do: so what a place was told last is always
 //! what its configuration is in the shown documents, and no configuration has to be kept beside them.
 
+#[path = "served_late.rs"]
+mod late;
 #[path = "served_trial.rs"]
 mod trial;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
-use std::sync::Arc;
 use std::time::Instant;
 
 use blaze_domain::config::Key;
@@ -59,6 +60,8 @@ pub struct Served {
     asked: Asked,
     /// Places that went since the last flush.
     untracked: Vec<Place>,
+    /// Places of which more became known since the last flush, and whether it is open what they have.
+    late: BTreeMap<Place, bool>,
 }
 
 /// Without the documents: they hold secrets in clear.
@@ -88,27 +91,8 @@ impl Served {
             places: Places::default(),
             asked: Asked::default(),
             untracked: Vec::new(),
+            late: BTreeMap::new(),
         }
-    }
-
-    /// Takes over what an earlier life knew, before anything is loaded: what places were told, so that nothing older is
-    /// told now and what did not change is not told again, and which roll-outs failed. The places count as if they had
-    /// asked now, because they may well be running.
-    pub fn restore(
-        &mut self,
-        told: impl IntoIterator<Item = (Place, Told)>,
-        failed: impl IntoIterator<Item = String>,
-        now: Instant,
-    ) {
-        for (place, told) in told {
-            self.floor = self.floor.max(told.revision);
-            if told.hash.is_some() {
-                self.note_asked(&place, now);
-                self.places.insert(place, told);
-            }
-        }
-        self.next.failed = Arc::new(failed.into_iter().take(MAX_FAILED).collect());
-        self.shown.failed = Arc::clone(&self.next.failed);
     }
 
     /// What is served.
@@ -227,7 +211,8 @@ impl Served {
     /// Whether a flush would look at anything.
     #[must_use]
     pub fn has_pending(&self) -> bool {
-        !self.pending.is_empty() || self.next.is_loaded != self.shown.is_loaded || !self.untracked.is_empty()
+        let has_documents = !self.pending.is_empty() || self.next.is_loaded != self.shown.is_loaded;
+        has_documents || !self.untracked.is_empty() || (self.next.is_loaded && !self.late.is_empty())
     }
 
     /// Shows the newest documents, and tells whose configuration is another one than the last that they were told.
@@ -250,15 +235,19 @@ impl Served {
                 // What an earlier life told may have changed, or gone, without any trace in these documents.
                 looked.extend(self.places.all().map(|(place, _)| place.clone()));
             }
+            let late = std::mem::take(&mut self.late);
+            looked.extend(late.keys().cloned());
             for place in looked {
-                self.look(place, &mut out);
+                let is_open = late.get(&place).copied().unwrap_or(false);
+                self.look(place, is_open, &mut out);
             }
         }
         self.shown = self.next.clone();
         out
     }
 
-    fn look(&mut self, place: Place, out: &mut Flushed) {
+    /// `is_open`: whether nobody knows what the place has, so that it hears how it is in any case.
+    fn look(&mut self, place: Place, is_open: bool, out: &mut Flushed) {
         let told = self.places.get(&place);
         let old = self.shown.at(&self.site, &place);
         let new = self.next.at(&self.site, &place);
@@ -268,10 +257,10 @@ impl Served {
         let before = told.map_or_else(|| old_hash.clone(), |told| told.hash.clone());
         let is_tracked = told.is_some();
         let revision = match told {
-            Some(told) if told.hash == hash => told.revision,
+            Some(told) if told.hash == hash && !is_open => told.revision,
             Some(_) | None => self.floor,
         };
-        if before != hash {
+        if before != hash || is_open {
             let known = old.filter(|_| old_hash == before);
             out.notices
                 .push(self.notice(&place, revision, before, known, new.zip(hash.clone())));

@@ -57,7 +57,8 @@ impl Engine {
             return;
         }
         let gone = self.notes.all_told().filter(|(_, told)| told.hash.is_none());
-        let gone: Vec<Place> = gone.filter_map(|(at, _)| tell::place_of(at)).collect();
+        let gone = gone.filter_map(|(at, _)| tell::place_of(at));
+        let gone: Vec<Place> = gone.filter(|place| !self.fades.places.contains_key(place)).collect();
         for place in gone {
             self.begin_to_fade(place);
         }

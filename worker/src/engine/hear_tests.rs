@@ -37,8 +37,9 @@ fn copies() -> (Supervisor, Arc<Fake>, Copies) {
     let target = Target {
         copy: Arc::clone(&fake) as Arc<dyn LocalCopy>,
         is_current: false,
+        is_read: true,
     };
-    let copies = Copies::start(&supervisor, vec![target], &Arc::default());
+    let copies = Copies::start(&supervisor, vec![target], &Arc::default(), &mpsc::channel(1).0);
     (supervisor, fake, copies)
 }
 

@@ -6,6 +6,7 @@
 //! broker: get ──────────────▶│ Engine │──reply─────────▶ broker
 //! acks, watchdogs: Sign ────▶│        │
 //! mounted file ─────────────▶│        │──Told──────────▶ serve::Speaker ─▶ keys, notices
+//! copies: Found ────────────▶│        │
 //! lease: leader? ───────────▶│        │──Update────────▶ copy::Copies
 //! admin: Query ─────────────▶└────────┘
 //! ```
@@ -13,6 +14,7 @@
 mod ask;
 mod fade;
 mod follow;
+mod found;
 mod hear;
 mod lead;
 mod missed;
@@ -29,7 +31,7 @@ use std::time::Duration;
 
 use blaze_domain::LayerName;
 use blaze_domain::config::state::State;
-use blaze_domain::config::{Kind, Timestamp};
+use blaze_domain::config::{Document, Kind, Timestamp};
 use blaze_proto::v1;
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
@@ -181,10 +183,7 @@ impl Engine {
             as_of,
             ..
         } = loaded.position;
-        let mut state = State::new(revision, []);
-        for document in loaded.documents {
-            state.put(self.identity.delivery.kept(document));
-        }
+        let state = self.state_of(revision, loaded.documents);
         let told = tell::told_of(&loaded.notes);
         let failed: Vec<String> = loaded.notes.failed().map(str::to_owned).collect();
         self.served.restore(told, failed, now.into_std());
@@ -196,10 +195,23 @@ impl Engine {
         }
         self.lacks_texts = lacks_texts(self.replica.state());
         self.fade_from_notes();
-        self.note_services([Kind::Service]);
+        self.note_all_services();
         self.flush_at = Some(now);
         // The one of the copies that is behind the other catches up.
         self.keep(Changed::Keys(Vec::new()));
+    }
+
+    /// Documents of a copy or of a file, as they are kept here.
+    fn state_of(&self, revision: u64, documents: impl IntoIterator<Item = Arc<Document>>) -> State {
+        let mut state = State::new(revision, []);
+        for document in documents {
+            state.put(self.identity.delivery.kept(document));
+        }
+        state
+    }
+
+    fn note_all_services(&mut self) {
+        self.note_services([Kind::Service]);
     }
 
     /// Works until `stop`.
@@ -216,6 +228,7 @@ impl Engine {
                 () = stop.cancelled() => return,
                 () = sleep_until(flush_at.unwrap_or_else(Instant::now)), if flush_at.is_some() => self.flush(),
                 Some(query) = inputs.queries.recv() => self.answer_query(query),
+                Some(found) = inputs.found.recv() => self.on_found(found),
                 // Before the term that it is of: whoever takes over tells what others have not.
                 Ok(()) = inputs.noted.changed() => {
                     let mark = inputs.noted.borrow_and_update().clone();
@@ -293,13 +306,10 @@ impl Engine {
     fn take_defaults(&mut self, status: &defaults::Status) {
         self.defaults_problem = status.problem.as_ref().map(ToString::to_string);
         let Some(current) = &status.current else { return };
-        let mut state = State::new(0, []);
-        for document in &current.documents {
-            state.put(self.identity.delivery.kept(Arc::clone(document)));
-        }
+        let state = self.state_of(0, current.documents.iter().cloned());
         // What came from the main service or a copy of it is better.
         if self.served.load(state, Source::File).is_ok() {
-            self.note_services([Kind::Service]);
+            self.note_all_services();
             self.flush_soon();
         }
     }

@@ -9,7 +9,7 @@ use bytes::Bytes;
 use tokio::sync::{mpsc, oneshot, watch};
 
 use super::{Sign, Status};
-use crate::copy::{Copies, defaults};
+use crate::copy::{Copies, Found, defaults};
 use crate::core::Site;
 use crate::core::messages::Delivery;
 use crate::lease::{Mark, Term};
@@ -57,6 +57,8 @@ pub struct Inputs {
     pub noted: watch::Receiver<Option<Mark>>,
     /// Questions of the admin port.
     pub queries: mpsc::Receiver<Query>,
+    /// What copies hold that could not be read at the start.
+    pub found: mpsc::Receiver<Found>,
 }
 
 /// Where things go.

@@ -4,6 +4,8 @@
 mod fade;
 #[path = "follow_tests.rs"]
 mod follow;
+#[path = "found_tests.rs"]
+mod found;
 #[path = "hear_tests.rs"]
 mod hear;
 #[path = "lead_tests.rs"]
@@ -20,7 +22,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::JoinSet;
 
 use super::*;
-use crate::copy::Copies;
+use crate::copy::{Copies, Found};
 use crate::core::Site;
 use crate::core::messages::Delivery;
 use crate::core::testing::document;
@@ -108,6 +110,7 @@ struct World {
     up: watch::Sender<bool>,
     defaults: watch::Sender<defaults::Status>,
     queries: mpsc::Sender<Query>,
+    found: mpsc::Sender<Found>,
     answers: mpsc::Receiver<(String, Value)>,
     seen: mpsc::Receiver<Seen>,
     acks: watch::Receiver<Option<v1::Ack>>,
@@ -138,6 +141,7 @@ fn world_on(
     let (gets, gets_in) = mpsc::channel(64);
     let (signs, signs_in) = mpsc::channel(64);
     let (queries, queries_in) = mpsc::channel(64);
+    let (found, found_in) = mpsc::channel(2);
     let (leader, leader_in) = watch::channel(is_leader.then_some(1));
     let (noted, noted_in) = watch::channel(None);
     let (told_out, told) = watch::channel(None);
@@ -173,6 +177,7 @@ fn world_on(
         leader: leader_in,
         noted: noted_in,
         queries: queries_in,
+        found: found_in,
     };
     let mut tasks = JoinSet::new();
     tasks.spawn(speaker.run(Arc::new(Board { seen: see, is_up })));
@@ -187,6 +192,7 @@ fn world_on(
         up,
         defaults,
         queries,
+        found,
         answers,
         seen,
         acks,

@@ -1,0 +1,146 @@
+//! What becomes of a copy that can be read only after the start.
+
+use super::hear::{canary_documents, rollout};
+use super::*;
+
+fn at(store_id: &str, revision: u64, documents: Vec<Document>) -> Loaded {
+    Loaded {
+        position: Position {
+            store_id: store_id.to_owned(),
+            layer: "edge".parse().unwrap(),
+            revision,
+            as_of: Timestamp::from_millis(1_000),
+        },
+        documents: documents.into_iter().map(Arc::new).collect(),
+        notes: Arc::default(),
+    }
+}
+
+/// As an earlier life told the service, or its instance, something of a revision.
+fn told(instance: Option<&str>, revision: u64, hash: &str) -> Notes {
+    let mut notes = Notes::default();
+    let place = blaze_domain::config::effective::At {
+        service: Some("slam".parse().unwrap()),
+        instance: instance.map(|name| name.parse().unwrap()),
+        layer: Some("edge".parse().unwrap()),
+        node: Some("robot-1".parse().unwrap()),
+    };
+    let told = crate::copy::Told {
+        revision,
+        hash: Some(hash.into()),
+    };
+    notes.tell(place, told);
+    notes
+}
+
+impl World {
+    async fn finds(&self, loaded: Loaded) {
+        let (taken, is_taken) = oneshot::channel();
+        let place = "database".to_owned();
+        let found = Found {
+            place,
+            loaded,
+            is_of_another: false,
+            taken,
+        };
+        self.found.send(found).await.unwrap();
+        is_taken.await.unwrap();
+    }
+
+    async fn rate(&mut self) -> Value {
+        self.slam().await["config"]["rate_hz"].clone()
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_the_database_has_newer_is_served_before_the_main_service_answers() {
+    let mut w = world_from(Some(at("s", 2, documents(30))), true);
+    assert_eq!(w.rate().await, 30);
+    w.rest().await;
+    w.finds(at("s", 4, documents(40))).await;
+    let (_, notice) = w.notice().await;
+    assert_eq!(
+        (&notice["revision"], &notice["config"]["rate_hz"], &notice["source"]),
+        (&json!(4), &json!(40), &json!("copy"))
+    );
+    w.rest().await;
+    assert_eq!(w.rate().await, 40);
+    assert_eq!(w.hello().await.revision, 4);
+    // Also what the main service told before it went away may be the older one: another worker of the layer writes there.
+    w.opens(documents(50), 5).await;
+    w.rest().await;
+    w.closes().await;
+    w.rest().await;
+    w.finds(at("s", 6, documents(60))).await;
+    w.rest().await;
+    assert_eq!(w.rate().await, 60);
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_older_state_another_store_and_a_main_service_that_answers_leave_what_is_served() {
+    let mut w = world_from(Some(at("s", 4, documents(40))), true);
+    w.rest().await;
+    w.finds(at("s", 3, documents(30))).await;
+    w.finds(at("other", 9, documents(90))).await;
+    w.rest().await;
+    assert_eq!((w.rate().await, w.hello().await.revision), (json!(40), 4));
+    w.opens(documents(50), 5).await;
+    w.finds(at("s", 6, documents(60))).await;
+    w.rest().await;
+    assert_eq!(w.rate().await, 50);
+}
+
+#[tokio::test(start_paused = true)]
+async fn who_had_nothing_or_the_mounted_file_serves_what_is_found() {
+    let mut w = world();
+    w.finds(at("s", 4, documents(40))).await;
+    w.rest().await;
+    let answer = w.slam().await;
+    assert_eq!(
+        (&answer["config"]["rate_hz"], &answer["source"], &answer["revision"]),
+        (&json!(40), &json!("copy"), &json!(4))
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn whoever_may_have_heard_something_else_hears_how_it_is() {
+    let mut w = world_from(Some(at("s", 2, documents(30))), true);
+    w.slam().await;
+    w.rest().await;
+    // It was another one at 6, and is again what this worker knows.
+    let loaded = Loaded {
+        notes: Arc::new(told(Some("0"), 6, "sha256:other")),
+        ..at("s", 7, documents(30))
+    };
+    w.finds(loaded.clone()).await;
+    let (_, notice) = w.notice().await;
+    assert_eq!(
+        (&notice["instance"], &notice["revision"], &notice["config"]["rate_hz"]),
+        (&json!("0"), &json!(7), &json!(30))
+    );
+    w.rest().await;
+    w.finds(loaded).await;
+    assert_eq!(w.rest().await, [], "nothing is new");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_roll_out_that_failed_in_another_life_is_undone() {
+    let mut documents = canary_documents();
+    documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
+    documents.push(rollout(2, "u-1", 500));
+    let mut w = world_from(Some(at("s", 2, documents.clone())), true);
+    w.rest().await;
+    assert_eq!(w.rate().await, 500);
+    let mut notes = Notes::default();
+    notes.fail("u-1");
+    let notes = Arc::new(notes);
+    w.finds(Loaded {
+        notes,
+        ..at("s", 2, documents)
+    })
+    .await;
+    assert_eq!(w.rates().await, [json!(30)]);
+    let (send, status) = oneshot::channel();
+    w.queries.send(Query::Status(send)).await.unwrap();
+    assert_eq!(status.await.unwrap().json["rollouts"][0]["phase"], "failed");
+}
