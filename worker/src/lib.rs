@@ -13,6 +13,7 @@ pub mod copy;
 pub mod core;
 pub mod engine;
 mod hearing;
+mod kept;
 pub mod lease;
 pub mod own;
 pub mod running;

@@ -1,5 +1,8 @@
 //! What reaches the copies, and when.
 
+#[path = "copies_late_tests.rs"]
+mod late;
+
 use blaze_domain::config::Document;
 use proptest::prelude::*;
 use serde_json::json;
@@ -278,71 +281,6 @@ async fn a_copy_that_writes_everything_is_spared_writes_for_the_time_alone() {
     assert_eq!(fixture.calls(), (3, 0));
     assert!(store(position(2), None).await);
     assert_eq!(fixture.calls(), (4, 0));
-}
-
-/// With a copy that could not be read at the start, which holds this.
-fn unread(held: Loaded) -> (Fixture, mpsc::Receiver<Found>) {
-    let supervisor = Supervisor::new("test");
-    let fake = Arc::new(Fake {
-        is_away: true.into(),
-        ..Fake::new("fake")
-    });
-    *fake.held.lock() = Some(held);
-    let target = Target {
-        copy: Arc::clone(&fake) as Arc<dyn LocalCopy>,
-        is_current: false,
-        is_read: false,
-    };
-    let (find, found) = mpsc::channel(1);
-    let copies = Copies::start(&supervisor, vec![target], &Arc::default(), &find);
-    let fixture = Fixture {
-        supervisor,
-        fake,
-        copies,
-        state: State::default(),
-    };
-    (fixture, found)
-}
-
-#[tokio::test(start_paused = true)]
-async fn a_copy_that_could_not_be_read_is_read_before_it_is_written() {
-    let (mut fixture, mut found) = unread(loaded(5, []));
-    fixture.put("a", 6);
-    assert!(!fixture.copies.flush(Duration::from_secs(5)).await);
-    assert!(fixture.copies.counts()[0].failed >= 3 && found.try_recv().is_err());
-    fixture.fake.is_away.store(false, Ordering::Relaxed);
-    let Found {
-        place, loaded, taken, ..
-    } = found.recv().await.unwrap();
-    assert_eq!((place.as_str(), loaded.position), ("fake", position(5)));
-    assert!(
-        !fixture.copies.flush(Duration::from_secs(60)).await,
-        "it is not taken into account yet"
-    );
-    assert_eq!(fixture.calls(), (0, 0));
-    assert_eq!(fixture.copies.counts()[0].error, None);
-    taken.send(()).unwrap();
-    assert!(fixture.copies.flush(LONG).await);
-    assert_eq!((fixture.calls(), fixture.held().position), ((1, 0), position(6)));
-}
-
-#[tokio::test(start_paused = true)]
-async fn what_is_newer_there_is_never_written_over_and_is_told() {
-    let (mut fixture, mut found) = unread(loaded(5, []));
-    fixture.fake.is_away.store(false, Ordering::Relaxed);
-    fixture.put("a", 4);
-    // As it could not be read, and again as it turns out to be newer when it is written.
-    for is_of_another in [false, true] {
-        let one = found.recv().await.unwrap();
-        assert_eq!((&one.loaded.position, one.is_of_another), (&position(5), is_of_another));
-        one.taken.send(()).unwrap();
-    }
-    assert!(fixture.copies.flush(LONG).await, "nothing of it is missing there");
-    assert_eq!((fixture.calls(), fixture.held()), ((0, 0), loaded(5, [])));
-    assert_eq!(fixture.copies.counts()[0].failed, 0);
-    fixture.put("b", 6);
-    assert!(fixture.copies.flush(LONG).await);
-    assert_eq!(fixture.held().documents, fixture.expected());
 }
 
 #[tokio::test(start_paused = true)]
