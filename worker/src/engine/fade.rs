@@ -70,6 +70,7 @@ impl Engine {
         let gone = gone.filter_map(|(at, _)| tell::place_of(at));
         let gone: Vec<Place> = gone.filter(|place| !self.fades.places.contains_key(place)).collect();
         for place in gone {
+            self.fades.channels_differ = true;
             self.begin_to_fade(place);
         }
     }

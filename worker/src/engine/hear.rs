@@ -104,9 +104,15 @@ impl Engine {
 
     /// Roll-outs that began or ended with what is shown, and windows of those that services were told of by now.
     pub(super) fn follow_rollouts(&mut self) {
-        let now = Instant::now().into_std();
-        let is_changed = self.gate.follow(&self.served);
-        if self.gate.open(self.told_up_to(), now) || is_changed {
+        if self.gate.follow(&self.served) {
+            self.acknowledge_soon();
+        }
+        self.open_windows();
+    }
+
+    /// Windows of roll-outs that services were told of by now.
+    pub(super) fn open_windows(&mut self) {
+        if self.gate.open(self.told_up_to(), Instant::now().into_std()) {
             self.acknowledge_soon();
         }
     }
@@ -115,7 +121,7 @@ impl Engine {
     fn told_up_to(&self) -> Option<u64> {
         let shown = self.served.state().revision();
         if self.tells {
-            let untold = self.outputs.speaker.untold();
+            let untold = self.outputs.speaker.untold_where_possible();
             return Some(untold.map_or(shown, |first| first.saturating_sub(1)));
         }
         let (noted, shown) = (self.noted.as_ref()?, self.shown.as_ref()?);

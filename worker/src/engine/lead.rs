@@ -91,7 +91,8 @@ impl Engine {
         let mut told: Vec<Told> = Vec::with_capacity(gone.len() + left.len());
         // First what goes: an instance that moves has the same key there.
         for notice in gone.iter().chain(&left) {
-            told.extend(self.of_notice(notice));
+            // Nobody knows since when they have not heard: no window of a roll-out opens before they have.
+            told.extend(self.of_notice(notice).map(|told| Told { revision: 0, ..told }));
         }
         for place in &self.places() {
             if let Some(standing) = self.served.standing_of(place) {
@@ -201,7 +202,7 @@ impl Engine {
         if self.tells {
             self.leave_mark();
         }
-        self.follow_rollouts();
+        self.open_windows();
         let is_done = is_all_told && self.unnoted.is_empty() && self.farewells.is_empty() && self.missed.len() == 0;
         if !is_done {
             self.settle_soon();

@@ -113,6 +113,12 @@ impl Speaker {
         self.shared.state.lock().untold()
     }
 
+    /// The same of those whom the broker can tell: a channel that cannot be made holds up nobody else.
+    #[must_use]
+    pub fn untold_where_possible(&self) -> Option<u64> {
+        self.shared.state.lock().untold_where_possible()
+    }
+
     /// Has keys of before, which nobody wants any more, looked for and deleted. All that are wanted must have been told.
     pub fn sweep_keys(&self) {
         self.shared.state.lock().sweep = true;

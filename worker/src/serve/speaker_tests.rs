@@ -261,4 +261,12 @@ async fn a_channel_that_is_not_there_yet_holds_up_no_other_one_and_waits_on() {
     assert!((20..200).contains(&counts.failures), "{counts:?}");
     assert_eq!((counts.waiting, counts.dropped), (1, 0));
     assert!(w.speaker.is_waiting("missing") && w.speaker.untold() == Some(1));
+    // Of all who can be told nobody waits.
+    let is_all = async {
+        while w.speaker.untold_where_possible().is_some() {
+            tokio::time::sleep(Duration::from_millis(1)).await
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(10), is_all).await.unwrap();
+    assert!(w.speaker.is_waiting("missing"));
 }

@@ -141,6 +141,14 @@ impl State {
         waiting.chain(self.on_the_way.values().copied()).min()
     }
 
+    /// The same of those whom the broker can tell: what is set aside may wait for ever.
+    pub(super) fn untold_where_possible(&self) -> Option<u64> {
+        let waiting = self.waiting.values();
+        let possible = waiting.filter(|(at, _)| self.order.contains_key(at));
+        let waiting = possible.map(|(_, waiting)| waiting.since);
+        waiting.chain(self.on_the_way.values().copied()).min()
+    }
+
     /// Everything is forgotten, also what is on its way and comes back.
     pub(super) fn clear(&mut self) {
         *self = Self {

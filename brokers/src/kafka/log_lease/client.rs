@@ -11,7 +11,7 @@ use rdkafka::message::{BorrowedMessage, DeliveryResult, Message as _};
 use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _, ProducerContext, PurgeConfig};
 use rdkafka::{ClientContext, Offset, Timestamp, TopicPartitionList};
 
-use super::ledger::{Entry, Ledger, Place};
+use super::ledger::{Act, Entry, Ledger, Place};
 use crate::kafka::context::{self, LastError};
 use crate::kafka::directory::is_passing;
 use crate::kafka::settings::Settings;
@@ -65,6 +65,8 @@ pub(super) struct Link {
     /// What there was when it began ends here, unless it was compacted away.
     end: i64,
     is_caught_up: bool,
+    /// Of what there was when it began something had been taken away.
+    has_gaps: bool,
     ledger: Ledger,
 }
 
@@ -105,6 +107,7 @@ impl Link {
             position: low,
             end,
             is_caught_up: low >= end,
+            has_gaps: low > 0,
             ledger: Ledger::default(),
         })
     }
@@ -130,12 +133,14 @@ impl Link {
                 None if Instant::now() >= deadline => return Ok(false),
                 None => {}
                 Some(Ok(message)) => {
+                    self.has_gaps |= !self.is_caught_up && message.offset() != self.position;
                     self.position = message.offset() + 1;
                     if let Some(entry) = of_layer(&self.layer, &message) {
                         let place = Place {
                             offset: message.offset(),
                             appended_ms: appended_ms(message.timestamp()),
                             read: Instant::now(),
+                            is_after_gap: self.has_gaps && !self.is_caught_up,
                         };
                         self.ledger.apply(entry, place);
                     }
@@ -166,11 +171,9 @@ impl Link {
             Err(error) => return Ok(Err(error)),
         };
         let answer = Answer::default();
+        let key = key_of(&self.layer, entry);
         let record = BaseRecord::with_opaque_to(&self.topic, Box::new(Arc::clone(&answer)));
-        if let Err((error, _)) = self
-            .writer
-            .send(record.partition(PARTITION).key(&self.layer).payload(&bytes))
-        {
+        if let Err((error, _)) = self.writer.send(record.partition(PARTITION).key(&key).payload(&bytes)) {
             return Ok(Err(error.to_string()));
         }
         let taken = loop {
@@ -198,6 +201,14 @@ impl Link {
         }
     }
 
+    /// Takes the claim of this owner away: what became of it is known.
+    pub(super) fn forget_claim(&self, owner: &str) {
+        let key = claim_key(&self.layer, owner);
+        let record: BaseRecord<'_, str, [u8], _> = BaseRecord::with_opaque_to(&self.topic, Box::new(Answer::default()));
+        // What stays is a claim that does not count.
+        let _ = self.writer.send(record.partition(PARTITION).key(&key));
+    }
+
     /// Shows the tools of Kafka, by the position of the group, who reads here and how far. Nothing rests on it.
     pub(super) fn show_position(&self) {
         let mut list = TopicPartitionList::new();
@@ -210,14 +221,29 @@ impl Link {
     }
 }
 
+/// Of claims each writer has its own, of all else there is the last of the layer.
+fn key_of(layer: &str, entry: &Entry) -> String {
+    match entry.act {
+        Act::Claim { .. } => claim_key(layer, &entry.owner),
+        Act::Renew | Act::Release => layer.to_owned(),
+    }
+}
+
+fn claim_key(layer: &str, owner: &str) -> String {
+    format!("{layer}/{owner}")
+}
+
 /// What it says, if that is of this layer.
 fn of_layer(layer: &str, message: &BorrowedMessage<'_>) -> Option<Entry> {
-    if message.key()? != layer.as_bytes() {
+    let key = std::str::from_utf8(message.key()?).ok()?;
+    let rest = key.strip_prefix(layer)?;
+    if !rest.is_empty() && !rest.starts_with('/') {
         return None;
     }
+    // One without a payload takes away a claim of which its writer knows what became.
     let entry = Entry::parse(message.payload()?);
     if entry.is_none() {
-        tracing::debug!(offset = message.offset(), layer, "this is no record of a lease");
+        tracing::debug!(offset = message.offset(), key, "this is no record of a lease");
     }
     entry
 }

@@ -8,8 +8,9 @@
 //! Two claims of one term, or a claim and a renewal, meet in the log, and the first of them counts. So nobody can take what
 //! was renewed in time, and nobody can renew what was taken.
 //!
-//! All records of a lease have one key. So of what was compacted there is one record, and after it all that followed. Whether
-//! that one counted nobody can say who did not read what it rests on: a claim is believed until somebody goes on with a term.
+//! Whoever has claimed a term holds it once it has gone on with it. What goes on with terms has one key, and each claim the
+//! one of its writer, which takes it away when it knows what became of it. So of what was compacted there is the last record
+//! that went on with a term; claims before it rest on nothing that can be read, and are believed only until one is read.
 
 use std::time::{Duration, Instant};
 
@@ -90,6 +91,8 @@ pub(super) struct Place {
     pub(super) appended_ms: Option<i64>,
     /// When it was read.
     pub(super) read: Instant,
+    /// It was there before anybody here read, and so may have been what is not there any more.
+    pub(super) is_after_gap: bool,
 }
 
 /// A term as far as it was read.
@@ -100,8 +103,10 @@ struct Term {
     time: Duration,
     /// The last record of it.
     last: Place,
-    /// It is a claim, and what it rests on was not read.
+    /// It begins with a claim, and what that rests on was not read.
     is_doubtful: bool,
+    /// Its owner has gone on with it.
+    is_renewed: bool,
     is_released: bool,
 }
 
@@ -155,13 +160,17 @@ impl Ledger {
             // What came before was compacted away, or there was nothing.
             (_, None) => true,
             (Act::Claim { after, has_waited }, Some(term)) => {
-                entry.term == term.number.saturating_add(1)
-                    && after.is_some_and(|after| after >= term.last.offset)
-                    && (has_waited || term.is_released || is_over(term, &place))
+                let is_over = has_waited || term.is_released || is_over(term, &place);
+                let is_next =
+                    entry.term == term.number.saturating_add(1) && after.is_some_and(|after| after >= term.last.offset);
+                // What it rests on may be what was taken away.
+                let may_be_next = term.is_doubtful && entry.term > term.number;
+                is_over && (is_next || may_be_next)
             }
             (Act::Renew | Act::Release, Some(term)) => {
                 // Whoever goes on with a term has read that it counts.
-                let is_same = entry.term == term.number && entry.owner == term.owner;
+                // Two that go on with one term have read different remains of what was compacted: one of them is to stay.
+                let is_same = entry.term == term.number && entry.owner <= term.owner;
                 term.is_doubtful || is_same || entry.term > term.number
             }
         };
@@ -174,7 +183,8 @@ impl Ledger {
             time: entry.time(),
             owner: entry.owner,
             last: place,
-            is_doubtful: is_claim && self.term.is_none(),
+            is_doubtful: is_claim && place.is_after_gap && self.term.as_ref().is_none_or(|term| term.is_doubtful),
+            is_renewed: !is_claim,
             is_released: entry.act == Act::Release,
         });
         self.note = entry.note;
@@ -189,10 +199,11 @@ impl Ledger {
             };
             return Step::Claim { term: 1, act };
         };
-        if term.owner == owner && !term.is_released {
+        let has_waited = term.is_released || now >= term.last.read + term.time;
+        // A claim that its owner did not go on with in time is as good as none.
+        if term.owner == owner && !term.is_released && (term.is_renewed || !has_waited) {
             return Step::Renew(term.number);
         }
-        let has_waited = term.is_released || now >= term.last.read + term.time;
         // The server's clock is asked once: its answer is read like any other record.
         if !has_waited && !std::mem::take(&mut self.is_of_before) {
             return Step::Wait;

@@ -1,7 +1,7 @@
 //! A lease as records of a partition, whose order decides.
 //!
 //! ```text
-//! hold(note) ─► thread ─► what does the log say?   it is mine: renew · it is over: claim · else: wait
+//! hold(note) ─► thread ─► what does the log say?   it is mine: renew · it is over: claim and renew · else: wait
 //!                 │          └─► write ─► read up to what was written ─► does the log say that it is mine?
 //!                 └─► reads on in between, so that it knows since when it was not renewed
 //! ```
@@ -115,6 +115,7 @@ impl LogLease {
             options,
             last_error: Arc::default(),
             is_made: false,
+            is_warned: false,
             link: None,
             held: None,
             not_before: None,
@@ -177,6 +178,8 @@ struct Reader {
     patience: Duration,
     last_error: Arc<LastError>,
     is_made: bool,
+    /// It was said that somebody else must make it.
+    is_warned: bool,
     link: Option<Link>,
     /// The term in which it was held at the last call.
     held: Option<u64>,
@@ -218,13 +221,15 @@ impl Reader {
     /// Reads what is new, from the beginning if need be.
     fn tend(&mut self) -> Result<(), String> {
         if self.link.is_none() {
-            self.make_topic()?;
+            // Where it is there already, nobody need be able to make it.
+            let made = self.make_topic();
             let place = (&self.topic, &*self.options.name, &*self.options.group);
             match Link::open(&self.settings, &self.last_error, place, self.patience) {
                 Ok(link) => self.link = Some(link),
                 Err(error) => {
                     // It may have been taken away.
                     self.is_made = false;
+                    made?;
                     return Err(self.last_error.take().unwrap_or_else(|| error.to_string()));
                 }
             }
@@ -263,7 +268,9 @@ impl Reader {
             match code {
                 // Somebody with more rights may have made it.
                 RDKafkaErrorCode::TopicAuthorizationFailed | RDKafkaErrorCode::ClusterAuthorizationFailed => {
-                    tracing::warn!(%topic, %code, "the topic of the lease must be made by an administrator, as the documentation of the worker says");
+                    if !std::mem::replace(&mut self.is_warned, true) {
+                        tracing::warn!(%topic, %code, "the topic of the lease must be made by an administrator, as the documentation of the worker says");
+                    }
                 }
                 _ => return Err(format!("the topic {topic} could not be made: {code}")),
             }
@@ -288,10 +295,23 @@ impl Reader {
                 Step::Claim { term, act } if !is_too_early => (term, act, left),
                 Step::Claim { .. } | Step::Wait => return Ok(Ok(None)),
             };
-            let entry = options.entry(term, act, note);
-            let written = link.write(&entry, deadline)?;
+            if act != Act::Renew {
+                let claimed = link.write(&options.entry(term, act, note.clone()), deadline)?;
+                let is_own = claimed.map(|offset| link.ledger().own_term(&options.owner) == Some((term, offset)));
+                if is_own != Ok(true) {
+                    link.forget_claim(&options.owner);
+                    return Ok(is_own.map(|_| None));
+                }
+            }
+            // It is held by whoever has gone on with it: of that the log keeps the last record.
+            let written = link.write(&options.entry(term, Act::Renew, note), deadline)?;
             Ok(written.map(|offset| {
-                let is_held = link.ledger().own_term(&options.owner) == Some((term, offset));
+                // One that was given up may have come after it.
+                let own = link.ledger().own_term(&options.owner);
+                let is_held = own.is_some_and(|(own, last)| own == term && last >= offset);
+                if act != Act::Renew {
+                    link.forget_claim(&options.owner);
+                }
                 if is_held {
                     link.show_position();
                 }
