@@ -264,7 +264,7 @@ async fn a_channel_that_is_not_there_yet_holds_up_no_other_one_and_waits_on() {
     // Of all who can be told nobody waits.
     let is_all = async {
         while w.speaker.untold_where_possible().is_some() {
-            tokio::time::sleep(Duration::from_millis(1)).await
+            tokio::time::sleep(Duration::from_millis(1)).await;
         }
     };
     tokio::time::timeout(Duration::from_secs(10), is_all).await.unwrap();
