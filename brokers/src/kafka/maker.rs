@@ -40,8 +40,6 @@ fn is_due(code: RDKafkaErrorCode, ago: Duration) -> bool {
     match code {
         // An impossible name stays one; what the server did not want may come to be wanted.
         RDKafkaErrorCode::InvalidTopic => false,
-        // Who has had no answer in time has waited for it: meanwhile nothing else was looked at.
-        RDKafkaErrorCode::RequestTimedOut | RDKafkaErrorCode::OperationTimedOut => ago >= TRY_AGAIN,
         code if is_final(code) => ago >= TRY_AGAIN,
         _ => ago >= TRY_SOON,
     }
