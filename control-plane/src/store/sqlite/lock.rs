@@ -4,12 +4,19 @@ use std::fs::{File, OpenOptions};
 use std::io::{Read as _, Seek as _, Write as _};
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 
 use super::connection::file_error;
 use crate::store::StoreError;
+
+/// How long the one before has to let go of it. A process that this one is just starting has a copy of all open files until its
+/// program begins, and the lock with them.
+const LET_GO: Duration = Duration::from_millis(250);
+/// Between two tries.
+const AGAIN: Duration = Duration::from_millis(10);
 
 /// Held while it lives; the system lets go of it when the process ends, however that happens.
 #[derive(Debug)]
@@ -18,7 +25,7 @@ pub(super) struct FileLock {
 }
 
 impl FileLock {
-    /// Locks `<path>.lock`, and writes the process id into it for people.
+    /// Locks `<path>.lock`, and writes the process id into it for people. Blocks for a moment where another one has it.
     ///
     /// # Errors
     /// [`StoreError::Refused`] if another process has it, and as [`file_error`].
@@ -28,10 +35,14 @@ impl FileLock {
         let mut options = OpenOptions::new();
         options.read(true).write(true).create(true).truncate(false).mode(0o600);
         let mut file = options.open(&lock).map_err(failed)?;
-        match flock(&file, FlockOperation::NonBlockingLockExclusive) {
-            Ok(()) => {}
-            Err(Errno::WOULDBLOCK) => return Err(in_use(path, &mut file)),
-            Err(error) => return Err(failed(error.into())),
+        let until = Instant::now() + LET_GO;
+        loop {
+            match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+                Ok(()) => break,
+                Err(Errno::WOULDBLOCK) if Instant::now() < until => std::thread::sleep(AGAIN),
+                Err(Errno::WOULDBLOCK) => return Err(in_use(path, &mut file)),
+                Err(error) => return Err(failed(error.into())),
+            }
         }
         file.set_len(0).map_err(failed)?;
         file.rewind().map_err(failed)?;
@@ -80,6 +91,21 @@ mod tests {
         assert!(text.contains("mongodb"), "{text}");
         drop(first);
         FileLock::take(&path).unwrap();
+    }
+
+    #[test]
+    fn whoever_lets_go_of_it_in_a_moment_is_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("store.db");
+        let first = FileLock::take(&path).unwrap();
+        let (waits, is_waiting) = std::sync::mpsc::channel();
+        let second = std::thread::spawn(move || {
+            waits.send(()).unwrap();
+            FileLock::take(&path).map(|_| ())
+        });
+        is_waiting.recv().unwrap();
+        drop(first);
+        second.join().unwrap().unwrap();
     }
 
     #[test]
