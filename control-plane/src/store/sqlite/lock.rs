@@ -98,7 +98,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("store.db");
         let first = FileLock::take(&path).unwrap();
-        let (waits, is_waiting) = std::sync::mpsc::channel();
+        let (waits, is_waiting) = std::sync::mpsc::sync_channel(1);
         let second = std::thread::spawn(move || {
             waits.send(()).unwrap();
             FileLock::take(&path).map(|_| ())
