@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use blaze_brokers::{Broker, Content, Publisher, PublisherOptions, SubscribeOptions, Subscription};
+use blaze_brokers::{Broker, Content, Health, Publisher, PublisherOptions, SubscribeOptions, Subscription};
 use blaze_domain::names::ChannelName;
 use blaze_tests::fleet::Written;
 use bytes::Bytes;
@@ -204,6 +204,11 @@ impl Plain {
             // Channels must be made there; services leave alone what is no answer to them.
             BrokerKind::Kafka => ChannelName::shared_reply(),
         };
+        let mut status = broker.status();
+        let is_up = status.wait_for(|status| status.health == Health::Up);
+        tokio::time::timeout(PATIENCE, is_up)
+            .await
+            .context("the broker does not answer")??;
         let subscription = broker.subscribe(&channel, SubscribeOptions::default()).await?;
         Ok(Self {
             publisher: broker.publisher(&channel, PublisherOptions::default())?,
