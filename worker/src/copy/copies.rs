@@ -285,7 +285,7 @@ impl Writer {
                     self.rest(began).await;
                 }
             }
-            // Another process of this layer writes it and knows more, so that nothing of this is missing there.
+            // Another process of this layer writes it and has newer documents; notes of this one come with its next write.
             Err(CopyError::Newer { .. }) => {
                 self.slot.finish(next.number);
                 self.read(true).await;
