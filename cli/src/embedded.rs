@@ -16,13 +16,14 @@ use blaze_brokers::Broker;
 use blaze_brokers::redis::RedisKeys;
 use blaze_config::process::Setup;
 use blaze_config::running::{Addresses, RunningMain};
+use blaze_domain::InstanceName;
 use blaze_domain::node_file::{ControlPlaneSection, NodeFile, RedisBroker};
 use blaze_flow::flow::RunningFlow;
 use blaze_flow::flow::node_file::Followed;
 use blaze_flow::flow::service::FlowService;
 use blaze_runtime::config::Verdict;
 use blaze_runtime::logs::LogHandle;
-use blaze_runtime::{Readiness, Supervisor};
+use blaze_runtime::{Readiness, Supervisor, environment};
 use blaze_worker::admin::Shown;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::WorkerSettings;
@@ -85,6 +86,15 @@ pub(crate) async fn follow(
     service.ok_or_else(|| refused("it has no broker of its node or layer".to_owned()))
 }
 
+/// Which instance of its programs this process is.
+///
+/// # Errors
+/// [`CliError::Usage`]: what the environment says can be none.
+pub(crate) fn instance() -> Result<InstanceName, CliError> {
+    let named = environment::parsed("BLAZE_INSTANCE").map_err(|fault| CliError::Usage(fault.to_string()))?;
+    Ok(named.unwrap_or_else(InstanceName::first))
+}
+
 /// A worker that runs, and where it is asked.
 pub(crate) struct Worker {
     pub(crate) running: Arc<RunningWorker>,
@@ -129,6 +139,7 @@ impl Worker {
             folder,
             // On the broker of a node there is one worker.
             lease: None,
+            instance: instance()?,
         };
         let running = RunningWorker::start(options, supervisor).await;
         let running = Arc::new(running.map_err(|error| failed(format!("{error:#}")))?);

@@ -55,11 +55,11 @@ fn main() -> ExitCode {
         overrides.push(("log.format".to_owned(), format.clone()));
     }
     let sources = Sources::of_process(arguments.config, overrides);
-    let instance = environment::parsed::<InstanceName>("BLAZE_INSTANCE").err();
-    let loaded = match (load_typed(&sources, &schema()), instance) {
-        (Ok(loaded), None) => loaded,
+    let instance = environment::parsed::<InstanceName>("BLAZE_INSTANCE");
+    let (loaded, instance) = match (load_typed(&sources, &schema()), instance) {
+        (Ok(loaded), Ok(instance)) => (loaded, instance.unwrap_or_else(InstanceName::first)),
         (loaded, instance) => {
-            let faults = loaded.err().into_iter().flatten().chain(instance);
+            let faults = loaded.err().into_iter().flatten().chain(instance.err());
             faults.for_each(|fault| say(format_args!("{fault}")));
             return ExitCode::from(exit_code::CONFIGURATION);
         }
@@ -70,7 +70,7 @@ fn main() -> ExitCode {
     if arguments.check {
         return ExitCode::SUCCESS;
     }
-    match block_on(run(sources.pinned(), loaded)) {
+    match block_on(run(sources.pinned(), loaded, instance)) {
         Ok(code) => code,
         Err(error) => {
             say(format_args!("blaze-worker failed: {error}"));
@@ -111,9 +111,9 @@ fn broker_fault(file: &NodeFile) -> Option<Fault> {
     }
 }
 
-async fn run(sources: Sources, loaded: Loaded<NodeFile>) -> ExitCode {
+async fn run(sources: Sources, loaded: Loaded<NodeFile>, instance: InstanceName) -> ExitCode {
     let supervisor = Supervisor::new("blaze-worker");
-    match start(&supervisor, sources, loaded).await {
+    match start(&supervisor, sources, loaded, instance).await {
         Ok((worker, readiness)) => {
             let steps = ShutdownSteps::new(SHUTDOWN)
                 .on(ShutdownPhase::NotReady, "readiness", async move { readiness.stop() })
@@ -131,6 +131,7 @@ async fn start(
     supervisor: &Supervisor,
     sources: Sources,
     loaded: Loaded<NodeFile>,
+    instance: InstanceName,
 ) -> anyhow::Result<(Arc<RunningWorker>, Readiness)> {
     let file = &loaded.value;
     let format = if file.log.format.as_str() == "json" {
@@ -145,7 +146,7 @@ async fn start(
     })?;
     let (readiness, shown) = (Readiness::new(), Shown::default());
     let address = shown.serve(file.admin.worker, readiness.clone(), supervisor).await?;
-    let worker = Arc::new(begin(settings, file, supervisor).await?);
+    let worker = Arc::new(begin(settings, file, instance, supervisor).await?);
     shown.set(Arc::clone(&worker));
     let overlays = worker.own().overlays();
     let told = watch_with(
@@ -177,7 +178,12 @@ fn spawn(supervisor: &Supervisor, name: &str, task: impl Future<Output = ()> + S
     });
 }
 
-async fn begin(settings: WorkerSettings, file: &NodeFile, supervisor: &Supervisor) -> anyhow::Result<RunningWorker> {
+async fn begin(
+    settings: WorkerSettings,
+    file: &NodeFile,
+    instance: InstanceName,
+    supervisor: &Supervisor,
+) -> anyhow::Result<RunningWorker> {
     let broker: Arc<dyn Broker> = match &settings.broker {
         LocalBroker::Node(NodeBroker::Memory) | LocalBroker::Layer(LayerBroker::Memory) => {
             Arc::new(MemoryHub::new(settings.site.layer.to_string()).broker())
@@ -198,6 +204,7 @@ async fn begin(settings: WorkerSettings, file: &NodeFile, supervisor: &Superviso
         keys,
         lease,
         worker_id,
+        instance,
     };
     RunningWorker::start(options, supervisor).await
 }

@@ -28,12 +28,11 @@ pub struct OwnConfig {
 }
 
 impl OwnConfig {
-    /// Of the worker on a node; with the part of the engine, and with acknowledgements for [`say_again`].
-    pub(crate) fn new(node: &NodeName) -> anyhow::Result<(Self, Own, watch::Receiver<Option<Bytes>>)> {
-        let instance = match blaze_runtime::environment::variable("BLAZE_INSTANCE") {
-            Some(name) => name.parse().context("BLAZE_INSTANCE")?,
-            None => InstanceName::first(),
-        };
+    /// Of an instance of the worker on a node; with the part of the engine, and with acknowledgements for [`say_again`].
+    pub(crate) fn new(
+        node: &NodeName,
+        instance: InstanceName,
+    ) -> anyhow::Result<(Self, Own, watch::Receiver<Option<Bytes>>)> {
         let place = Place {
             service: "blaze-worker".parse().context("the name of the program")?,
             instance: Some(instance),

@@ -12,6 +12,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, BrokerKind};
+use blaze_domain::InstanceName;
 use blaze_domain::names::ChannelName;
 use blaze_runtime::{Supervisor, TaskPolicy};
 use bytes::Bytes;
@@ -52,6 +53,8 @@ pub struct WorkerOptions {
     pub lease: Option<Arc<dyn Lease>>,
     /// Its name among the workers of the layer.
     pub worker_id: String,
+    /// Which instance it is, as a service with a configuration of its own.
+    pub instance: InstanceName,
 }
 
 /// A worker that runs until its supervisor ends.
@@ -83,6 +86,7 @@ impl RunningWorker {
             folder,
             lease,
             worker_id,
+            instance,
         } = options;
         let vault = Vault::load(settings.key_file.as_deref()).context("worker.key_file")?;
         let kept = Kept::open(&settings, folder, &vault, supervisor).await?;
@@ -156,7 +160,7 @@ impl RunningWorker {
                 }
             });
         };
-        let (own, said_of_own, own_acks) = OwnConfig::new(&settings.node)?;
+        let (own, said_of_own, own_acks) = OwnConfig::new(&settings.node, instance)?;
         spawn("own state", Box::pin(say_again(own_acks, said.clone())));
         let engine = Engine::new(identity, outputs, start.loaded).with_own(said_of_own);
         spawn("engine", Box::pin(engine.run(inputs, stop.clone())));

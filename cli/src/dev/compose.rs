@@ -27,7 +27,7 @@ use super::options::{DevBroker, DevOptions};
 use super::redis;
 use crate::config::files::Source;
 use crate::config::seed;
-use crate::embedded::{Worker, follow, start_main};
+use crate::embedded::{Worker, follow, instance, start_main};
 use crate::exit::CliError;
 
 /// How long worker and flow may take.
@@ -48,6 +48,7 @@ pub(super) struct Dev {
 pub(super) async fn start(options: &DevOptions, sources: &[Source], supervisor: &Supervisor) -> Result<Dev, CliError> {
     // Faults of the options are told before anything runs.
     let (file, _) = options.node_file(None, None)?;
+    instance()?;
     let log = logs::init(file.log.level.as_str(), LogFormat::Text);
     let log = log.map_err(|error| CliError::Failed(error.to_string()))?;
     if let Some(folder) = &options.data {

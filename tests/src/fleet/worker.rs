@@ -9,7 +9,7 @@ use blaze_brokers::memory::MemoryHub;
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{Broker, Role, open_layer, open_node};
 use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
-use blaze_domain::{LayerName, NodeName, Scope};
+use blaze_domain::{InstanceName, LayerName, NodeName, Scope};
 use blaze_runtime::Supervisor;
 use blaze_worker::running::{RunningWorker, WorkerOptions};
 use blaze_worker::settings::{LocalBroker, WorkerSettings};
@@ -156,6 +156,7 @@ impl Worker {
             folder: spec.folder.clone(),
             // Of its prefix each is the only one.
             lease: None,
+            instance: InstanceName::first(),
         };
         let supervisor = Supervisor::new(node.to_string());
         let running = RunningWorker::start(options, &supervisor).await?;

@@ -232,6 +232,17 @@ fn an_instance_that_can_be_none_is_a_fault_of_the_configuration() {
             assert!(told.contains("environment BLAZE_INSTANCE: "), "{program}: {told}");
         }
     }
+    let mut dev = Command::new(binary("blaze").unwrap());
+    let output = dev
+        .args(["dev", "--broker", "memory"])
+        .env("BLAZE_INSTANCE", "Left!")
+        .output();
+    let output = output.unwrap();
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+    assert!(
+        text(&output.stderr).contains("environment BLAZE_INSTANCE: "),
+        "{output:?}"
+    );
 }
 
 /// A `blaze-flow` that has printed its ready line.

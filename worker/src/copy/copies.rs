@@ -19,7 +19,7 @@ use std::time::Duration;
 use blaze_domain::config::Key;
 use blaze_domain::config::state::State;
 use blaze_runtime::{Supervisor, TaskPolicy};
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 
 use super::slot::{Next, Slot};
@@ -109,6 +109,8 @@ pub struct Copies {
     slots: Arc<[Arc<Slot>]>,
     /// Something is known already that is to be stored later.
     owed: Arc<AtomicBool>,
+    /// Whether the main service answers.
+    answers: watch::Sender<bool>,
 }
 
 impl Copies {
@@ -122,11 +124,18 @@ impl Copies {
     ) -> Self {
         let slot = |target: &Target| Arc::new(Slot::new(target.copy.describe(), notes));
         let slots: Arc<[Arc<Slot>]> = targets.iter().map(slot).collect();
+        let answers = watch::Sender::new(false);
         for (target, slot) in targets.into_iter().zip(&*slots) {
             let name = format!("copy to {}", slot.place);
             let (stop, writer) = (
                 supervisor.shutdown_token(),
-                Writer::new(target, Arc::clone(slot), Arc::clone(&slots), found.clone()),
+                Writer::new(
+                    target,
+                    Arc::clone(slot),
+                    Arc::clone(&slots),
+                    found.clone(),
+                    answers.subscribe(),
+                ),
             );
             supervisor.spawn(name, TaskPolicy::Essential, async move {
                 tokio::select! {
@@ -138,7 +147,14 @@ impl Copies {
         Self {
             slots,
             owed: Arc::default(),
+            answers,
         }
+    }
+
+    /// Says whether the main service answers: what a copy holds that is newer than what is served is read only while it does not.
+    pub fn set_main_answers(&self, answers: bool) {
+        self.answers
+            .send_if_modified(|before| std::mem::replace(before, answers) != answers);
     }
 
     /// Says whether something is known that is to be stored later: until then no copy counts as current.
@@ -202,13 +218,22 @@ struct Writer {
     is_read: bool,
     /// The copy holds what the next update is counted from.
     is_current: bool,
+    /// Another worker of the layer has written something newer, which is not read yet.
+    is_overtaken: bool,
+    main_answers: watch::Receiver<bool>,
     failures: u32,
     /// What it was last written with.
     written: Option<Position>,
 }
 
 impl Writer {
-    fn new(target: Target, slot: Arc<Slot>, all: Arc<[Arc<Slot>]>, found: mpsc::Sender<Found>) -> Self {
+    fn new(
+        target: Target,
+        slot: Arc<Slot>,
+        all: Arc<[Arc<Slot>]>,
+        found: mpsc::Sender<Found>,
+        main_answers: watch::Receiver<bool>,
+    ) -> Self {
         Self {
             copy: target.copy,
             slot,
@@ -216,6 +241,8 @@ impl Writer {
             found,
             is_read: target.is_read,
             is_current: target.is_current,
+            is_overtaken: false,
+            main_answers,
             failures: 0,
             written: None,
         }
@@ -226,8 +253,15 @@ impl Writer {
             if !self.is_read {
                 self.read(false).await;
             }
+            // While the main service answers it tells the same, and a worker that is always second would read all for each change.
+            if self.is_overtaken && !*self.main_answers.borrow_and_update() {
+                self.read(true).await;
+            }
             match self.slot.take() {
-                None => self.slot.wake.notified().await,
+                None => tokio::select! {
+                    () = self.slot.wake.notified() => {}
+                    Ok(()) = self.main_answers.changed(), if self.is_overtaken => {}
+                },
                 Some(next) => self.write_one(next).await,
             }
         }
@@ -263,6 +297,7 @@ impl Writer {
             }
         }
         self.is_read = true;
+        self.is_overtaken = false;
         self.recovered();
     }
 
@@ -275,6 +310,7 @@ impl Writer {
         let began = Instant::now();
         let written = self.write(&next).await;
         self.is_current = written.is_ok();
+        self.is_overtaken = matches!(written, Err(CopyError::Newer { .. }));
         match written {
             Ok(()) => {
                 self.slot.written.fetch_add(1, Ordering::Relaxed);
@@ -288,7 +324,6 @@ impl Writer {
             // Another process of this layer writes it and has newer documents; notes of this one come with its next write.
             Err(CopyError::Newer { .. }) => {
                 self.slot.finish(next.number);
-                self.read(true).await;
             }
             Err(error) => {
                 self.slot.put_back(next);

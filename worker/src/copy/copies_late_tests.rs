@@ -66,3 +66,26 @@ async fn what_is_newer_there_is_never_written_over_and_is_told() {
     assert!(fixture.copies.flush(LONG).await);
     assert_eq!(fixture.held().documents, fixture.expected());
 }
+
+#[tokio::test(start_paused = true)]
+async fn who_is_always_second_reads_only_when_the_main_service_is_gone() {
+    let (mut fixture, mut found) = unread(loaded(5, []));
+    fixture.fake.is_away.store(false, Ordering::Relaxed);
+    found.recv().await.unwrap().taken.send(()).unwrap();
+    fixture.copies.set_main_answers(true);
+    for revision in 1..=4 {
+        fixture.put("a", revision);
+        assert!(fixture.copies.flush(LONG).await, "nothing of it is missing there");
+    }
+    assert!(found.try_recv().is_err(), "the main service tells it");
+    fixture.copies.set_main_answers(false);
+    let one = found.recv().await.unwrap();
+    assert_eq!((&one.loaded.position, one.is_of_another), (&position(5), true));
+    one.taken.send(()).unwrap();
+    // Once: it is known now.
+    fixture.copies.set_main_answers(true);
+    fixture.copies.set_main_answers(false);
+    tokio::time::sleep(LONG).await;
+    assert!(found.try_recv().is_err());
+    assert_eq!(fixture.calls(), (0, 0));
+}

@@ -26,6 +26,7 @@ impl Engine {
             SyncEvent::Opened(stream) => {
                 self.stream = Some(stream);
                 self.fault = None;
+                self.tell_copies_of_stream();
             }
             SyncEvent::Said(incoming) => {
                 let applied = self.replica.apply(self.without_texts(incoming), now());
@@ -68,6 +69,7 @@ impl Engine {
                 // What ended it says more than that it has ended.
                 let reason = self.fault.take().unwrap_or(reason);
                 let was_there = self.stream.take().is_some();
+                self.tell_copies_of_stream();
                 if was_there || self.reason.as_ref() != Some(&reason) {
                     tracing::warn!(reason, "the main service is away; services get what is here");
                 }
@@ -77,6 +79,12 @@ impl Engine {
                 self.catching_up = self.catching_up.filter(|until| *until > Instant::now());
                 self.note_sync();
             }
+        }
+    }
+
+    fn tell_copies_of_stream(&self) {
+        if let Some(copies) = &self.outputs.copies {
+            copies.set_main_answers(self.stream.is_some());
         }
     }
 

@@ -7,7 +7,7 @@
 
 use tokio::time::Instant;
 
-use super::{Engine, lacks_texts, tell};
+use super::{Engine, tell};
 use crate::copy::{Changed, Found, Loaded, Notes};
 use crate::core::Replica;
 
@@ -36,7 +36,7 @@ impl Engine {
             let layer = self.identity.site.layer.clone();
             self.replica = Replica::from_copy(layer, Some(position.store_id), state.clone(), Some(position.as_of));
             self.served.take_later(state);
-            self.lacks_texts = lacks_texts(self.replica.state());
+            self.note_texts_of_all();
             self.note_all_services();
         }
         if is_wanted || !is_of_another {

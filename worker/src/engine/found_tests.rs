@@ -35,12 +35,17 @@ fn told(instance: Option<&str>, revision: u64, hash: &str) -> Notes {
 
 impl World {
     async fn finds(&self, loaded: Loaded) {
+        self.finds_of(false, loaded).await;
+    }
+
+    /// Another worker of the layer has written it, or nobody knew what was there.
+    async fn finds_of(&self, is_of_another: bool, loaded: Loaded) {
         let (taken, is_taken) = oneshot::channel();
         let place = "database".to_owned();
         let found = Found {
             place,
             loaded,
-            is_of_another: false,
+            is_of_another,
             taken,
         };
         self.found.send(found).await.unwrap();
@@ -100,6 +105,74 @@ async fn who_had_nothing_or_the_mounted_file_serves_what_is_found() {
         (&answer["config"]["rate_hz"], &answer["source"], &answer["revision"]),
         (&json!(40), &json!("copy"), &json!(4))
     );
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_is_found_is_better_than_the_mounted_file() {
+    let mut w = world();
+    let file = documents(1).into_iter().map(|document| {
+        Arc::new(Document {
+            revision: 0,
+            ..document
+        })
+    });
+    w.defaults.send_replace(defaults::Status {
+        current: Some(Arc::new(defaults::Defaults {
+            documents: file.collect(),
+            as_of: Timestamp::default(),
+            left_out: 0,
+            rollouts: 0,
+        })),
+        problem: None,
+    });
+    w.rest().await;
+    assert_eq!(w.slam().await["source"], "file");
+    w.rest().await;
+    w.finds(at("s", 4, documents(40))).await;
+    let (_, notice) = w.notice().await;
+    assert_eq!(
+        (&notice["config"]["rate_hz"], &notice["source"]),
+        (&json!(40), &json!("copy"))
+    );
+}
+
+#[tokio::test(start_paused = true)]
+async fn notes_of_another_worker_count_with_its_documents_alone() {
+    let mut w = world_from(Some(at("s", 2, documents(30))), true);
+    w.slam().await;
+    w.rest().await;
+    let with_notes = |revision, rate| Loaded {
+        notes: Arc::new(told(Some("0"), revision, "sha256:other")),
+        ..at("s", revision, documents(rate))
+    };
+    // Not newer than what is served: what the other one told of it is its own affair.
+    w.finds_of(true, with_notes(2, 30)).await;
+    assert_eq!(w.rest().await, []);
+    w.finds_of(true, with_notes(6, 30)).await;
+    let (_, notice) = w.notice().await;
+    assert_eq!((&notice["instance"], &notice["revision"]), (&json!("0"), &json!(6)));
+}
+
+#[tokio::test(start_paused = true)]
+async fn texts_of_secrets_that_are_found_are_told() {
+    let with = |revision, value: Value| {
+        let mut all = documents(30);
+        all[3] = document(
+            "Service/slam",
+            2,
+            json!({ "config": { "password": { "$secret": value } } }),
+        );
+        at("s", revision, all)
+    };
+    let mut w = world_from(Some(with(2, json!({ "redacted": true, "version": 2 }))), true);
+    let hash = w.slam().await["hash"].clone();
+    w.rest().await;
+    w.finds(with(3, json!({ "text": "canary", "version": 2 }))).await;
+    let told = w.rest().await;
+    let is_key = |seen: &Seen| matches!(seen, Seen::Key(_, Some(value)) if value["config"]["password"] == "canary");
+    assert!(told.iter().any(is_key), "{told:?}");
+    let request = json!({ "id": "1", "service": "slam", "instance": "0", "hash": hash, "reply_to": "blaze/reply/t" });
+    assert_eq!(w.asks(request).await["config"]["password"], "canary");
 }
 
 #[tokio::test(start_paused = true)]

@@ -139,15 +139,17 @@ impl Engine {
     /// The texts of secrets have come, which were not there before: whoever has them redacted has the right hash, and yet not
     /// what it needs. They are told with the change that they came with.
     pub(super) fn note_texts(&mut self, change: &Change) {
-        let lacked = self.lacks_texts;
         // What is not changed is looked at only as long as something is missing.
-        self.lacks_texts = match lacked {
-            true => lacks_texts(&change.new),
-            false => {
-                let mut changed = change.keys.iter().filter_map(|key| change.new.get(key));
-                changed.any(|held| lacks_text(&held.document.spec))
-            }
-        };
+        if self.lacks_texts {
+            return self.note_texts_of_all();
+        }
+        let mut changed = change.keys.iter().filter_map(|key| change.new.get(key));
+        self.lacks_texts = changed.any(|held| lacks_text(&held.document.spec));
+    }
+
+    /// The same, of a state that is another one as a whole.
+    pub(super) fn note_texts_of_all(&mut self) {
+        let lacked = std::mem::replace(&mut self.lacks_texts, lacks_texts(self.replica.state()));
         self.owes_texts |= self.identity.delivery == Delivery::Text && lacked && !self.lacks_texts;
     }
 
