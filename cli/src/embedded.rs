@@ -126,7 +126,9 @@ impl Worker {
         let (shown, readiness) = (Shown::default(), Readiness::new());
         let admin = match is_asked {
             true => {
-                let served = shown.serve(file.admin.worker, readiness.clone(), supervisor).await;
+                let served = shown
+                    .serve(file.admin.worker, settings.scope(), readiness.clone(), supervisor)
+                    .await;
                 Some(served.map_err(|error| failed(format!("{}: {error}", file.admin.worker)))?)
             }
             false => None,

@@ -57,14 +57,15 @@ pub struct ServiceOptions {
 }
 
 impl ServiceOptions {
-    /// The first instance of a service on no particular node, with the default bounds.
+    /// A service on no particular node, with the default bounds: the instance that the variable `BLAZE_INSTANCE` names, else the first
+    /// one.
     #[must_use]
     pub fn new(layer: LayerName, service: ServiceName, broker: Arc<dyn Broker>, scope: Scope) -> Self {
         Self {
             layer,
             node: None,
             service,
-            instance: InstanceName::first(),
+            instance: of_environment().ok().flatten().unwrap_or_else(InstanceName::first),
             broker,
             scope,
             pool_threads: 0,
@@ -80,23 +81,12 @@ impl ServiceOptions {
         }
     }
 
-    /// The instance that the variable `BLAZE_INSTANCE` names, if it is set; it is for whoever starts several of one service.
-    ///
-    /// # Errors
-    /// [`SdkError::Option`], when it is no name of an instance.
-    pub fn instance_of_environment(self) -> Result<Self, SdkError> {
-        let text = blaze_runtime::environment::variable("BLAZE_INSTANCE");
-        self.with_instance(text.as_deref())
-    }
-
-    fn with_instance(mut self, text: Option<&str>) -> Result<Self, SdkError> {
-        if let Some(text) = text {
-            self.instance = text.parse().map_err(|error| SdkError::Option {
-                option: "BLAZE_INSTANCE",
-                reason: format!("is no name of an instance: {error}"),
-            })?;
+    /// Whether the environment names an instance that can be none, and nobody has chosen another one.
+    pub(crate) fn check_instance(&self) -> Result<(), SdkError> {
+        match of_environment() {
+            Err(error) if self.instance == InstanceName::first() => Err(error),
+            Ok(_) | Err(_) => Ok(()),
         }
-        Ok(self)
     }
 
     /// Whether the sign of life can be given like that.
@@ -127,6 +117,19 @@ impl ServiceOptions {
     }
 }
 
+/// The instance that the environment names, if it names one.
+fn of_environment() -> Result<Option<InstanceName>, SdkError> {
+    named(blaze_runtime::environment::variable("BLAZE_INSTANCE").as_deref())
+}
+
+fn named(text: Option<&str>) -> Result<Option<InstanceName>, SdkError> {
+    let fault = |error| SdkError::Option {
+        option: "BLAZE_INSTANCE",
+        reason: format!("is no name of an instance: {error}"),
+    };
+    text.map(|text| text.parse().map_err(fault)).transpose()
+}
+
 #[cfg(test)]
 mod tests {
     use blaze_brokers::memory::MemoryHub;
@@ -141,14 +144,20 @@ mod tests {
 
     #[test]
     fn the_environment_may_name_the_instance() {
-        let named = |text| {
-            options()
-                .with_instance(text)
-                .map(|options| options.instance.to_string())
-        };
-        assert_eq!(named(None).unwrap(), "0");
-        assert_eq!(named(Some("left")).unwrap(), "left");
-        assert!(named(Some("Left!")).is_err());
+        assert_eq!(options().instance.as_str(), "0");
+        assert_eq!(named(None).unwrap(), None);
+        assert_eq!(named(Some("left")).unwrap(), Some("left".parse().unwrap()));
+        let error = named(Some("Left!")).unwrap_err();
+        assert!(
+            matches!(
+                error,
+                SdkError::Option {
+                    option: "BLAZE_INSTANCE",
+                    ..
+                }
+            ),
+            "{error}"
+        );
     }
 
     #[tokio::test]

@@ -10,7 +10,7 @@ use blaze_domain::{InstanceName, LayerName, NodeName, Origin, Scope, ServiceName
 use blaze_runtime::{ShutdownPhase, ShutdownSteps, Supervisor, TaskPolicy};
 
 use crate::broker::LocalBroker;
-use crate::cache::{CacheError, CacheManager, ServiceState, Store};
+use crate::cache::{CacheError, CacheManager, ServiceState, Store, WatchdogOptions};
 use crate::config::{ConfigManager, ProgramConfig};
 use crate::flow::FlowManager;
 use crate::options::ServiceOptions;
@@ -136,6 +136,7 @@ impl ServiceManager {
                 reason: format!("is {:?}, 1 s to {MAX_TTL_S} s are allowed", options.lease_ttl),
             })?;
         options.check_watchdog()?;
+        options.check_instance()?;
         let store = match &options.cache {
             Some(section) => Some(Arc::new(RedisKeys::open(section).map_err(SdkError::Cache)?) as Arc<dyn Store>),
             None => None,
@@ -146,6 +147,11 @@ impl ServiceManager {
         }
         .max(2);
         let name = format!("{}-{}", options.service, options.instance);
+        let watchdog = WatchdogOptions {
+            version: options.version,
+            ttl: options.watchdog_ttl,
+            by_clock: options.epoch == 0,
+        };
         let supervisor = match &options.supervisor {
             Some(parent) => parent.child(name),
             None => observed(name),
@@ -185,8 +191,7 @@ impl ServiceManager {
             shared.identity.clone(),
             Arc::clone(&shared.broker),
             store,
-            options.version,
-            options.watchdog_ttl,
+            watchdog,
             config.shown(),
             &shared.supervisor,
         );

@@ -10,15 +10,20 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::get;
 use axum::{Json, Router};
+use blaze_domain::Scope;
 use blaze_runtime::{AdminServer, CheckStatus, Gate, Readiness, Supervisor, TaskPolicy};
 use parking_lot::Mutex;
 use serde_json::json;
+use tokio::sync::watch;
 
 use crate::engine::Status;
 use crate::running::RunningWorker;
 
 /// Between two looks at the worker, for readiness and metrics.
 const LOOK: Duration = Duration::from_millis(500);
+const NOTHING: &str = "nothing is loaded yet";
+/// The same until services reach it.
+const FIRST_LOOK: Duration = Duration::from_millis(50);
 /// Where configurations can come from.
 const SOURCES: [&str; 3] = ["main", "copy", "file"];
 
@@ -26,6 +31,7 @@ const SOURCES: [&str; 3] = ["main", "copy", "file"];
 #[derive(Clone, Default)]
 pub struct Shown {
     inner: Arc<Mutex<Inner>>,
+    begun: Arc<watch::Sender<bool>>,
 }
 
 #[derive(Default)]
@@ -35,22 +41,35 @@ struct Inner {
 }
 
 impl Shown {
-    /// Serves the admin port of a worker that is [started](Self::set) afterwards, so that it can be asked from the beginning.
+    /// Serves the admin port of a worker that is [started](Self::set) afterwards, so that it can be asked from the beginning. `scope`
+    /// is that of its broker.
     ///
     /// # Errors
     /// When the port cannot be bound.
     pub async fn serve(
         &self,
         address: SocketAddr,
+        scope: Scope,
         readiness: Readiness,
         supervisor: &Supervisor,
     ) -> std::io::Result<SocketAddr> {
+        let broker = match scope {
+            Scope::Node => "node_broker",
+            Scope::Layer | Scope::Inter => "layer_broker",
+        };
+        // Before anybody can ask: without them it would be ready.
+        let (decides, shows) = (Gate::Decides, Gate::Shows);
+        readiness.add(broker, decides, CheckStatus::Failed, "not connected yet");
+        readiness.add("configuration", decides, CheckStatus::Failed, NOTHING);
+        readiness.add("main service", shows, CheckStatus::Failed, "not connected yet");
+        readiness.add("mounted file", shows, CheckStatus::Ok, "");
+        readiness.add("config", shows, CheckStatus::Ok, "");
         let numbers = self.clone();
         let metrics = Arc::new(move || numbers.metrics());
         let admin = AdminServer::bind(address, self.router(), readiness.clone(), metrics).await?;
         let address = admin.address();
         admin.serve(supervisor);
-        let (look, stop) = (self.clone().look(readiness), supervisor.stopping_token());
+        let (look, stop) = (self.clone().look(broker, readiness), supervisor.stopping_token());
         supervisor.spawn("look", TaskPolicy::MayEnd, async move {
             tokio::select! {
                 () = look => {}
@@ -75,25 +94,36 @@ impl Shown {
     }
 
     /// Looks at the worker again and again, for readiness and metrics.
-    async fn look(self, readiness: Readiness) {
-        readiness.add(
-            "configuration",
-            Gate::Decides,
-            CheckStatus::Failed,
-            "nothing is loaded yet",
-        );
-        readiness.add("main service", Gate::Shows, CheckStatus::Failed, "not connected yet");
-        readiness.add("mounted file", Gate::Shows, CheckStatus::Ok, "");
-        readiness.add("config", Gate::Shows, CheckStatus::Ok, "");
+    async fn look(self, broker: &'static str, readiness: Readiness) {
         loop {
             if let Some(worker) = self.worker()
                 && let Some(status) = worker.status().await
             {
+                let (is_reached, words) = worker.reach();
+                let state = if is_reached {
+                    CheckStatus::Ok
+                } else {
+                    CheckStatus::Failed
+                };
+                readiness.set(broker, state, words);
                 tell(&readiness, &status);
+                // Others are not waited for: what is not there now is got later.
+                let knows = status.is_ready || status.reason.is_some() || !worker.has_main();
+                if is_reached && knows {
+                    self.begun.send_replace(true);
+                }
                 self.inner.lock().status = Some(status);
             }
-            tokio::time::sleep(LOOK).await;
+            let pause = if *self.begun.borrow() { LOOK } else { FIRST_LOOK };
+            tokio::time::sleep(pause).await;
         }
+    }
+
+    /// Waits until services reach it for the first time, and it serves what there is: the configuration, unless there is none here and the
+    /// main service cannot be reached either.
+    pub async fn begun(&self) {
+        // The sender lives as long as this.
+        let _ = self.begun.subscribe().wait_for(|begun| *begun).await;
     }
 
     /// The numbers, as text.
@@ -115,7 +145,7 @@ fn tell(readiness: &Readiness, status: &Status) {
     let revision = format!("revision {}", status.revision);
     match status.is_ready {
         true => readiness.set("configuration", CheckStatus::Ok, revision.clone()),
-        false => readiness.set("configuration", CheckStatus::Failed, "nothing is loaded yet"),
+        false => readiness.set("configuration", CheckStatus::Failed, NOTHING),
     }
     match (status.in_sync, &status.reason) {
         (true, _) => readiness.set("main service", CheckStatus::Ok, revision),

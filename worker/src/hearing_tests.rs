@@ -25,7 +25,7 @@ async fn what_comes_on_a_channel_is_handed_on_in_its_order() {
     let (broker, other): (Arc<dyn Broker>, Arc<dyn Broker>) = (Arc::new(hub.broker()), Arc::new(hub.broker()));
     let (send, mut heard) = mpsc::channel(4);
     let mut tasks = JoinSet::new();
-    tasks.spawn(listen(Arc::clone(&broker), ACK, send, Sign::Ack));
+    tasks.spawn(listen(Arc::clone(&broker), ACK, send, Sign::Ack, Arc::default()));
     let (acks, elsewhere) = (publisher(&*other, ACK).await, publisher(&*other, GET).await);
     // Until it listens nobody hears.
     let first = async {

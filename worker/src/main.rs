@@ -145,7 +145,9 @@ async fn start(
         anyhow::anyhow!(lines.join("; "))
     })?;
     let (readiness, shown) = (Readiness::new(), Shown::default());
-    let address = shown.serve(file.admin.worker, readiness.clone(), supervisor).await?;
+    let address = shown
+        .serve(file.admin.worker, settings.scope(), readiness.clone(), supervisor)
+        .await?;
     let worker = Arc::new(begin(settings, file, instance, supervisor).await?);
     shown.set(Arc::clone(&worker));
     let overlays = worker.own().overlays();
@@ -159,9 +161,8 @@ async fn start(
     );
     let follow = follow_node_file(Arc::clone(&worker), told, log, readiness.clone());
     supervisor.spawn("reload", TaskPolicy::Essential, follow);
-    let ready = readiness.clone();
     spawn(supervisor, "ready line", async move {
-        ready.ready().await;
+        shown.begun().await;
         // Without a reader of stdout there is nobody to tell.
         let _ = ready_line(&[("admin", address)]);
     });
@@ -224,7 +225,14 @@ const KEYS: Keys = Keys {
         "state_dir",
         "worker",
     ],
-    live: &["config.server", "config.ca_file", "config.token_file", "log.level"],
+    live: &[
+        "config.server",
+        "config.ca_file",
+        "config.token_file",
+        "config.cert_file",
+        "config.key_file",
+        "log.level",
+    ],
 };
 
 /// Takes over what may change while the process runs; what is faulty changes nothing and shows on `/readyz`.

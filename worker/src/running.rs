@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use blaze_brokers::redis::RedisKeys;
-use blaze_brokers::{Broker, BrokerKind};
+use blaze_brokers::{Broker, BrokerKind, Health};
 use blaze_domain::InstanceName;
 use blaze_domain::names::ChannelName;
 use blaze_runtime::{Supervisor, TaskPolicy};
@@ -22,7 +22,7 @@ use tokio_util::sync::CancellationToken;
 use crate::copy::{Copies, Counts as CopyCounts, Vault, defaults};
 use crate::core::Site;
 use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
-use crate::hearing::{ACK, GET, WATCHDOG, listen, notice_deafness, scan};
+use crate::hearing::{ACK, GET, Heard, WATCHDOG, listen, notice_deafness, scan};
 use crate::kept::Kept;
 use crate::lease::{self, Holder, Leadership, Lease};
 use crate::own::{OwnConfig, say_again};
@@ -38,6 +38,9 @@ const LOOK_AT_FILE: Duration = Duration::from_millis(500);
 const KEEP_WITHIN: Duration = Duration::from_secs(2);
 /// How long it waits until the lease is given up.
 const GIVE_UP_WITHIN: Duration = Duration::from_secs(2);
+
+/// Channels on which services say something: requests, acknowledgements, signs of life.
+const CHANNELS: usize = 3;
 
 /// What a worker is made of.
 pub struct WorkerOptions {
@@ -65,6 +68,9 @@ pub struct RunningWorker {
     lease: Option<LeaseEnd>,
     main: watch::Sender<MainService>,
     own: OwnConfig,
+    broker: Arc<dyn Broker>,
+    heard: Arc<Heard>,
+    has_main: bool,
 }
 
 /// How the task that keeps the lease is ended, and says that it has.
@@ -160,6 +166,8 @@ impl RunningWorker {
                 }
             });
         };
+        let heard = Arc::new(Heard::default());
+        let hears = || Arc::clone(&heard);
         let (own, said_of_own, own_acks) = OwnConfig::new(&settings.node, instance)?;
         spawn("own state", Box::pin(say_again(own_acks, said.clone())));
         let engine = Engine::new(identity, outputs, start.loaded).with_own(said_of_own);
@@ -167,15 +175,15 @@ impl RunningWorker {
         spawn("notices", Box::pin(speaker.clone().run(outlet)));
         spawn(
             "requests",
-            Box::pin(listen(Arc::clone(&broker), GET, requests, |payload| payload)),
+            Box::pin(listen(Arc::clone(&broker), GET, requests, |payload| payload, hears())),
         );
         spawn(
             "acknowledgements",
-            Box::pin(listen(Arc::clone(&broker), ACK, said.clone(), Sign::Ack)),
+            Box::pin(listen(Arc::clone(&broker), ACK, said.clone(), Sign::Ack, hears())),
         );
         spawn(
             "watchdogs",
-            Box::pin(listen(Arc::clone(&broker), WATCHDOG, said.clone(), Sign::Beat)),
+            Box::pin(listen(Arc::clone(&broker), WATCHDOG, said.clone(), Sign::Beat, hears())),
         );
         spawn("outages", Box::pin(notice_deafness(broker.status(), said.clone())));
         if let Some(records) = records {
@@ -208,8 +216,11 @@ impl RunningWorker {
             speaker,
             copies,
             lease,
+            has_main: main.is_some(),
             main: main_sender,
             own,
+            broker,
+            heard,
         })
     }
 
@@ -218,6 +229,23 @@ impl RunningWorker {
         let (send, answer) = oneshot::channel();
         self.queries.send(Query::Status(send)).await.ok()?;
         answer.await.ok()
+    }
+
+    /// Whether services reach it on its broker: that answers, and what they say there is heard. With words for people.
+    #[must_use]
+    pub fn reach(&self) -> (bool, String) {
+        let status = self.broker.status().borrow().clone();
+        match (status.health, self.heard.channels()) {
+            (Health::Up, CHANNELS) => (true, status.detail),
+            (Health::Up, _) => (false, format!("{}: requests are not heard yet", status.detail)),
+            (Health::Connecting | Health::Down | Health::InUse | Health::Closed, _) => (false, status.detail),
+        }
+    }
+
+    /// Whether it has a main service to ask at all.
+    #[must_use]
+    pub fn has_main(&self) -> bool {
+        self.has_main
     }
 
     /// What became of notices and keys.

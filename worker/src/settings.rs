@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use blaze_domain::Scope;
 use blaze_domain::node_file::{AutoBool, DatabaseSection, Fault, LayerBroker, NodeBroker, NodeFile, RedisBroker};
 
 use crate::core::Site;
@@ -94,6 +95,7 @@ impl WorkerSettings {
                 server: config.server.reveal().to_owned(),
                 ca_file: config.ca_file.clone(),
                 token_file: config.token_file.clone(),
+                certificate: config.cert_file.clone().zip(config.key_file.clone()),
             }),
             database: file.database.clone(),
             state_dir: file.worker.state_dir.clone(),
@@ -101,6 +103,15 @@ impl WorkerSettings {
             defaults_file: file.worker.defaults_file.clone(),
             lease: Duration::from_millis(file.worker.lease_ms.into()),
         })
+    }
+
+    /// Scope of the broker that services are on.
+    #[must_use]
+    pub fn scope(&self) -> Scope {
+        match &self.broker {
+            LocalBroker::Node(_) => Scope::Node,
+            LocalBroker::Layer(_) => Scope::Layer,
+        }
     }
 
     /// Whether the keys are on the broker's own server, so that keys and notices can go together.

@@ -31,11 +31,13 @@ const CALL: Duration = Duration::from_secs(2);
 const LOOK: Duration = Duration::from_millis(500);
 /// Keys that one look at many takes from the server at a time.
 const SCAN: usize = 500;
+/// The same of values, which may be large.
+const VALUES: usize = 50;
 
 /// Why a call did nothing, or nobody knows whether it did.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum KeyError {
-    /// The server does not answer. What was asked for may have been done.
+    /// The server does not answer, or cannot do it as it is just now. What was asked for may have been done.
     #[error("{place}: {reason}")]
     Away {
         /// Host and port, or path.
@@ -43,7 +45,7 @@ pub enum KeyError {
         /// For people.
         reason: String,
     },
-    /// The server said no.
+    /// The server said no, and will again.
     #[error("{place} refuses: {reason}")]
     Refused {
         /// Host and port, or path.
@@ -51,6 +53,39 @@ pub enum KeyError {
         /// In its words.
         reason: String,
     },
+}
+
+/// What a server says that starts, has no memory left, cannot write to its disk, is a replica just now, or lets nobody in: it says
+/// so of everything, and after a while no more.
+const PASSING: [&str; 14] = [
+    "LOADING",
+    "OOM",
+    "MISCONF",
+    "READONLY",
+    "BUSY",
+    "MASTERDOWN",
+    "CLUSTERDOWN",
+    "TRYAGAIN",
+    "NOREPLICAS",
+    "NOAUTH",
+    "WRONGPASS",
+    "MOVED",
+    "ASK",
+    "UNBLOCKED",
+];
+
+/// Whether the server may do later what it does not do now.
+fn passes(error: &RedisError) -> bool {
+    if error.is_io_error() || error.is_timeout() || error.is_connection_dropped() || error.is_connection_refusal() {
+        return true;
+    }
+    if matches!(error.kind(), redis::ErrorKind::AuthenticationFailed) {
+        return true;
+    }
+    // Of a transaction that was given up, what was said of its commands.
+    let said = error.clone().into_server_errors();
+    let codes = said.iter().flat_map(|said| said.iter().map(|(_, error)| error.code()));
+    codes.chain(error.code()).any(|code| PASSING.contains(&code))
 }
 
 /// One change of a key. Keys are given without the prefix of the section.
@@ -200,6 +235,17 @@ impl RedisKeys {
         .await
     }
 
+    /// There is no such record, if one member of it has this value.
+    ///
+    /// # Errors
+    /// [`KeyError`].
+    pub async fn delete_record(&self, key: &str, member: &str, value: &str) -> Result<(), KeyError> {
+        let mut call = self.scripts.delete_record.key(self.settings.names.key(key));
+        call.arg(member).arg(value);
+        self.call(|mut connection| async move { call.invoke_async::<()>(&mut connection).await })
+            .await
+    }
+
     /// A record; `None` if there is none or it has vanished.
     ///
     /// # Errors
@@ -226,17 +272,18 @@ impl RedisKeys {
         let pattern = format!("{}*", escaped(&self.settings.names.key(beginning)));
         let keys = self.keys(&pattern, most).await?;
         let mut out = Vec::with_capacity(keys.len());
-        for key in &keys {
-            let value = self
-                .call(|mut connection| async move {
-                    redis::cmd("GET")
-                        .arg(key)
-                        .query_async::<Option<Vec<u8>>>(&mut connection)
-                        .await
-                })
+        for part in keys.chunks(VALUES) {
+            let mut pipe = redis::pipe();
+            for key in part {
+                pipe.get(key);
+            }
+            let found = self
+                .call(|mut connection| async move { pipe.query_async::<Vec<Option<Vec<u8>>>>(&mut connection).await })
                 .await?;
-            let name = key.strip_prefix(&prefix).unwrap_or(key).to_owned();
-            out.extend(value.map(|value| (name, Bytes::from(value))));
+            for (key, value) in part.iter().zip(found) {
+                let name = key.strip_prefix(&prefix).unwrap_or(key).to_owned();
+                out.extend(value.map(|value| (name, Bytes::from(value))));
+            }
         }
         Ok(out)
     }
@@ -346,10 +393,9 @@ impl RedisKeys {
         let (place, reason) = (self.settings.place.clone(), error.to_string());
         // Also after a refusal: a server that became a replica, or wants another password, is another one behind the same name.
         *self.connection.lock() = None;
-        if error.is_io_error() || error.is_timeout() || error.is_connection_dropped() || error.is_connection_refusal() {
-            KeyError::Away { place, reason }
-        } else {
-            KeyError::Refused { place, reason }
+        match passes(error) {
+            true => KeyError::Away { place, reason },
+            false => KeyError::Refused { place, reason },
         }
     }
 }

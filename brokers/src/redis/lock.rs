@@ -39,6 +39,7 @@ pub(super) struct Scripts {
     hold: Script,
     release: Script,
     apply: Script,
+    pub(super) delete_record: Script,
 }
 
 impl Default for Scripts {
@@ -47,6 +48,7 @@ impl Default for Scripts {
             hold: Script::new(HOLD),
             release: Script::new(RELEASE),
             apply: Script::new(APPLY),
+            delete_record: Script::new(DELETE_RECORD),
         }
     }
 }
@@ -141,5 +143,11 @@ return 1
 /// Deleted when one's own.
 const RELEASE: &str = r"
 if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('DEL', KEYS[1]) end
+return 1
+";
+
+/// A record that is deleted when a member of it has a value: that of another process is not.
+const DELETE_RECORD: &str = r"
+if redis.call('HGET', KEYS[1], ARGV[1]) == ARGV[2] then redis.call('DEL', KEYS[1]) end
 return 1
 ";

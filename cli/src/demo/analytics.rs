@@ -143,6 +143,7 @@ mod tests {
             old: None,
             new: Some(Arc::new(config)),
             revision,
+            hash: Some(format!("sha256:{revision}")),
             paths: Vec::new(),
             scopes: Vec::new(),
             deleted: false,

@@ -55,8 +55,7 @@ impl FlowService {
             return Ok(None);
         };
         let options = ServiceOptions::new(shared.me.layer.clone(), name, Arc::clone(broker), scope)
-            .on_node(shared.me.node.clone())
-            .instance_of_environment()?;
+            .on_node(shared.me.node.clone());
         let options = ServiceOptions {
             // Nothing of a flow runs as a callback.
             pool_threads: 1,

@@ -60,16 +60,26 @@ pub struct ConfigSection {
     pub ca_file: Option<PathBuf>,
     /// File that holds the token; read again when it changes.
     pub token_file: Option<PathBuf>,
+    /// Own certificate, for a main service that asks for one; read again when it changes.
+    pub cert_file: Option<PathBuf>,
+    /// Key of the own certificate.
+    pub key_file: Option<PathBuf>,
 }
 
 impl ConfigSection {
     pub(super) fn section(s: &mut Section<'_>) -> Option<Self> {
         let server = s.need("server", url(&["https://", "http://"]));
         let (ca_file, token_file) = (s.opt("ca_file", path), s.opt("token_file", path));
+        let (cert_file, key_file) = (s.opt("cert_file", path), s.opt("key_file", path));
+        if cert_file.is_some() != key_file.is_some() {
+            return s.node.fault("cert_file and key_file go together");
+        }
         Some(Self {
             server: server?,
             ca_file,
             token_file,
+            cert_file,
+            key_file,
         })
     }
 }

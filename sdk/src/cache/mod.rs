@@ -14,6 +14,7 @@ mod wait;
 mod watchdog;
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
 use std::time::{Duration, SystemTime};
 
 use blaze_brokers::Broker;
@@ -92,6 +93,16 @@ pub enum Liveness {
     Ended,
 }
 
+/// How a service says that it lives.
+pub(crate) struct WatchdogOptions {
+    /// Version of the program.
+    pub(crate) version: String,
+    /// How long a sign counts.
+    pub(crate) ttl: Duration,
+    /// The number of its life is the time at which it began. Clocks go back; whoever begins is the newer one all the same.
+    pub(crate) by_clock: bool,
+}
+
 /// What the service says of itself.
 #[derive(Debug, Clone)]
 struct Said {
@@ -107,8 +118,9 @@ struct Shared {
     key: Option<String>,
     broker: Arc<dyn Broker>,
     store: Option<Arc<dyn Store>>,
-    version: String,
-    ttl: Duration,
+    watchdog: WatchdogOptions,
+    /// Number of this life, as it is said.
+    epoch: AtomicU64,
     config: watch::Receiver<Shown>,
     said: Mutex<Said>,
     /// What is said has changed.
@@ -127,18 +139,17 @@ impl CacheManager {
         identity: Identity,
         broker: Arc<dyn Broker>,
         store: Option<Arc<dyn Store>>,
-        version: String,
-        ttl: Duration,
+        watchdog: WatchdogOptions,
         config: watch::Receiver<Shown>,
         supervisor: &Supervisor,
     ) -> Self {
         let shared = Arc::new(Shared {
             key: record::key(&identity),
+            epoch: AtomicU64::new(identity.epoch),
             identity,
             broker,
             store,
-            version,
-            ttl,
+            watchdog,
             config,
             said: Mutex::new(Said {
                 state: ServiceState::Starting,

@@ -61,6 +61,8 @@ pub(super) fn key(identity: &Identity) -> Option<String> {
 pub(super) struct Sign<'a> {
     pub(super) identity: &'a Identity,
     pub(super) state: ServiceState,
+    /// Number of this life.
+    pub(super) epoch: u64,
     /// Since when it is so, in ms since 1970.
     pub(super) since_ms: u64,
     pub(super) version: &'a str,
@@ -84,7 +86,7 @@ impl Sign<'_> {
     fn numbers(&self) -> [(&'static str, u64); 3] {
         let revision = self.config.as_ref().map_or(0, |(revision, _)| *revision);
         [
-            ("epoch", self.identity.epoch),
+            ("epoch", self.epoch),
             ("since_ms", self.since_ms),
             ("config_revision", revision),
         ]
@@ -188,6 +190,7 @@ mod tests {
         let identity = identity();
         let sign = Sign {
             identity: &identity,
+            epoch: 17,
             state: ServiceState::Ready,
             since_ms: 5,
             version: "1.2.3",

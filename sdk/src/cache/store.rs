@@ -15,8 +15,8 @@ pub(crate) trait Store: Send + Sync + 'static {
     async fn records(&self, beginning: &str, most: usize) -> Result<Vec<(String, Record)>, KeyError>;
     /// A record with these members and no others, for so long.
     async fn put_record(&self, key: &str, members: Record, expires: Duration) -> Result<(), KeyError>;
-    /// There is no such key.
-    async fn delete(&self, key: &str) -> Result<(), KeyError>;
+    /// There is no such record of this epoch.
+    async fn delete_record(&self, key: &str, epoch: &str) -> Result<(), KeyError>;
     /// The value of a key.
     async fn get(&self, key: &str) -> Result<Option<Bytes>, KeyError>;
     /// A value, for so long.
@@ -38,8 +38,8 @@ impl Store for RedisKeys {
         self.apply(&[KeyChange::PutRecord { key, members, expires }], &[]).await
     }
 
-    async fn delete(&self, key: &str) -> Result<(), KeyError> {
-        self.apply(&[KeyChange::Delete { key: key.to_owned() }], &[]).await
+    async fn delete_record(&self, key: &str, epoch: &str) -> Result<(), KeyError> {
+        Self::delete_record(self, key, "epoch", epoch).await
     }
 
     async fn get(&self, key: &str) -> Result<Option<Bytes>, KeyError> {

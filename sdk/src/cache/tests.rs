@@ -74,9 +74,12 @@ impl Store for Keys {
         Ok(())
     }
 
-    async fn delete(&self, key: &str) -> Result<(), KeyError> {
+    async fn delete_record(&self, key: &str, epoch: &str) -> Result<(), KeyError> {
         self.reach()?;
-        self.records.lock().remove(key);
+        let mut records = self.records.lock();
+        if records.get(key).is_some_and(|(record, _)| record["epoch"] == epoch) {
+            records.remove(key);
+        }
         Ok(())
     }
 
@@ -117,6 +120,10 @@ impl World {
     }
 
     fn service(&self, name: &str, epoch: u64, has_keys: bool) -> CacheManager {
+        self.service_by(name, epoch, has_keys, false)
+    }
+
+    fn service_by(&self, name: &str, epoch: u64, has_keys: bool, by_clock: bool) -> CacheManager {
         let identity = Identity {
             layer: "edge".parse().unwrap(),
             node: Some("robot-1".parse().unwrap()),
@@ -137,8 +144,11 @@ impl World {
             identity,
             broker,
             store,
-            "1.2.3".to_owned(),
-            TTL,
+            WatchdogOptions {
+                version: "1.2.3".to_owned(),
+                ttl: TTL,
+                by_clock,
+            },
             config.shown(),
             &self.supervisor,
         )
@@ -194,6 +204,24 @@ async fn of_two_processes_of_one_key_the_older_one_falls_silent() {
             assert!(world.keys.now(SLAM).is_some(), "the record is the newer one's");
         }
     }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_clock_that_went_back_makes_no_process_the_older_one() {
+    let world = World::new();
+    let before = world.service_by("slam", 1_000, true, true);
+    before.set_state(ServiceState::Ready);
+    until(&before, Liveness::Alive).await;
+    // It was killed, or lives on: whoever begins is the newer one.
+    let after = world.service_by("slam", 7, true, true);
+    after.set_state(ServiceState::Ready);
+    until(&after, Liveness::Alive).await;
+    assert_eq!(world.keys.now(SLAM).unwrap()["epoch"], "1001");
+    until(&before, Liveness::Superseded).await;
+    before.leave(Duration::from_secs(1)).await;
+    tokio::time::sleep(TTL * 2).await;
+    assert_eq!(*after.liveness().borrow(), Liveness::Alive);
+    assert_eq!(world.keys.now(SLAM).unwrap()["epoch"], "1001");
 }
 
 #[tokio::test(start_paused = true)]

@@ -1,5 +1,6 @@
 //! The task that says that the service lives.
 
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use blaze_brokers::BrokerError;
@@ -42,9 +43,13 @@ pub(super) async fn run(shared: &Shared) {
 
 /// Writes a record again and again. A look before each write finds out whether a newer process has the key.
 async fn in_store(shared: &Shared, store: &dyn Store, key: &str) -> Liveness {
+    // Until it has looked once, what is there is of an earlier life, or of a process that this one follows.
+    let mut is_first = shared.watchdog.by_clock;
     loop {
         let said = shared.said.lock().clone();
-        let next = match beat(shared, store, key, &said).await {
+        let beaten = beat(shared, store, key, &said, is_first).await;
+        is_first &= beaten.is_err();
+        let next = match beaten {
             Ok(true) if said.ending => return Liveness::Ended,
             Ok(true) => {
                 shared.show(Liveness::Alive);
@@ -72,15 +77,24 @@ async fn beat(
     store: &dyn Store,
     key: &str,
     said: &Said,
+    is_first: bool,
 ) -> Result<bool, blaze_brokers::redis::KeyError> {
-    let present = store.record(key).await?;
-    if present.is_some_and(|record| record::epoch_of(&record) > shared.identity.epoch) {
-        return Ok(false);
+    let present = store.record(key).await?.map_or(0, |record| record::epoch_of(&record));
+    let own = shared.epoch.load(Ordering::Relaxed);
+    if present > own {
+        if !is_first {
+            return Ok(false);
+        }
+        shared.epoch.store(present.saturating_add(1), Ordering::Relaxed);
     }
     if said.ending {
-        store.delete(key).await?;
+        // Another process may have begun since.
+        let own = shared.epoch.load(Ordering::Relaxed);
+        store.delete_record(key, &own.to_string()).await?;
     } else {
-        store.put_record(key, shared.sign(said).record(), shared.ttl).await?;
+        store
+            .put_record(key, shared.sign(said).record(), shared.watchdog.ttl)
+            .await?;
     }
     Ok(true)
 }
@@ -93,7 +107,7 @@ async fn by_messages(shared: &Shared) -> Result<Liveness, BrokerError> {
     let mut heard = Vec::new();
     loop {
         let said = shared.said.lock().clone();
-        let ttl = if said.ending { OVER } else { shared.ttl };
+        let ttl = if said.ending { OVER } else { shared.watchdog.ttl };
         let text = shared.sign(&said).message(ttl);
         let outcome = publisher.publish_bare(&Bytes::from(text), None);
         if said.ending {
@@ -128,7 +142,7 @@ async fn by_messages(shared: &Shared) -> Result<Liveness, BrokerError> {
 
 impl Shared {
     fn pace(&self) -> Duration {
-        self.ttl / 3
+        self.watchdog.ttl / 3
     }
 
     fn show(&self, liveness: Liveness) {
@@ -141,7 +155,8 @@ impl Shared {
             identity: &self.identity,
             state: said.state,
             since_ms: said.since_ms,
-            version: &self.version,
+            epoch: self.epoch.load(Ordering::Relaxed),
+            version: &self.watchdog.version,
             config: record::of_config(self.config.borrow().held()),
         }
     }

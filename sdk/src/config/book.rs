@@ -206,7 +206,9 @@ impl ConfigBook {
         let is_older = match &self.standing {
             Standing::Nothing => false,
             Standing::Held(old) => new.revision < old.revision,
-            // At the revision that deleted it, a configuration is one of before.
+            // At the revision that deleted it, a configuration is one of before. All that a mounted file says is of revision 0, and comes
+            // in its order.
+            Standing::Deleted { revision: 0 } => false,
             Standing::Deleted { revision } => new.revision <= *revision,
         };
         if is_older {
@@ -235,6 +237,7 @@ impl ConfigBook {
         Some(ConfigChange {
             old,
             revision: new.revision,
+            hash: Some(new.hash),
             new: Some(new.config),
             paths,
             scopes,
@@ -254,6 +257,7 @@ impl ConfigBook {
             old: Some(old),
             new: None,
             revision,
+            hash: None,
             paths: Vec::new(),
             scopes: Vec::new(),
             deleted: true,

@@ -227,3 +227,19 @@ proptest! {
         prop_assert_eq!(shown, history[last].map(|rate| json!({ "rate": rate })));
     }
 }
+
+#[test]
+fn what_a_mounted_file_takes_away_and_gives_again_is_there_again() {
+    let (mut book, now) = ours();
+    book.poll(now).unwrap();
+    book.on_reply(&given(0, &json!({ "rate": 1 })), now);
+    assert!(
+        book.on_notice(&bytes(&deleted(0)), now)
+            .is_some_and(|change| change.deleted)
+    );
+    let again = book.on_notice(&bytes(&notice(0, &json!({ "rate": 2 }))), now).unwrap();
+    assert_eq!(
+        (again.new.as_deref(), again.hash),
+        (Some(&json!({ "rate": 2 })), Some(hash(&json!({ "rate": 2 }))))
+    );
+}

@@ -96,6 +96,8 @@ pub struct ConfigChange {
     pub new: Option<Arc<Value>>,
     /// Revision of what it is.
     pub revision: u64,
+    /// Hash of what it is; absent if the service was deleted.
+    pub hash: Option<String>,
     /// JSON pointers of what is different, sorted; empty if the service was deleted.
     pub paths: Vec<String>,
     /// Which kinds of document changed. Empty = unknown: it is the first configuration, the notice was missed and the change
@@ -157,6 +159,7 @@ mod tests {
             old: Some(Arc::new(json!({ "n": revision - 1 }))),
             new: Some(Arc::new(json!({ "n": revision, "password": "geheim" }))),
             revision,
+            hash: Some(format!("sha256:{revision}")),
             paths: paths.iter().map(|path| (*path).to_owned()).collect(),
             scopes: scopes.to_vec(),
             deleted: false,

@@ -160,6 +160,7 @@ mod tests {
             old: Some(Arc::new(json!({ "n": revision - 1 }))),
             new: Some(Arc::new(json!({ "n": revision }))),
             revision,
+            hash: Some(format!("sha256:{revision}")),
             paths: vec!["/n".to_owned()],
             scopes: scopes.to_vec(),
             deleted: false,

@@ -257,8 +257,9 @@ impl ConfigManager {
         self.shared.listeners.add(&scopes, Box::new(callback))
     }
 
-    /// Tells workers how the service gets on with the configuration that it has. A staged roll-out is undone by `rejected` and
-    /// `unhealthy`. Of the detail, 4 KiB are sent.
+    /// Tells workers how the service gets on with the configuration that it has now. A staged roll-out is undone by `rejected` and
+    /// `unhealthy`. Of the detail, 4 KiB are sent. In a callback, while which the next configuration may come, use
+    /// [`ConfigManager::ack_change`].
     ///
     /// # Errors
     /// [`SdkError::Broker`], when the broker cannot carry it at all. One that is away drops it, which is an outcome.
@@ -269,6 +270,20 @@ impl ConfigManager {
             status,
             detail,
         )
+    }
+
+    /// The same of the configuration that a change has brought, whatever came since.
+    ///
+    /// # Errors
+    /// As [`ConfigManager::ack`].
+    pub fn ack_change(
+        &self,
+        change: &ConfigChange,
+        status: AckStatus,
+        detail: &str,
+    ) -> Result<PublishOutcome, SdkError> {
+        let of = change.hash.as_deref().map(|hash| (change.revision, hash));
+        self.ack_of(of, status, detail)
     }
 
     /// The same of a configuration that may not be the newest any more: its revision and hash.

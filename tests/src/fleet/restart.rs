@@ -32,6 +32,10 @@ pub struct Restarted {
     pub gets: Vec<Duration>,
     /// Those that were not answered: nobody listened, or the connection broke.
     pub refused: usize,
+    /// The longest time that one of those took to fail.
+    pub slowest_refusal: Duration,
+    /// Those of them that began after the main service was ready again.
+    pub refused_since: usize,
 }
 
 /// Kills the main service, leaves it away for a time and starts it again, while eight users read what is at a path of it, 100
@@ -66,12 +70,14 @@ pub async fn restart(
         ..Restarted::default()
     };
     while let Some(done) = users.join_next().await {
-        for (begun, taken) in done? {
-            match taken {
-                Some(taken) if begun + taken >= killed => restarted.gets.push(taken),
-                Some(_) => {}
-                None => restarted.refused += 1,
+        for (begun, taken, is_answered) in done? {
+            if is_answered {
+                restarted.gets.extend((begun + taken >= killed).then_some(taken));
+                continue;
             }
+            restarted.refused += 1;
+            restarted.refused_since += usize::from(begun > ready);
+            restarted.slowest_refusal = restarted.slowest_refusal.max(taken);
         }
     }
     anyhow::ensure!(!restarted.gets.is_empty(), "no user was answered");
@@ -102,14 +108,14 @@ async fn come_back(workers: &[Worker], ready: Instant) -> anyhow::Result<Vec<Dur
     Ok(back)
 }
 
-/// A user: when each request began, and how long its answer took, if it was answered.
-async fn read(api: Api, path: &str, stop: Arc<AtomicBool>) -> Vec<(Instant, Option<Duration>)> {
+/// A user: when each request began, how long it took, and whether it was answered.
+async fn read(api: Api, path: &str, stop: Arc<AtomicBool>) -> Vec<(Instant, Duration, bool)> {
     let mut all = Vec::new();
     while !stop.load(Ordering::Acquire) {
         let begun = Instant::now();
         let told = api.send(Method::GET, path, None).await;
         let is_answered = matches!(told, Told::Done(_));
-        all.push((begun, is_answered.then(|| begun.elapsed())));
+        all.push((begun, begun.elapsed(), is_answered));
         tokio::time::sleep(PACE).await;
     }
     all

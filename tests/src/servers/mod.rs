@@ -20,6 +20,7 @@ mod process;
 mod redis;
 mod shared;
 
+pub use certificates::Certificates;
 pub use etcd::{EtcdOptions, EtcdServer};
 pub use kafka::{KafkaOptions, KafkaServer};
 pub use mongo::{

@@ -24,7 +24,7 @@ const EQUAL: Duration = Duration::from_secs(5);
 /// Workers in this process whose services are looked at in the end.
 const LOOKED_AT: usize = 3;
 
-/// What is killed, in turns.
+/// What is killed, in turns; the first one last, as all workers depend on it.
 const VICTIMS: [Victim; 3] = [Victim::Main, Victim::Broker, Victim::Database];
 
 #[derive(Debug, Clone, Copy)]
@@ -113,8 +113,10 @@ fn process_node(number: usize) -> String {
 /// Kills one after the other, in the middle of the writes; each is back before the next.
 fn kill_all(parts: &mut Parts, kills: usize, goal: usize, progress: &Progress) {
     let mut random = StdRng::seed_from_u64(7);
-    for (index, victim) in VICTIMS.iter().cycle().take(kills).enumerate() {
-        let due = goal * (index + 1) / (kills + 1);
+    for index in 0..kills {
+        let victim = VICTIMS[(kills - 1 - index) % VICTIMS.len()];
+        // The last one when all is written: then all must be equal soon after it answers again.
+        let due = goal * (index + 1) / kills;
         wait::until(
             &format!("{due} writes"),
             Duration::from_secs(600),
@@ -124,7 +126,7 @@ fn kill_all(parts: &mut Parts, kills: usize, goal: usize, progress: &Progress) {
         .unwrap();
         // Not on a condition: it is to hit any point of a commit.
         std::thread::sleep(Duration::from_micros(random.random_range(0..10_000)));
-        parts.kill(*victim);
+        parts.kill(victim);
     }
 }
 

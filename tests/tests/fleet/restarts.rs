@@ -42,6 +42,9 @@ async fn workers_come_back_one_after_the_other_and_users_do_not_wait_for_them() 
         restarted.away
     );
     assert!(p99 <= GET, "a user's GET took {p99:?}");
+    // Who is not answered hears so at once, and nobody is refused once the main service is back.
+    assert!(restarted.slowest_refusal <= GET, "{:?}", restarted.slowest_refusal);
+    assert_eq!(restarted.refused_since, 0);
     assert!(last <= BACK, "the last worker came back after {last:?}");
     let most = restarted.back.iter().enumerate().map(|(number, begin)| {
         let within = restarted.back[number..]

@@ -137,7 +137,12 @@ async fn all_is_killed_and_comes_back(alone: bool) {
     robot.redis.kill().unwrap();
     mongo.kill().unwrap();
     // The database stays away, the file is there. The worker waits for the broker.
-    let worker = robot.worker(&stage);
+    let worker = robot.worker_unready(&stage).listening();
+    let readiness = worker.text("/readyz").await;
+    assert!(
+        readiness.contains("not_ready") && readiness.contains("node_broker"),
+        "{readiness}"
+    );
     robot.redis.restart().unwrap();
     last.is_served(&robot, Instant::now(), "the file alone").await;
     // The other way round: the broker waits for the worker, which has to come up within the time.
@@ -155,7 +160,7 @@ async fn all_is_killed_and_comes_back(alone: bool) {
     worker.kill();
     robot.redis.kill().unwrap();
     std::fs::remove_file(stage.path("robot-1").join("last-known-good")).unwrap();
-    let worker = robot.worker(&stage);
+    let worker = robot.worker_unready(&stage).listening();
     robot.redis.restart().unwrap();
     last.is_served(&robot, Instant::now(), "the database alone").await;
     assert_eq!(worker.status().await["connected"], false);

@@ -88,6 +88,23 @@ impl Robot {
 pub(crate) struct Starting(Process);
 
 impl Starting {
+    pub(crate) fn of(process: Process) -> Self {
+        Self(process)
+    }
+
+    /// Its admin port listens; its broker may not be there.
+    pub(crate) fn listening(self) -> Worker {
+        const SAID: &str = "admin listening on ";
+        let said = || {
+            let lines = self.0.stderr().into_iter();
+            lines
+                .filter_map(|line| line.split(SAID).nth(1)?.trim().parse().ok())
+                .next()
+        };
+        let admin = wait::until_some("the admin port", PATIENCE, said, || self.0.tail()).unwrap();
+        Worker { process: self.0, admin }
+    }
+
     pub(crate) fn ready(self) -> Worker {
         let addresses = addresses(&self.0).unwrap();
         let admin = *addresses.get("admin").context("no admin").unwrap();

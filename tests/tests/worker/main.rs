@@ -18,6 +18,7 @@
 //! rollouts   roll-outs that services judge
 //! secrets    what services are not told is nowhere
 //! wire       both ends of `Sync` across versions
+//! tls        TLS on both sides and a token: the worker as `blaze node join` sets it up
 //! raw        `Sync` as bytes
 //! recorded   recordings of it
 //! partition  the link to the main service loses everything while very much is changed (needs root: a network namespace)
@@ -48,4 +49,5 @@ mod secrets;
 mod serving;
 mod several;
 mod stage;
+mod tls;
 mod wire;

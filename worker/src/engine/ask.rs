@@ -33,7 +33,9 @@ impl Engine {
                     return;
                 }
                 let text = messages::refusal(&error, id.as_deref());
-                (reply_to.map(|to| (to, id)), text)
+                // Who can be told which of its requests it was hears of it where answers go that nobody chose.
+                let to = reply_to.or_else(|| id.as_ref().and_then(|_| messages::default_reply()));
+                (to.map(|to| (to, id)), text)
             }
         };
         let Some((to, id)) = to else { return };

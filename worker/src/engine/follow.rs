@@ -13,8 +13,18 @@ use crate::core::{Applied, Incoming, PROTOCOL};
 use crate::sync::SyncEvent;
 
 /// After an outage services hear of the final state, not of each step to it: what they are told waits until everything up to
-/// where the store stood has come, or for so long.
+/// where the store stood has come, or nothing comes for so long.
 const CATCH_UP: Duration = Duration::from_secs(3);
+/// The same, however much still comes.
+const CATCH_UP_AT_MOST: Duration = Duration::from_secs(30);
+
+/// What was missed is coming.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct CatchingUp {
+    /// Nobody is told before this time.
+    pub(super) until: Instant,
+    at_most: Instant,
+}
 
 impl Engine {
     pub(super) fn on_sync(&mut self, event: SyncEvent) {
@@ -76,7 +86,7 @@ impl Engine {
                 self.reason = Some(reason);
                 self.replica.disconnected();
                 // A time that is still to come stays: else a link that comes and goes would put it off for ever.
-                self.catching_up = self.catching_up.filter(|until| *until > Instant::now());
+                self.catching_up = self.catching_up.filter(|wait| wait.until > Instant::now());
                 self.note_sync();
             }
         }
@@ -121,9 +131,14 @@ impl Engine {
 
     /// What was missed in an outage comes in steps, of which only the last is told.
     fn note_catching_up(&mut self) {
-        if !self.replica.is_in_sync() && self.catching_up.is_none() {
-            let until = Instant::now() + CATCH_UP;
-            self.catching_up = Some(until);
+        if self.replica.is_in_sync() {
+            return;
+        }
+        let now = Instant::now();
+        let at_most = self.catching_up.map_or(now + CATCH_UP_AT_MOST, |wait| wait.at_most);
+        let until = at_most.min(now + CATCH_UP);
+        if until > now {
+            self.catching_up = Some(CatchingUp { until, at_most });
             self.flush_at = Some(until);
         }
     }

@@ -206,3 +206,53 @@ async fn texts_that_come_in_the_middle_of_what_was_missed_are_told_with_the_rest
     );
     assert_eq!(w.slam().await["config"]["password"], "canary");
 }
+
+#[tokio::test(start_paused = true)]
+async fn what_was_missed_is_told_once_also_when_it_comes_slowly() {
+    let mut w = world();
+    w.opens(documents(30), 2).await;
+    w.slam().await;
+    w.rest().await;
+    w.closes().await;
+    w.rest().await;
+    // A commit each second, for longer than the wait for nothing.
+    w.goes_on(PROTOCOL, 12).await;
+    for revision in 3..=12 {
+        let changed = document("Service/slam", revision, json!({ "config": { "rate_hz": revision } }));
+        w.says(commit(revision, revision - 1, vec![(Op::Update, changed)]))
+            .await;
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
+    let told = w.rest().await;
+    assert!(
+        !told.is_empty() && rates(&told).iter().all(|rate| *rate == 12),
+        "{told:?}"
+    );
+    // It ends, however much comes: services are not kept waiting for ever.
+    w.closes().await;
+    w.rest().await;
+    w.goes_on(PROTOCOL, 1_000).await;
+    for revision in 13..60 {
+        let changed = document("Service/slam", revision, json!({ "config": { "rate_hz": revision } }));
+        w.says(commit(revision, revision - 1, vec![(Op::Update, changed)]))
+            .await;
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
+    let told = w.rest().await;
+    let all = rates(&told);
+    assert!(all.len() >= 10 && all[0] > 40, "{all:?}");
+}
+
+#[tokio::test(start_paused = true)]
+async fn whose_answer_could_go_nowhere_is_told_so_where_all_are_answered() {
+    let mut w = world();
+    w.opens(documents(30), 2).await;
+    let request = json!({ "id": "7", "service": "slam", "reply_to": "other/topic" });
+    w.gets.send(Bytes::from(request.to_string())).await.unwrap();
+    let (to, answer) = w.answers.recv().await.unwrap();
+    assert_eq!(to, "blaze/reply/config");
+    assert_eq!(
+        (&answer["id"], &answer["error"]["code"]),
+        (&json!("7"), &json!("invalid_request"))
+    );
+}

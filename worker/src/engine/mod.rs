@@ -101,8 +101,7 @@ pub struct Engine {
     shown: Option<Mark>,
     flushed: Option<Instant>,
     flush_at: Option<Instant>,
-    /// What was missed is coming; nobody is told before this time.
-    catching_up: Option<Instant>,
+    catching_up: Option<follow::CatchingUp>,
     /// When to look whether the broker has taken what places are told.
     settle_at: Option<Instant>,
     ack_at: Instant,

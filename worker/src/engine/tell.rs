@@ -57,7 +57,7 @@ impl Engine {
     /// is told when it has all come.
     pub(super) fn flush_soon(&mut self) {
         let next = self.flushed.map_or_else(Instant::now, |last| last + TOGETHER);
-        let next = self.catching_up.map_or(next, |until| until.max(next));
+        let next = self.catching_up.map_or(next, |wait| wait.until.max(next));
         self.flush_at = Some(self.flush_at.map_or(next, |at| at.min(next)));
     }
 

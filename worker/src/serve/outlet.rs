@@ -38,6 +38,9 @@ pub enum OutletError {
         /// What one of them waits for.
         reason: String,
     },
+    /// All messages were published; the server of the keys, which is another one, does not answer.
+    #[error("the keys are not written: {0}")]
+    KeysLater(KeyError),
     /// It is more than the broker carries.
     #[error("{bytes} bytes are more than the broker carries")]
     TooLarge {
@@ -65,7 +68,11 @@ impl OutletError {
                 BrokerError::Name { .. } | BrokerError::Collision { .. } => true,
                 BrokerError::Closed | BrokerError::Away(_) | BrokerError::TooManyChannels(_) => false,
             },
-            Self::Away(_) | Self::NotYet { .. } | Self::Led | Self::Keys(KeyError::Away { .. }) => false,
+            Self::Away(_)
+            | Self::NotYet { .. }
+            | Self::KeysLater(_)
+            | Self::Led
+            | Self::Keys(KeyError::Away { .. }) => false,
         }
     }
 }
@@ -83,7 +90,8 @@ impl From<WriteError> for OutletError {
 /// Where keys and notices go.
 #[async_trait]
 pub trait Outlet: Send + Sync + 'static {
-    /// Makes all changes of keys, then publishes all messages, in their order.
+    /// Makes all changes of keys, then publishes all messages, in their order. Where a server that is not the broker's does not take
+    /// the keys, the messages are published all the same.
     ///
     /// # Errors
     /// [`OutletError`]: some of it may have been done; doing all of it again does no harm.
@@ -237,22 +245,29 @@ impl BrokerOutlet {
 #[async_trait]
 impl Outlet for BrokerOutlet {
     async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
-        match &self.keys {
+        let keys = match &self.keys {
             Some(keys) if keys.is_broker => {
                 let messages: Vec<_> = said(messages).map(|(to, text)| (to.clone(), text.clone())).collect();
                 return keys.apply(changes, &messages).await;
             }
-            Some(keys) => keys.apply(changes, &[]).await?,
-            None => {}
+            Some(keys) => keys.apply(changes, &[]).await,
+            None => Ok(()),
+        };
+        let later = match keys {
+            Ok(()) => None,
+            Err(OutletError::Keys(error @ KeyError::Away { .. })) => Some(OutletError::KeysLater(error)),
+            Err(error) => return Err(error),
+        };
+        if !messages.is_empty() {
+            match &self.side {
+                Some(side) => side.write(messages).await?,
+                None => {
+                    self.check_up()?;
+                    said(messages).try_for_each(|(to, text)| self.publish(to, text))?;
+                }
+            }
         }
-        if messages.is_empty() {
-            return Ok(());
-        }
-        if let Some(side) = &self.side {
-            return Ok(side.write(messages).await?);
-        }
-        self.check_up()?;
-        said(messages).try_for_each(|(to, text)| self.publish(to, text))
+        later.map_or(Ok(()), Err)
     }
 
     fn has_keys(&self) -> bool {
@@ -309,3 +324,7 @@ impl Channels for BrokerOutlet {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "outlet_tests.rs"]
+mod tests;

@@ -22,6 +22,9 @@ const PAUSE: (Duration, Duration) = (Duration::from_millis(20), Duration::from_m
 /// What is for a channel that is not there yet is set aside for so long, so that it does not hold up the rest.
 const ASIDE: Duration = Duration::from_millis(200);
 
+/// A server of the keys that is not the broker's and does not answer is left alone for so long: notices go on meanwhile.
+const KEYS_AGAIN: Duration = Duration::from_secs(1);
+
 /// What is told of one place.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Told {
@@ -162,13 +165,15 @@ impl Speaker {
     async fn speak(&self, outlet: &dyn Outlet) {
         let (mut pause, mut most) = (PAUSE.0, BATCH);
         let mut aside: Option<Instant> = None;
+        let mut keys_again: Option<Instant> = None;
         loop {
+            if keys_again.is_some_and(|until| until <= Instant::now()) {
+                keys_again = None;
+                self.shared.state.lock().keys_wait = false;
+            }
             if aside.is_some_and(|until| until <= Instant::now()) {
                 aside = None;
                 self.shared.state.lock().bring_back();
-            }
-            if self.term.is_on() {
-                self.sweep(outlet).await;
             }
             let (batch, changes) = {
                 let mut state = self.shared.state.lock();
@@ -180,9 +185,16 @@ impl Speaker {
                 (batch, changes)
             };
             if batch.is_empty() {
+                // Last: to look through all keys of a server may take long.
+                if keys_again.is_none() && self.term.is_on() && self.sweep(outlet).await {
+                    continue;
+                }
+                let is_due = self.term.is_on() && self.shared.state.lock().sweep;
+                let again = [aside, keys_again, is_due.then(|| Instant::now() + PAUSE.1)];
+                let again = again.into_iter().flatten().min();
                 tokio::select! {
                     () = self.shared.more.notified() => {}
-                    () = sleep_until(aside.unwrap_or_else(Instant::now)), if aside.is_some() => {}
+                    () = sleep_until(again.unwrap_or_else(Instant::now)), if again.is_some() => {}
                 }
                 continue;
             }
@@ -202,6 +214,15 @@ impl Speaker {
                     (pause, most) = (PAUSE.0, BATCH);
                     self.shared.keys.fetch_add(changes.len() as u64, Ordering::Relaxed);
                     self.shared.notices.fetch_add(messages.len() as u64, Ordering::Relaxed);
+                }
+                Err(OutletError::KeysLater(error)) => {
+                    tracing::debug!(%error, keys = changes.len(), "services were told, their keys are written later");
+                    self.shared.failures.fetch_add(1, Ordering::Relaxed);
+                    self.shared.notices.fetch_add(messages.len() as u64, Ordering::Relaxed);
+                    keys_again = Some(Instant::now() + KEYS_AGAIN);
+                    let mut state = self.shared.state.lock();
+                    state.put_back(batch.without_notices());
+                    state.keys_wait = true;
                 }
                 // Whoever is refused alone would be refused again, and must not hold up the others.
                 Err(error) if error.is_refusal() && batch.len() <= 2 && batch.waiting.len() <= 1 => {
@@ -233,12 +254,12 @@ impl Speaker {
         }
     }
 
-    /// Looks for keys of before, if that is due; one that cannot be looked for now is looked for later.
-    async fn sweep(&self, outlet: &dyn Outlet) {
+    /// Looks for keys of before, if that is due; those that cannot be looked for now are looked for later. Returns whether it did.
+    async fn sweep(&self, outlet: &dyn Outlet) -> bool {
         let cleared = {
             let mut state = self.shared.state.lock();
             if !std::mem::take(&mut state.sweep) {
-                return;
+                return false;
             }
             state.cleared
         };
@@ -246,13 +267,17 @@ impl Speaker {
         let mut state = self.shared.state.lock();
         // What is wanted has been forgotten meanwhile, so nobody knows what is not.
         if state.cleared != cleared {
-            return;
+            return true;
         }
         match found {
-            Ok(found) => state.drop_unwanted(found),
+            Ok(found) => {
+                state.drop_unwanted(found);
+                true
+            }
             Err(error) => {
                 tracing::debug!(%error, "keys of before were not looked for");
                 state.sweep = true;
+                false
             }
         }
     }

@@ -1,7 +1,7 @@
 //! The speaker in front of a broker that is away, refuses, or has forgotten.
 
 use async_trait::async_trait;
-use blaze_brokers::redis::KeyChange;
+use blaze_brokers::redis::{KeyChange, KeyError};
 use tokio::sync::{mpsc, watch};
 
 use super::super::waiting::BATCH_BYTES;
@@ -19,6 +19,8 @@ struct Fake {
     refused: Option<&'static str>,
     /// A channel that it has not yet.
     missing: Option<&'static str>,
+    /// Whether the server of the keys, another one, answers.
+    has_keys: watch::Receiver<bool>,
 }
 
 #[async_trait]
@@ -42,11 +44,16 @@ impl Outlet for Fake {
                 reason: "told so".to_owned(),
             });
         }
-        self.delivered
-            .send((changes.to_vec(), messages.to_vec()))
-            .await
-            .unwrap();
-        Ok(())
+        let has_keys = changes.is_empty() || *self.has_keys.borrow();
+        let changes = if has_keys { changes.to_vec() } else { Vec::new() };
+        self.delivered.send((changes, messages.to_vec())).await.unwrap();
+        match has_keys {
+            true => Ok(()),
+            false => Err(OutletError::KeysLater(KeyError::Away {
+                place: "cache".to_owned(),
+                reason: "told so".to_owned(),
+            })),
+        }
     }
 
     fn has_keys(&self) -> bool {
@@ -65,6 +72,7 @@ impl Outlet for Fake {
 struct World {
     speaker: Speaker,
     up: watch::Sender<bool>,
+    keys: watch::Sender<bool>,
     lost: Arc<Notify>,
     delivered: mpsc::Receiver<Delivered>,
     _run: tokio::task::JoinSet<()>,
@@ -72,6 +80,7 @@ struct World {
 
 fn world(is_up: bool) -> World {
     let (up, seen) = watch::channel(is_up);
+    let (keys, has_keys) = watch::channel(true);
     let (send, delivered) = mpsc::channel(64);
     let (speaker, lost) = (Speaker::new(Term::always()), Arc::new(Notify::new()));
     let outlet = Arc::new(Fake {
@@ -81,12 +90,14 @@ fn world(is_up: bool) -> World {
         own: vec!["blaze:config:old".to_owned(), "blaze:config:slam".to_owned()],
         refused: Some("blaze/config/changed/refused"),
         missing: Some("blaze/config/changed/missing"),
+        has_keys,
     });
     let mut run = tokio::task::JoinSet::new();
     run.spawn(speaker.clone().run(outlet));
     World {
         speaker,
         up,
+        keys,
         lost,
         delivered,
         _run: run,
@@ -159,7 +170,9 @@ async fn keys_that_the_server_has_lost_are_written_again_without_a_notice() {
         key: "blaze:config:slam".to_owned(),
         value: Bytes::from("1"),
     };
-    assert_eq!(again, (vec![old, slam], Vec::new()), "and one that nobody wants goes");
+    assert_eq!(again, (vec![slam], Vec::new()));
+    let swept = w.delivered.recv().await.unwrap();
+    assert_eq!(swept, (vec![old], Vec::new()), "and one that nobody wants goes");
 }
 
 #[test]
@@ -269,4 +282,32 @@ async fn a_channel_that_is_not_there_yet_holds_up_no_other_one_and_waits_on() {
     };
     tokio::time::timeout(Duration::from_secs(10), is_all).await.unwrap();
     assert!(w.speaker.is_waiting("missing"));
+}
+
+#[tokio::test(start_paused = true)]
+async fn notices_go_on_while_the_keys_wait_for_their_server() {
+    let mut w = world(true);
+    w.keys.send_replace(false);
+    for text in ["1", "2", "3"] {
+        w.speaker.tell([told("slam", text), told("nav", text)]);
+        let delivered = w.delivered.recv().await.unwrap();
+        assert_eq!((texts(&delivered).len(), delivered.0.len()), (2, 0));
+    }
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    while let Ok(tried) = w.delivered.try_recv() {
+        assert_eq!(texts(&tried), [] as [Bytes; 0], "each notice was told once");
+    }
+    assert_eq!((w.speaker.counts().notices, w.speaker.untold()), (6, None));
+    w.keys.send_replace(true);
+    let written = loop {
+        let delivered = w.delivered.recv().await.unwrap();
+        if !delivered.0.is_empty() {
+            break delivered;
+        }
+    };
+    let put = |place: &str| KeyChange::Put {
+        key: format!("blaze:config:{place}"),
+        value: Bytes::from("3"),
+    };
+    assert_eq!(written, (vec![put("nav"), put("slam")], Vec::new()));
 }

@@ -33,6 +33,8 @@ pub(super) struct State {
     pub(super) waiting: BTreeMap<String, (i64, Waiting)>,
     /// Of the last that was put at the end, and of the first.
     ends: (i64, i64),
+    /// Keys are not told just now: their server does not answer.
+    pub(super) keys_wait: bool,
     /// Keys of before are to be looked for: those of this worker that are not wanted are to go.
     pub(super) sweep: bool,
     /// What is being told just now: the lowest revisions of its places.
@@ -56,6 +58,12 @@ impl Batch {
 
     pub(super) fn len(&self) -> usize {
         self.keys.len() + self.waiting.len()
+    }
+
+    /// The same once its notices were told.
+    pub(super) fn without_notices(mut self) -> Self {
+        self.waiting.clear();
+        self
     }
 
     /// The same once its keys are as they should be.
@@ -117,13 +125,15 @@ impl State {
                 continue;
             };
             bytes += waiting.notice.value.as_ref().map_or(0, Bytes::len);
-            if let Some(key) = waiting.key.as_ref().and_then(|key| self.dirty.take(key)) {
+            let key = waiting.key.as_ref().filter(|_| !self.keys_wait);
+            if let Some(key) = key.and_then(|key| self.dirty.take(key)) {
                 bytes += self.wanted.get(&key).map_or(0, Bytes::len);
                 batch.keys.insert(key);
             }
             batch.waiting.push((place, waiting));
         }
-        while batch.len() < most
+        while !self.keys_wait
+            && batch.len() < most
             && (bytes < BATCH_BYTES || batch.is_empty())
             && let Some(key) = self.dirty.pop_first()
         {

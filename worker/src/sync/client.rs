@@ -1,7 +1,7 @@
 //! Keeps a stream to the main service open: connects, greets, hands on what comes, says what the worker has; after an end of
 //! any kind it waits and begins anew.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use blaze_proto::v1;
@@ -13,7 +13,7 @@ use tokio::time::Instant;
 use tokio_stream::wrappers::WatchStream;
 use tokio_util::sync::CancellationToken;
 use tonic::metadata::{Ascii, MetadataValue};
-use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint};
+use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 use tonic::{Request, Status, Streaming};
 
 use super::backoff::Backoff;
@@ -39,8 +39,11 @@ const ALIVE: Duration = Duration::from_secs(3);
 const ALIVE_ANSWER: Duration = Duration::from_secs(3);
 /// Token files are small.
 const MAX_TOKEN_BYTES: u64 = 8192;
-/// So are files of authorities.
-const MAX_CA_BYTES: u64 = 1024 * 1024;
+/// So are files of authorities, certificates and keys.
+const MAX_PEM_BYTES: u64 = 1024 * 1024;
+
+/// How each part of a file in PEM form begins.
+const PEM: &[u8] = b"-----BEGIN ";
 
 /// Where the main service is and how it knows this worker. Files are read anew for each connection.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -51,6 +54,8 @@ pub struct MainService {
     pub ca_file: Option<PathBuf>,
     /// File with the token.
     pub token_file: Option<PathBuf>,
+    /// Files with the own certificate and its key, for a main service that asks for one.
+    pub certificate: Option<(PathBuf, PathBuf)>,
 }
 
 impl MainService {
@@ -92,7 +97,7 @@ pub enum ConnectError {
     #[error("no connection: {0}")]
     Transport(String),
     /// The main service refuses.
-    #[error("refused: {} ({:?})", .0.message(), .0.code())]
+    #[error("refused: {}", words(.0))]
     Refused(Status),
     /// What it says makes no sense.
     #[error(transparent)]
@@ -328,13 +333,13 @@ async fn channel(main: &MainService) -> Result<Channel, ConnectError> {
             let tls = ClientTlsConfig::new().timeout(CONNECT);
             let tls = match &main.ca_file {
                 None => tls.with_native_roots(),
-                Some(path) => {
-                    let refuse = |reason| ConnectError::File {
-                        key: "config.ca_file",
-                        path: path.clone(),
-                        reason,
-                    };
-                    tls.ca_certificate(Certificate::from_pem(read(path, MAX_CA_BYTES).await.map_err(refuse)?))
+                Some(path) => tls.ca_certificate(Certificate::from_pem(pem("config.ca_file", path).await?)),
+            };
+            let tls = match &main.certificate {
+                None => tls,
+                Some((certificate, key)) => {
+                    let certificate = pem("config.cert_file", certificate).await?;
+                    tls.identity(Identity::from_pem(certificate, pem("config.key_file", key).await?))
                 }
             };
             endpoint
@@ -348,6 +353,37 @@ async fn channel(main: &MainService) -> Result<Channel, ConnectError> {
         .map_err(|error| ConnectError::Transport(chain(&error)))
 }
 
+/// What a file in PEM form holds; `key` names it in the node file.
+async fn pem(key: &'static str, path: &Path) -> Result<Vec<u8>, ConnectError> {
+    let refuse = |reason| ConnectError::File {
+        key,
+        path: path.to_owned(),
+        reason,
+    };
+    let text = read(path, MAX_PEM_BYTES).await.map_err(refuse)?;
+    // The library takes a file without any for one with none, and then only the other end says that something is missing.
+    let has_some = text.windows(PEM.len()).any(|start| start == PEM);
+    has_some
+        .then_some(text)
+        .ok_or_else(|| refuse("it holds nothing in PEM form".to_owned()))
+}
+
+/// What a refusal says, with what caused it where the connection broke.
+fn words(status: &Status) -> String {
+    let cause = std::error::Error::source(status).map(chain);
+    let text = match cause {
+        Some(cause) => format!("{} ({:?}): {cause}", status.message(), status.code()),
+        None => format!("{} ({:?})", status.message(), status.code()),
+    };
+    // As TLS names it. It comes after the connection does, in answer to the first call.
+    match text.contains("CertificateRequired") {
+        true => format!(
+            "the main service asks for a client certificate: name it with config.cert_file and config.key_file [{text}]"
+        ),
+        false => text,
+    }
+}
+
 /// The library's errors say little; what caused them says more.
 fn chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
@@ -359,7 +395,7 @@ fn chain(error: &dyn std::error::Error) -> String {
     text
 }
 
-async fn read(path: &std::path::Path, most: u64) -> Result<Vec<u8>, String> {
+async fn read(path: &Path, most: u64) -> Result<Vec<u8>, String> {
     let bytes = tokio::fs::read(path).await.map_err(|error| error.to_string())?;
     if bytes.len() as u64 > most {
         return Err(format!("it has {} bytes, at most {most} are read", bytes.len()));

@@ -100,6 +100,7 @@ async fn prepare(
     let around = Around {
         server: &endpoint.url,
         ca_file: endpoint.ca_file.as_deref(),
+        shows_certificate: endpoint.client_certificate.is_some(),
         kind: &kind,
         token_file: match &place {
             TokenPlace::File(file) => Some(file),

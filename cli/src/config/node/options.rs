@@ -66,6 +66,12 @@ pub struct JoinOptions {
     /// Path of the authorities (PEM) on the node; else that of --ca-file on this machine
     #[arg(long, value_name = "PATH", help_heading = "Node file")]
     pub ca_path: Option<PathBuf>,
+    /// Path of the worker's own certificate (PEM) on the node, for a server with tls.client_ca_file
+    #[arg(long, value_name = "PATH", requires = "key_path", help_heading = "Node file")]
+    pub cert_path: Option<PathBuf>,
+    /// Path of its key on the node
+    #[arg(long, value_name = "PATH", requires = "cert_path", help_heading = "Node file")]
+    pub key_path: Option<PathBuf>,
     /// Redis of the node (redis://…), memory or none; else on an edge node redis://127.0.0.1:6379
     #[arg(long, value_name = "BROKER", help_heading = "Node file")]
     pub node_broker: Option<NodeBrokerChoice>,

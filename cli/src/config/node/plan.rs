@@ -87,6 +87,8 @@ pub(super) struct Around<'a> {
     pub(super) server: &'a Url,
     /// Authorities that were used for it.
     pub(super) ca_file: Option<&'a Path>,
+    /// A client certificate was shown to it.
+    pub(super) shows_certificate: bool,
     /// Kind of the layer: `edge`, `fog`, `cloud`.
     pub(super) kind: &'a str,
     /// The token on this machine, if it is kept in a file.
@@ -112,7 +114,19 @@ pub(super) fn node_file(options: &JoinOptions, around: &Around<'_>) -> Result<(V
     config.insert("server".to_owned(), json!(grpc(options, around, &mut notes)?));
     let ca_path = options.ca_path.as_deref().or(around.ca_file);
     let token_path = options.token_path.as_deref().or(around.token_file);
-    for (key, path) in [("ca_file", ca_path), ("token_file", token_path)] {
+    let (cert_path, key_path) = (options.cert_path.as_deref(), options.key_path.as_deref());
+    if around.shows_certificate && cert_path.is_none() {
+        notes.push(
+            "the server asks for client certificates: give the worker one of its own with --cert-path and --key-path"
+                .to_owned(),
+        );
+    }
+    for (key, path) in [
+        ("ca_file", ca_path),
+        ("token_file", token_path),
+        ("cert_file", cert_path),
+        ("key_file", key_path),
+    ] {
         if let Some(path) = path {
             config.insert(key.to_owned(), json!(absolute(path)));
         }

@@ -21,10 +21,21 @@ fn file(line: &str, kind: &str) -> Result<(Value, Vec<String>), CliError> {
 }
 
 fn file_at(options: &JoinOptions, kind: &str, addresses: &[IpAddr]) -> Result<(Value, Vec<String>), CliError> {
+    file_from(options, kind, addresses, false)
+}
+
+/// The same where the administrator's client certificate was shown.
+fn file_from(
+    options: &JoinOptions,
+    kind: &str,
+    addresses: &[IpAddr],
+    shows_certificate: bool,
+) -> Result<(Value, Vec<String>), CliError> {
     let server = "https://10.0.3.1:8443".parse().unwrap();
     let around = Around {
         server: &server,
         ca_file: Some(Path::new("/etc/blaze/ca.pem")),
+        shows_certificate,
         kind,
         token_file: Some(Path::new("/etc/blaze/token")),
         addresses,
@@ -68,6 +79,22 @@ fn whoever_joins_again_without_an_address_gets_the_same_file() {
     for none in [json!({}), json!({ "spec": { "addresses": ["robot-1.local", 7] } })] {
         assert_eq!(addresses_of(&none), [] as [IpAddr; 0]);
     }
+}
+
+#[test]
+fn a_worker_has_a_certificate_of_its_own_or_it_is_said_that_it_needs_one() {
+    let (file, notes) = file_from(&options("--address 10.0.1.1"), "edge", &[], true).unwrap();
+    assert_eq!(file["config"].get("cert_file"), None);
+    assert!(notes.iter().any(|note| note.contains("--cert-path")), "{notes:?}");
+    let line = "--address 10.0.1.1 --cert-path /etc/blaze/own.pem --key-path /etc/blaze/own.key";
+    let (file, notes) = file_from(&options(line), "edge", &[], true).unwrap();
+    assert_eq!(
+        (&file["config"]["cert_file"], &file["config"]["key_file"]),
+        (&json!("/etc/blaze/own.pem"), &json!("/etc/blaze/own.key"))
+    );
+    assert!(!notes.iter().any(|note| note.contains("--cert-path")), "{notes:?}");
+    let half = "blaze node join robot-1 --layer edge --cert-path /own.pem";
+    assert!(Arguments::try_parse_from(half.split_whitespace()).is_err());
 }
 
 #[test]

@@ -213,3 +213,53 @@ async fn a_server_that_was_away_is_used_again_and_known_to_be_another() {
         .await
         .unwrap();
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_a_server_cannot_do_just_now_is_no_refusal() {
+    let server = Server::start(RedisKind::Redis);
+    let keys = keys_of(&server);
+    let change = [put("a", "1")];
+    keys.apply(&change, &[]).await.unwrap();
+    let lock = RedisLock {
+        key: "lease".to_owned(),
+        owner: "w-1".to_owned(),
+    };
+    assert!(keys.hold(&lock, LONG, None).await.unwrap().is_held);
+    server.cli(&["CONFIG", "SET", "maxmemory", "1"]);
+    for told in [
+        keys.apply(&change, &[]).await,
+        keys.put_for("b", &Bytes::from("1"), LONG).await,
+        keys.apply_if_held(&lock, &change, &[]).await.map(|_| ()),
+    ] {
+        assert!(
+            matches!(&told, Err(KeyError::Away { reason, .. }) if reason.contains("OOM")),
+            "{told:?}"
+        );
+    }
+    server.cli(&["CONFIG", "SET", "maxmemory", "0"]);
+    keys.apply(&change, &[]).await.unwrap();
+    server.cli(&["REPLICAOF", "127.0.0.1", "1"]);
+    let told = keys.apply(&change, &[]).await;
+    assert!(
+        matches!(&told, Err(KeyError::Away { reason, .. }) if reason.contains("read only")),
+        "{told:?}"
+    );
+    server.cli(&["REPLICAOF", "NO", "ONE"]);
+    keys.apply(&change, &[]).await.unwrap();
+    // Something that is no text has the name: that stays so.
+    keys.apply(&[record("r", "ready", LONG)], &[]).await.unwrap();
+    let told = keys.get("r").await;
+    assert!(matches!(told, Err(KeyError::Refused { .. })), "{told:?}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_record_is_deleted_by_whom_it_is_of() {
+    let server = Server::start(RedisKind::Redis);
+    let keys = keys_of(&server);
+    keys.apply(&[record("r", "ready", LONG)], &[]).await.unwrap();
+    keys.delete_record("r", "state", "starting").await.unwrap();
+    assert!(keys.record("r").await.unwrap().is_some());
+    keys.delete_record("r", "state", "ready").await.unwrap();
+    keys.delete_record("r", "state", "ready").await.unwrap();
+    assert_eq!(keys.record("r").await.unwrap(), None);
+}

@@ -131,6 +131,12 @@ impl GetRequest {
     }
 }
 
+/// Where answers go when nobody says so; always there, as it is a good name.
+#[must_use]
+pub fn default_reply() -> Option<ChannelName> {
+    format!("{REPLY_PREFIX}{DEFAULT_REPLY}").parse().ok()
+}
+
 fn reply_to(members: &Map<String, Value>) -> Result<ChannelName, String> {
     let default = format!("{REPLY_PREFIX}{DEFAULT_REPLY}");
     let text = text(members, "reply_to", MAX_REPLY_BYTES)?.unwrap_or(&default);
