@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::extract::State;
 use axum::http::StatusCode;
@@ -20,7 +20,7 @@ use crate::engine::Status;
 use crate::running::RunningWorker;
 
 /// Between two looks at the worker, for readiness and metrics.
-const LOOK: Duration = Duration::from_millis(500);
+const LOOK: Duration = Duration::from_millis(250);
 const NOTHING: &str = "nothing is loaded yet";
 /// The same until services reach it.
 const FIRST_LOOK: Duration = Duration::from_millis(50);
@@ -95,17 +95,23 @@ impl Shown {
 
     /// Looks at the worker again and again, for readiness and metrics.
     async fn look(self, broker: &'static str, readiness: Readiness) {
+        let mut looked = None;
         loop {
-            if let Some(worker) = self.worker()
-                && let Some(status) = worker.status().await
-            {
-                let (is_reached, words) = worker.reach();
-                let state = if is_reached {
-                    CheckStatus::Ok
-                } else {
-                    CheckStatus::Failed
-                };
-                readiness.set(broker, state, words);
+            let Some(worker) = self.worker() else {
+                tokio::time::sleep(FIRST_LOOK).await;
+                continue;
+            };
+            let (is_reached, words) = worker.reach();
+            let state = if is_reached {
+                CheckStatus::Ok
+            } else {
+                CheckStatus::Failed
+            };
+            readiness.set(broker, state, words);
+            // The answer has all services in it: not 20 times a second for nothing.
+            let is_due = is_reached || looked.is_none_or(|at: Instant| at.elapsed() >= LOOK);
+            if is_due && let Some(status) = worker.status().await {
+                looked = Some(Instant::now());
                 tell(&readiness, &status);
                 // Others are not waited for: what is not there now is got later.
                 let knows = status.is_ready || status.reason.is_some() || !worker.has_main();

@@ -1,7 +1,7 @@
 //! What services say, from the broker and from Redis to the engine.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use blaze_brokers::redis::RedisKeys;
@@ -38,24 +38,13 @@ const STILL_DEAF: Duration = Duration::from_secs(1);
 /// After Redis was away, services have so long to write their records again.
 const PATIENCE: Duration = Duration::from_secs(15);
 
-/// How many channels are heard.
-#[derive(Debug, Default)]
-pub(crate) struct Heard(AtomicUsize);
-
-impl Heard {
-    /// Channels on which what is said now is heard.
-    pub(crate) fn channels(&self) -> usize {
-        self.0.load(Ordering::Relaxed)
-    }
-}
-
-/// Hands on what comes on a channel, for ever.
+/// Hands on what comes on a channel, for ever; `hears`: whether what is said there now is heard.
 pub(crate) async fn listen<T: Send>(
     broker: Arc<dyn Broker>,
     channel: &'static str,
     sender: mpsc::Sender<T>,
     into: fn(Bytes) -> T,
-    heard: Arc<Heard>,
+    hears: Arc<AtomicBool>,
 ) {
     // It is a good name.
     let Ok(channel) = channel.parse::<ChannelName>() else {
@@ -70,7 +59,7 @@ pub(crate) async fn listen<T: Send>(
                 continue;
             }
         };
-        heard.0.fetch_add(1, Ordering::Relaxed);
+        hears.store(true, Ordering::Relaxed);
         let mut batch = Vec::new();
         while subscription.receive(&mut batch, 64).await > 0 {
             for received in batch.drain(..) {
@@ -88,7 +77,7 @@ pub(crate) async fn listen<T: Send>(
                 tracing::warn!(dropped, %channel, "more than can be taken; services say it again");
             }
         }
-        heard.0.fetch_sub(1, Ordering::Relaxed);
+        hears.store(false, Ordering::Relaxed);
     }
 }
 

@@ -7,6 +7,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
@@ -22,7 +23,7 @@ use tokio_util::sync::CancellationToken;
 use crate::copy::{Copies, Counts as CopyCounts, Vault, defaults};
 use crate::core::Site;
 use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
-use crate::hearing::{ACK, GET, Heard, WATCHDOG, listen, notice_deafness, scan};
+use crate::hearing::{ACK, GET, WATCHDOG, listen, notice_deafness, scan};
 use crate::kept::Kept;
 use crate::lease::{self, Holder, Leadership, Lease};
 use crate::own::{OwnConfig, say_again};
@@ -38,9 +39,6 @@ const LOOK_AT_FILE: Duration = Duration::from_millis(500);
 const KEEP_WITHIN: Duration = Duration::from_secs(2);
 /// How long it waits until the lease is given up.
 const GIVE_UP_WITHIN: Duration = Duration::from_secs(2);
-
-/// Channels on which services say something: requests, acknowledgements, signs of life.
-const CHANNELS: usize = 3;
 
 /// What a worker is made of.
 pub struct WorkerOptions {
@@ -69,7 +67,7 @@ pub struct RunningWorker {
     main: watch::Sender<MainService>,
     own: OwnConfig,
     broker: Arc<dyn Broker>,
-    heard: Arc<Heard>,
+    hears_requests: Arc<AtomicBool>,
     has_main: bool,
 }
 
@@ -166,8 +164,7 @@ impl RunningWorker {
                 }
             });
         };
-        let heard = Arc::new(Heard::default());
-        let hears = || Arc::clone(&heard);
+        let hears_requests = Arc::new(AtomicBool::new(false));
         let (own, said_of_own, own_acks) = OwnConfig::new(&settings.node, instance)?;
         spawn("own state", Box::pin(say_again(own_acks, said.clone())));
         let engine = Engine::new(identity, outputs, start.loaded).with_own(said_of_own);
@@ -175,15 +172,33 @@ impl RunningWorker {
         spawn("notices", Box::pin(speaker.clone().run(outlet)));
         spawn(
             "requests",
-            Box::pin(listen(Arc::clone(&broker), GET, requests, |payload| payload, hears())),
+            Box::pin(listen(
+                Arc::clone(&broker),
+                GET,
+                requests,
+                |payload| payload,
+                Arc::clone(&hears_requests),
+            )),
         );
         spawn(
             "acknowledgements",
-            Box::pin(listen(Arc::clone(&broker), ACK, said.clone(), Sign::Ack, hears())),
+            Box::pin(listen(
+                Arc::clone(&broker),
+                ACK,
+                said.clone(),
+                Sign::Ack,
+                Arc::default(),
+            )),
         );
         spawn(
             "watchdogs",
-            Box::pin(listen(Arc::clone(&broker), WATCHDOG, said.clone(), Sign::Beat, hears())),
+            Box::pin(listen(
+                Arc::clone(&broker),
+                WATCHDOG,
+                said.clone(),
+                Sign::Beat,
+                Arc::default(),
+            )),
         );
         spawn("outages", Box::pin(notice_deafness(broker.status(), said.clone())));
         if let Some(records) = records {
@@ -220,7 +235,7 @@ impl RunningWorker {
             main: main_sender,
             own,
             broker,
-            heard,
+            hears_requests,
         })
     }
 
@@ -235,9 +250,9 @@ impl RunningWorker {
     #[must_use]
     pub fn reach(&self) -> (bool, String) {
         let status = self.broker.status().borrow().clone();
-        match (status.health, self.heard.channels()) {
-            (Health::Up, CHANNELS) => (true, status.detail),
-            (Health::Up, _) => (false, format!("{}: requests are not heard yet", status.detail)),
+        match (status.health, self.hears_requests.load(Ordering::Relaxed)) {
+            (Health::Up, true) => (true, status.detail),
+            (Health::Up, false) => (false, format!("{}: requests are not heard yet", status.detail)),
             (Health::Connecting | Health::Down | Health::InUse | Health::Closed, _) => (false, status.detail),
         }
     }

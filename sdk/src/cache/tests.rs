@@ -162,6 +162,9 @@ async fn until(cache: &CacheManager, wanted: Liveness) {
     in_time.unwrap_or_else(|_| panic!("never {wanted:?}")).unwrap();
 }
 
+/// Long after this was written, in ms since 1970.
+const FUTURE: u64 = 1 << 50;
+
 const SLAM: &str = "blaze:watchdog:slam:robot-1:0";
 
 #[tokio::test(start_paused = true)]
@@ -209,19 +212,27 @@ async fn of_two_processes_of_one_key_the_older_one_falls_silent() {
 #[tokio::test(start_paused = true)]
 async fn a_clock_that_went_back_makes_no_process_the_older_one() {
     let world = World::new();
-    let before = world.service_by("slam", 1_000, true, true);
+    let before = world.service_by("slam", FUTURE, true, true);
     before.set_state(ServiceState::Ready);
     until(&before, Liveness::Alive).await;
     // It was killed, or lives on: whoever begins is the newer one.
     let after = world.service_by("slam", 7, true, true);
     after.set_state(ServiceState::Ready);
     until(&after, Liveness::Alive).await;
-    assert_eq!(world.keys.now(SLAM).unwrap()["epoch"], "1001");
+    let next = (FUTURE + 1).to_string();
+    assert_eq!(world.keys.now(SLAM).unwrap()["epoch"], next);
     until(&before, Liveness::Superseded).await;
     before.leave(Duration::from_secs(1)).await;
     tokio::time::sleep(TTL * 2).await;
     assert_eq!(*after.liveness().borrow(), Liveness::Alive);
-    assert_eq!(world.keys.now(SLAM).unwrap()["epoch"], "1001");
+    assert_eq!(world.keys.now(SLAM).unwrap()["epoch"], next);
+    // Who began earlier and says so later is the older one all the same.
+    let slow = world.service_by("nav", 7, true, true);
+    let newer = world.service_by("nav", 8, true, true);
+    newer.set_state(ServiceState::Ready);
+    until(&newer, Liveness::Alive).await;
+    slow.set_state(ServiceState::Ready);
+    until(&slow, Liveness::Superseded).await;
 }
 
 #[tokio::test(start_paused = true)]

@@ -43,7 +43,7 @@ pub(super) async fn run(shared: &Shared) {
 
 /// Writes a record again and again. A look before each write finds out whether a newer process has the key.
 async fn in_store(shared: &Shared, store: &dyn Store, key: &str) -> Liveness {
-    // Until it has looked once, what is there is of an earlier life, or of a process that this one follows.
+    // Until it has said something itself, what began in the future began before a clock went back.
     let mut is_first = shared.watchdog.by_clock;
     loop {
         let said = shared.said.lock().clone();
@@ -82,7 +82,7 @@ async fn beat(
     let present = store.record(key).await?.map_or(0, |record| record::epoch_of(&record));
     let own = shared.epoch.load(Ordering::Relaxed);
     if present > own {
-        if !is_first {
+        if !is_first || present <= super::now_ms() {
             return Ok(false);
         }
         shared.epoch.store(present.saturating_add(1), Ordering::Relaxed);

@@ -63,11 +63,13 @@ async fn after_everything_was_killed_services_get_their_last_configuration_at_on
     let mut service = stage.service().await;
     let asks = json!({ "service": "slam", "instance": "0" });
     // What came in the last 20 ms is shown with what comes until then.
+    let shown = tokio::time::Instant::now();
     let before = loop {
         let answer = service.ask(asks.clone(), PATIENCE).await;
         if answer["config"]["camera"]["rate_hz"] == 7 {
             break answer;
         }
+        assert!(shown.elapsed() < PATIENCE, "{answer}");
     };
     let newest = stage.get("/digest?layer=edge").await["revision"].as_u64().unwrap();
     worker.has_kept_all(2).await;

@@ -36,6 +36,8 @@ impl Engine {
             SyncEvent::Opened(stream) => {
                 self.stream = Some(stream);
                 self.fault = None;
+                // It may have been away for longer than anybody waits.
+                self.catching_up = self.catching_up.filter(|wait| wait.at_most > Instant::now());
                 self.tell_copies_of_stream();
             }
             SyncEvent::Said(incoming) => {

@@ -38,9 +38,12 @@ pub enum OutletError {
         /// What one of them waits for.
         reason: String,
     },
-    /// All messages were published; the server of the keys, which is another one, does not answer.
+    /// Nothing was done: the server of the keys, which is another one than the broker, does not answer.
     #[error("the keys are not written: {0}")]
     KeysLater(KeyError),
+    /// Nothing was done: the same server does not take one of the keys, and will not.
+    #[error("a key is not written: {0}")]
+    KeysRefused(KeyError),
     /// It is more than the broker carries.
     #[error("{bytes} bytes are more than the broker carries")]
     TooLarge {
@@ -71,6 +74,7 @@ impl OutletError {
             Self::Away(_)
             | Self::NotYet { .. }
             | Self::KeysLater(_)
+            | Self::KeysRefused(_)
             | Self::Led
             | Self::Keys(KeyError::Away { .. }) => false,
         }
@@ -91,7 +95,7 @@ impl From<WriteError> for OutletError {
 #[async_trait]
 pub trait Outlet: Send + Sync + 'static {
     /// Makes all changes of keys, then publishes all messages, in their order. Where a server that is not the broker's does not take
-    /// the keys, the messages are published all the same.
+    /// the keys, nothing is published, so that whoever calls can see that it is still its turn and publish without them.
     ///
     /// # Errors
     /// [`OutletError`]: some of it may have been done; doing all of it again does no harm.
@@ -245,29 +249,26 @@ impl BrokerOutlet {
 #[async_trait]
 impl Outlet for BrokerOutlet {
     async fn deliver(&self, changes: &[KeyChange], messages: &[KeyedMessage]) -> Result<(), OutletError> {
-        let keys = match &self.keys {
+        match &self.keys {
             Some(keys) if keys.is_broker => {
                 let messages: Vec<_> = said(messages).map(|(to, text)| (to.clone(), text.clone())).collect();
                 return keys.apply(changes, &messages).await;
             }
-            Some(keys) => keys.apply(changes, &[]).await,
-            None => Ok(()),
-        };
-        let later = match keys {
-            Ok(()) => None,
-            Err(OutletError::Keys(error @ KeyError::Away { .. })) => Some(OutletError::KeysLater(error)),
-            Err(error) => return Err(error),
-        };
-        if !messages.is_empty() {
-            match &self.side {
-                Some(side) => side.write(messages).await?,
-                None => {
-                    self.check_up()?;
-                    said(messages).try_for_each(|(to, text)| self.publish(to, text))?;
-                }
-            }
+            Some(keys) => keys.apply(changes, &[]).await.map_err(|error| match error {
+                OutletError::Keys(error @ KeyError::Away { .. }) => OutletError::KeysLater(error),
+                OutletError::Keys(error @ KeyError::Refused { .. }) => OutletError::KeysRefused(error),
+                other => other,
+            })?,
+            None => {}
         }
-        later.map_or(Ok(()), Err)
+        if messages.is_empty() {
+            return Ok(());
+        }
+        if let Some(side) = &self.side {
+            return Ok(side.write(messages).await?);
+        }
+        self.check_up()?;
+        said(messages).try_for_each(|(to, text)| self.publish(to, text))
     }
 
     fn has_keys(&self) -> bool {

@@ -22,8 +22,11 @@ const PAUSE: (Duration, Duration) = (Duration::from_millis(20), Duration::from_m
 /// What is for a channel that is not there yet is set aside for so long, so that it does not hold up the rest.
 const ASIDE: Duration = Duration::from_millis(200);
 
-/// A server of the keys that is not the broker's and does not answer is left alone for so long: notices go on meanwhile.
-const KEYS_AGAIN: Duration = Duration::from_secs(1);
+/// A server of the keys that is not the broker's and does not answer is left alone for so long, which doubles: notices go on
+/// meanwhile.
+const KEYS_AGAIN: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
+/// Between two tries to look for keys of before.
+const SWEEP_AGAIN: Duration = Duration::from_secs(5);
 
 /// What is told of one place.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -152,7 +155,11 @@ impl Speaker {
         let lost = async {
             loop {
                 outlet.keys_lost().await;
-                self.shared.state.lock().write_all();
+                {
+                    let mut state = self.shared.state.lock();
+                    state.write_all();
+                    state.keys_wait = false;
+                }
                 self.shared.more.notify_one();
             }
         };
@@ -166,6 +173,10 @@ impl Speaker {
         let (mut pause, mut most) = (PAUSE.0, BATCH);
         let mut aside: Option<Instant> = None;
         let mut keys_again: Option<Instant> = None;
+        let mut keys_pause = KEYS_AGAIN.0;
+        let mut sweep_at = Instant::now();
+        // Why it failed last, told once.
+        let mut trouble: Option<String> = None;
         loop {
             if keys_again.is_some_and(|until| until <= Instant::now()) {
                 keys_again = None;
@@ -186,11 +197,14 @@ impl Speaker {
             };
             if batch.is_empty() {
                 // Last: to look through all keys of a server may take long.
-                if keys_again.is_none() && self.term.is_on() && self.sweep(outlet).await {
-                    continue;
+                if keys_again.is_none() && sweep_at <= Instant::now() && self.term.is_on() {
+                    if self.sweep(outlet).await {
+                        continue;
+                    }
+                    sweep_at = Instant::now() + SWEEP_AGAIN;
                 }
                 let is_due = self.term.is_on() && self.shared.state.lock().sweep;
-                let again = [aside, keys_again, is_due.then(|| Instant::now() + PAUSE.1)];
+                let again = [aside, keys_again, is_due.then_some(sweep_at)];
                 let again = again.into_iter().flatten().min();
                 tokio::select! {
                     () = self.shared.more.notified() => {}
@@ -211,18 +225,34 @@ impl Speaker {
             match delivered {
                 Ok(()) => {
                     self.shared.state.lock().on_the_way.clear();
-                    (pause, most) = (PAUSE.0, BATCH);
+                    (pause, most, trouble) = (PAUSE.0, BATCH, None);
+                    if !changes.is_empty() {
+                        keys_pause = KEYS_AGAIN.0;
+                    }
                     self.shared.keys.fetch_add(changes.len() as u64, Ordering::Relaxed);
                     self.shared.notices.fetch_add(messages.len() as u64, Ordering::Relaxed);
                 }
                 Err(OutletError::KeysLater(error)) => {
-                    tracing::debug!(%error, keys = changes.len(), "services were told, their keys are written later");
+                    if keys_pause == KEYS_AGAIN.0 {
+                        tracing::warn!(%error, "keys are not written, notices go on; it is tried again");
+                    }
                     self.shared.failures.fetch_add(1, Ordering::Relaxed);
-                    self.shared.notices.fetch_add(messages.len() as u64, Ordering::Relaxed);
-                    keys_again = Some(Instant::now() + KEYS_AGAIN);
+                    keys_again = Some(Instant::now() + keys_pause);
+                    keys_pause = (keys_pause * 2).min(KEYS_AGAIN.1);
                     let mut state = self.shared.state.lock();
-                    state.put_back(batch.without_notices());
+                    state.put_back(batch);
                     state.keys_wait = true;
+                }
+                Err(OutletError::KeysRefused(error)) => {
+                    let mut state = self.shared.state.lock();
+                    if batch.keys.len() > 1 {
+                        most = 1;
+                        state.put_back(batch);
+                    } else {
+                        tracing::error!(%error, keys = ?batch.keys, "a key is not written; its service is told by a notice alone");
+                        self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+                        state.put_back(batch.without_keys());
+                    }
                 }
                 // Whoever is refused alone would be refused again, and must not hold up the others.
                 Err(error) if error.is_refusal() && batch.len() <= 2 && batch.waiting.len() <= 1 => {
@@ -240,7 +270,11 @@ impl Speaker {
                     state.set_aside(&channels);
                 }
                 Err(error) => {
-                    tracing::debug!(%error, "services could not be told");
+                    let words = error.to_string();
+                    if trouble.as_ref() != Some(&words) && !error.is_refusal() {
+                        tracing::warn!(error = words, "services cannot be told now; it is tried again");
+                    }
+                    trouble = Some(words);
                     self.shared.failures.fetch_add(1, Ordering::Relaxed);
                     self.shared.state.lock().put_back(batch);
                     if error.is_refusal() {
@@ -274,8 +308,12 @@ impl Speaker {
                 state.drop_unwanted(found);
                 true
             }
+            Err(error) if error.is_refusal() => {
+                tracing::warn!(%error, "keys of before were not looked for: those that nobody wants any more stay");
+                true
+            }
             Err(error) => {
-                tracing::debug!(%error, "keys of before were not looked for");
+                tracing::debug!(%error, "keys of before were not looked for yet");
                 state.sweep = true;
                 false
             }

@@ -44,16 +44,18 @@ impl Outlet for Fake {
                 reason: "told so".to_owned(),
             });
         }
-        let has_keys = changes.is_empty() || *self.has_keys.borrow();
-        let changes = if has_keys { changes.to_vec() } else { Vec::new() };
-        self.delivered.send((changes, messages.to_vec())).await.unwrap();
-        match has_keys {
-            true => Ok(()),
-            false => Err(OutletError::KeysLater(KeyError::Away {
-                place: "cache".to_owned(),
-                reason: "told so".to_owned(),
-            })),
+        let (place, reason) = ("cache".to_owned(), "told so".to_owned());
+        if !changes.is_empty() && !*self.has_keys.borrow() {
+            return Err(OutletError::KeysLater(KeyError::Away { place, reason }));
         }
+        if changes.iter().any(|change| change.key() == "blaze:config:forbidden") {
+            return Err(OutletError::KeysRefused(KeyError::Refused { place, reason }));
+        }
+        self.delivered
+            .send((changes.to_vec(), messages.to_vec()))
+            .await
+            .unwrap();
+        Ok(())
     }
 
     fn has_keys(&self) -> bool {
@@ -294,20 +296,34 @@ async fn notices_go_on_while_the_keys_wait_for_their_server() {
         assert_eq!((texts(&delivered).len(), delivered.0.len()), (2, 0));
     }
     tokio::time::sleep(Duration::from_secs(5)).await;
-    while let Ok(tried) = w.delivered.try_recv() {
-        assert_eq!(texts(&tried), [] as [Bytes; 0], "each notice was told once");
-    }
+    assert!(
+        w.delivered.is_empty(),
+        "each notice was told once, and no key was written"
+    );
     assert_eq!((w.speaker.counts().notices, w.speaker.untold()), (6, None));
     w.keys.send_replace(true);
-    let written = loop {
-        let delivered = w.delivered.recv().await.unwrap();
-        if !delivered.0.is_empty() {
-            break delivered;
-        }
-    };
+    let written = w.delivered.recv().await.unwrap();
     let put = |place: &str| KeyChange::Put {
         key: format!("blaze:config:{place}"),
         value: Bytes::from("3"),
     };
     assert_eq!(written, (vec![put("nav"), put("slam")], Vec::new()));
+}
+
+#[tokio::test(start_paused = true)]
+async fn whose_key_is_refused_is_told_without_it_and_the_others_have_theirs() {
+    let mut w = world(true);
+    w.speaker
+        .tell([told("slam", "1"), told("forbidden", "1"), told("nav", "1")]);
+    let (mut keys, mut places) = (Vec::new(), Vec::new());
+    while places.len() < 3 || keys.len() < 2 {
+        let (changes, messages) = w.delivered.recv().await.unwrap();
+        keys.extend(changes.iter().map(|change| change.key().to_owned()));
+        places.extend(messages.into_iter().map(|message| message.channel.to_string()));
+    }
+    assert_eq!(keys, ["blaze:config:slam", "blaze:config:nav"]);
+    let all = ["slam", "forbidden", "nav"].map(|place| format!("blaze/config/changed/{place}"));
+    assert_eq!(places, all, "in their order");
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    assert!(w.delivered.is_empty());
 }

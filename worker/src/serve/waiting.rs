@@ -60,13 +60,7 @@ impl Batch {
         self.keys.len() + self.waiting.len()
     }
 
-    /// The same once its notices were told.
-    pub(super) fn without_notices(mut self) -> Self {
-        self.waiting.clear();
-        self
-    }
-
-    /// The same once its keys are as they should be.
+    /// The same once its keys are as they should be, or never will be.
     pub(super) fn without_keys(mut self) -> Self {
         self.keys.clear();
         self
