@@ -19,6 +19,13 @@ pub mod stream;
 pub mod wait;
 pub mod wan;
 
+/// A limit of delay: as it is where each test has the machine for itself (`scripts/test --long`), else four times as much, as
+/// others that run beside take their share of two processors.
+#[must_use]
+pub fn within(limit: std::time::Duration) -> std::time::Duration {
+    if long() { limit } else { limit * 4 }
+}
+
 /// Whether the full counts are wanted (`scripts/test --long`).
 #[must_use]
 pub fn long() -> bool {

@@ -3,7 +3,9 @@
 use std::fs::File;
 use std::io::{Seek as _, Write as _};
 use std::path::Path;
-use std::time::Instant;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use serde::Serialize;
@@ -15,6 +17,38 @@ const IDLE: f64 = 0.5;
 /// Writes that are synced to see what that costs.
 const SYNCS: usize = 50;
 const BLOCK: [u8; 4096] = [7; 4096];
+/// How often an idler looks at the time.
+const LOOK: Duration = Duration::from_millis(5);
+
+/// A thread that sees how long the machine lets nobody do anything, until it is dropped.
+#[derive(Debug)]
+pub struct Idler(Arc<AtomicU64>);
+
+impl Idler {
+    /// Looks at the time from now on.
+    #[must_use]
+    pub fn start() -> Self {
+        let latest = Arc::<AtomicU64>::default();
+        let seen = Arc::downgrade(&latest);
+        std::thread::spawn(move || {
+            let mut before = Instant::now();
+            while let Some(seen) = seen.upgrade() {
+                std::thread::sleep(LOOK);
+                let now = Instant::now();
+                let late = now.duration_since(before).saturating_sub(LOOK);
+                seen.fetch_max(u64::try_from(late.as_nanos()).unwrap_or(u64::MAX), Ordering::Relaxed);
+                before = now;
+            }
+        });
+        Self(latest)
+    }
+
+    /// By how much it woke up too late at most.
+    #[must_use]
+    pub fn latest(&self) -> Duration {
+        Duration::from_nanos(self.0.load(Ordering::Relaxed))
+    }
+}
 
 /// What figures depend on.
 #[derive(Debug, Clone, Serialize)]

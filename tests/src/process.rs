@@ -6,6 +6,7 @@ use std::io::{BufRead, BufReader, Read, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -17,6 +18,8 @@ use crate::{memory, network, wait};
 
 /// Lines of output that are kept.
 const MAX_LINES: usize = 20_000;
+/// For the output of a process that has ended.
+const REST: Duration = Duration::from_secs(5);
 
 /// A binary of the workspace, beside the test's own: in `target/<profile>`, while tests lie in its folder `deps`.
 ///
@@ -107,6 +110,7 @@ pub struct Process {
     namespace: Option<String>,
     stdout: Lines,
     stderr: Lines,
+    readers: Vec<JoinHandle<()>>,
 }
 
 impl Process {
@@ -154,13 +158,15 @@ impl Process {
             Some(log) => Some(log),
             None => log_file(name, child.id())?,
         };
-        let stdout = collect(child.stdout.take(), None);
-        let stderr = collect(child.stderr.take(), log);
+        let mut readers = Vec::new();
+        let stdout = collect(child.stdout.take(), None, &mut readers);
+        let stderr = collect(child.stderr.take(), log, &mut readers);
         Ok(Self {
             child,
             namespace: namespace.map(str::to_owned),
             stdout,
             stderr,
+            readers,
         })
     }
 
@@ -250,17 +256,21 @@ impl Process {
         Ok(self.end(deadline)?.code())
     }
 
-    /// Waits for its end and gives all that the system says of it.
+    /// Waits for its end and gives all that the system says of it; what it printed has been read by then.
     ///
     /// # Errors
     /// When it does not end in time.
     pub fn end(&mut self, deadline: Duration) -> anyhow::Result<ExitStatus> {
-        wait::until_some(
+        let status = wait::until_some(
             "the end of the process",
             deadline,
             || self.child.try_wait().ok().flatten(),
             || "it still runs".to_owned(),
-        )
+        )?;
+        // A child of its own may hold the pipes for longer.
+        let is_read = || self.readers.iter().all(JoinHandle::is_finished);
+        let _ = wait::until("the end of its output", REST, is_read, String::new);
+        Ok(status)
     }
 
     /// How often something stands in its memory, in use or not. Needs the right to look into it.
@@ -318,11 +328,15 @@ fn log_file(name: &str, id: u32) -> anyhow::Result<Option<File>> {
     Ok(Some(file))
 }
 
-fn collect(pipe: Option<impl Read + Send + 'static>, mut log: Option<File>) -> Lines {
+fn collect(
+    pipe: Option<impl Read + Send + 'static>,
+    mut log: Option<File>,
+    readers: &mut Vec<JoinHandle<()>>,
+) -> Lines {
     let lines = Lines::default();
     let Some(pipe) = pipe else { return lines };
     let kept = Arc::clone(&lines);
-    std::thread::spawn(move || {
+    readers.push(std::thread::spawn(move || {
         for line in BufReader::new(pipe).lines().map_while(Result::ok) {
             if let Some(log) = &mut log {
                 // A full disk is no fault of the process.
@@ -334,6 +348,6 @@ fn collect(pipe: Option<impl Read + Send + 'static>, mut log: Option<File>) -> L
             }
             kept.push(line);
         }
-    });
+    }));
     lines
 }

@@ -19,6 +19,9 @@ use serde::{Deserialize, Serialize};
 
 /// Between two lines of output.
 const REPORT: Duration = Duration::from_millis(100);
+/// Samples that a plain reader keeps until they are taken: older ones give way, also reliable ones, so it is as many as
+/// a writer keeps. On a busy machine 512 of them, sent 2,000 times a second, are not enough.
+const DEPTH: i32 = 8192;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Kind {
@@ -143,11 +146,11 @@ fn plain(options: &Options, seen: &Mutex<Seen>) -> anyhow::Result<()> {
     };
     let qos = QosPolicyBuilder::new()
         .reliability(reliability)
-        .history(History::KeepLast { depth: 512 })
+        .history(History::KeepLast { depth: DEPTH })
         .resource_limits(ResourceLimits {
-            max_samples: 512,
+            max_samples: DEPTH,
             max_instances: 1,
-            max_samples_per_instance: 512,
+            max_samples_per_instance: DEPTH,
         })
         .build();
     let participant = DomainParticipantBuilder::new(options.domain)

@@ -10,10 +10,14 @@
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use blaze_tests::process::Process;
+use blaze_tests::within;
 use serde_json::Value;
+
+static TURN: Mutex<()> = Mutex::new(());
 
 const TOPICS: [&str; 3] = ["imu/data", "jackal_velocity_controller/odom", "camera/image_raw"];
 
@@ -27,6 +31,8 @@ struct Run {
 fn demo(arguments: &[&str]) -> Run {
     let mut command = vec!["demo", "-o", "json"];
     command.extend(arguments);
+    // Each has three nodes and a camera, and two cores must do.
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let mut process = Process::start("blaze", &command, None).unwrap();
     let code = process.exit(Duration::from_secs(120)).unwrap();
     let lines: Vec<Value> = process
@@ -46,6 +52,10 @@ fn demo(arguments: &[&str]) -> Run {
 
 fn number(value: &Value) -> f64 {
     value.as_f64().unwrap_or_else(|| panic!("a number: {value}"))
+}
+
+fn milliseconds(value: &Value) -> Duration {
+    Duration::from_secs_f64(number(value) / 1e3)
 }
 
 #[test]
@@ -77,7 +87,10 @@ fn recorded_data_finds_its_way_from_the_edge_to_the_cloud() {
                 (&Value::from(0), &Value::from(0)),
                 "{row}"
             );
-            assert!(number(&row["latency_ms"]["p99"]) < 100.0, "{row}");
+            assert!(
+                milliseconds(&row["latency_ms"]["p99"]) < within(Duration::from_millis(100)),
+                "{row}"
+            );
         } else if number(&row["lost"]) > 0.0 {
             let dropped = row["dropped"].as_object().unwrap();
             assert!(!dropped.is_empty(), "camera drops carry a reason: {row}");
@@ -106,7 +119,7 @@ fn recorded_data_finds_its_way_from_the_edge_to_the_cloud() {
     );
     for change in [service, link] {
         assert!(
-            number(&change["callback_ms"]) < 1_000.0,
+            milliseconds(&change["callback_ms"]) < within(Duration::from_secs(1)),
             "a change comes within a second: {change}"
         );
     }

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use blaze_tests::network::{Lan, check_rights};
-use blaze_tests::{long, wait};
+use blaze_tests::{long, wait, within};
 
 use super::support::{Launch, Node, START, free_domain, turn};
 
@@ -44,7 +44,7 @@ fn meet(order: [usize; 3], launch: impl Fn(usize) -> Launch) -> anyhow::Result<D
         let mut nodes = running.iter();
         nodes.all(|(index, node)| node.peers_up() == everybody_else(*index))
     };
-    wait::until("all flows know each other", MEET, known, || {
+    wait::until("all flows know each other", within(MEET), known, || {
         let lists = running
             .iter()
             .map(|(_, node)| format!("{} knows {:?}\n{}", node.name, node.peers_up(), node.process.tail()));
@@ -58,7 +58,7 @@ fn meet_in_all_orders(what: &str, launch: impl Fn(usize) -> Launch) -> anyhow::R
         let names = order.map(|index| NODES[index].0);
         let took = meet(order, &launch).map_err(|error| error.context(format!("{what}, {names:?}")))?;
         println!("meeting, {what}: {names:?}: everybody known {took:.0?} after the last was ready");
-        anyhow::ensure!(took <= MEET, "{what}, {names:?}: {took:?}");
+        anyhow::ensure!(took <= within(MEET), "{what}, {names:?}: {took:?}");
     }
     Ok(())
 }

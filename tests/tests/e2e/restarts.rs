@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use blaze_tests::{long, wait};
+use blaze_tests::{long, wait, within};
 
 use super::support::{Launch, Node, count, free_domain, text, turn};
 
@@ -81,16 +81,19 @@ impl Trio {
 
 /// The time that a condition takes to hold after the restarted process was ready.
 fn flowing_again(trio: &Trio, ready: Instant, flows: impl FnMut() -> bool) -> anyhow::Result<Duration> {
-    let left = FLOWING.saturating_sub(ready.elapsed());
+    let left = within(FLOWING).saturating_sub(ready.elapsed());
     wait::until("messages flow again", left, flows, || trio.tails())?;
     Ok(ready.elapsed())
 }
 
 fn same_bridges(node: &Node, before: &[String]) -> anyhow::Result<()> {
     let same = || node.bridges() == before;
-    wait::until("the bridges are as before", Duration::from_secs(3), same, || {
-        format!("{} has {:?}, before {before:?}", node.name, node.bridges())
-    })?;
+    wait::until(
+        "the bridges are as before",
+        within(Duration::from_secs(3)),
+        same,
+        || format!("{} has {:?}, before {before:?}", node.name, node.bridges()),
+    )?;
     Ok(())
 }
 

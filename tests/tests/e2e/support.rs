@@ -4,6 +4,7 @@ use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use anyhow::Context as _;
 use blaze_tests::admin::Admin;
 pub(crate) use blaze_tests::flow::free_domain;
 use blaze_tests::process::Process;
@@ -169,13 +170,8 @@ impl Node {
     /// Ends it and gives what its summary says of one topic and service.
     pub(crate) fn end(&mut self) -> anyhow::Result<Summary> {
         let code = self.process.terminate(Duration::from_secs(15))?;
-        // The reader of the pipe may be behind the end of the process.
-        let summary = wait::until_some(
-            "the summary",
-            Duration::from_secs(5),
-            || self.lines().into_iter().find(|line| line["kind"] == "summary"),
-            || self.process.tail(),
-        )?;
+        let summary = self.lines().into_iter().find(|line| line["kind"] == "summary");
+        let summary = summary.with_context(|| format!("no summary. {}", self.process.tail()))?;
         anyhow::ensure!(code.is_some(), "{} was ended by a signal", self.name);
         Ok(Summary { value: summary })
     }

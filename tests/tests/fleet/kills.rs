@@ -9,7 +9,7 @@ use blaze_domain::node_file::{NodeBroker, NodeFile};
 use blaze_tests::fleet::{Api, MainService, MainStore, Worker, WorkerProcess, WorkerSpec, wait_equal};
 use blaze_tests::process::usage;
 use blaze_tests::servers::{MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer};
-use blaze_tests::wait;
+use blaze_tests::{wait, within};
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
 use serde_json::Value;
@@ -137,11 +137,11 @@ async fn all_equal(api: &Api, workers: &[Worker], processes: &[(String, WorkerPr
     let digest = loop {
         match api.digest(LAYER).await {
             Ok(digest) => break digest,
-            Err(error) => assert!(begun.elapsed() < EQUAL, "{error:#}"),
+            Err(error) => assert!(begun.elapsed() < within(EQUAL), "{error:#}"),
         }
         tokio::time::sleep(Duration::from_millis(20)).await;
     };
-    if let Err(error) = wait_equal(api, workers, EQUAL.saturating_sub(begun.elapsed())).await {
+    if let Err(error) = wait_equal(api, workers, within(EQUAL).saturating_sub(begun.elapsed())).await {
         panic!("{error:#}");
     }
     for (name, process) in processes {
@@ -150,7 +150,7 @@ async fn all_equal(api: &Api, workers: &[Worker], processes: &[(String, WorkerPr
             if status["digest"] == digest.as_str() && status["connected"] == true && status["source"] == "main" {
                 break;
             }
-            assert!(begun.elapsed() < EQUAL, "{name} has not {digest}: {status}");
+            assert!(begun.elapsed() < within(EQUAL), "{name} has not {digest}: {status}");
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     }
@@ -170,7 +170,7 @@ async fn services_are_told_that(
             // What has come just now is told within 20 ms.
             while told(worker, &name).await != expected {
                 assert!(
-                    begun.elapsed() < EQUAL,
+                    begun.elapsed() < within(EQUAL),
                     "{name} at {} was not told {expected}",
                     worker.node()
                 );
@@ -192,7 +192,7 @@ async fn services_are_told_that(
                     break;
                 }
                 assert!(
-                    begun.elapsed() < EQUAL,
+                    begun.elapsed() < within(EQUAL),
                     "key of {name} at {node}: {found:?}, not {expected}"
                 );
                 tokio::time::sleep(Duration::from_millis(20)).await;

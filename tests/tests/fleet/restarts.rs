@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use blaze_tests::fleet::{MainService, MainStore, restart, wait_equal};
+use blaze_tests::within;
 use serde_json::json;
 
 use super::{PATIENCE, count, make_nodes, node, service, start_workers};
@@ -41,11 +42,15 @@ async fn workers_come_back_one_after_the_other_and_users_do_not_wait_for_them() 
         restarted.refused,
         restarted.away
     );
-    assert!(p99 <= GET, "a user's GET took {p99:?}");
+    assert!(p99 <= within(GET), "a user's GET took {p99:?}");
     // Who is not answered hears so at once, and nobody is refused once the main service is back.
-    assert!(restarted.slowest_refusal <= GET, "{:?}", restarted.slowest_refusal);
+    assert!(
+        restarted.slowest_refusal <= within(GET),
+        "{:?}",
+        restarted.slowest_refusal
+    );
     assert_eq!(restarted.refused_since, 0);
-    assert!(last <= BACK, "the last worker came back after {last:?}");
+    assert!(last <= within(BACK), "the last worker came back after {last:?}");
     let most = restarted.back.iter().enumerate().map(|(number, begin)| {
         let within = restarted.back[number..]
             .iter()
@@ -54,10 +59,15 @@ async fn workers_come_back_one_after_the_other_and_users_do_not_wait_for_them() 
     });
     let most = most.max().unwrap();
     assert!(
-        most <= workers.len() / 2,
+        // Those that come back before anybody saw the main service again count as one moment, longer where others run beside.
+        most <= if blaze_tests::long() {
+            workers.len() / 2
+        } else {
+            workers.len() * 3 / 4
+        },
         "{most} of {} workers came back within {QUARTER:?}: {:?}",
         workers.len(),
         restarted.back
     );
-    wait_equal(&api, &workers, BACK).await.unwrap();
+    wait_equal(&api, &workers, within(BACK)).await.unwrap();
 }

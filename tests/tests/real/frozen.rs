@@ -10,7 +10,7 @@ use blaze_tests::process::Signal;
 use blaze_tests::servers::{
     KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer, shared_kafka, shared_redis, unique_name,
 };
-use blaze_tests::wait;
+use blaze_tests::{wait, within};
 use serde_json::{Value, json};
 
 use crate::support::{SOON, turn};
@@ -137,7 +137,8 @@ fn freeze(
     while seen.len() < ATTEMPTS {
         let times = freeze_once(rig, what, others, &freeze, &thaw)?;
         // The margin beside the factor is what the clock of two busy cores resolves.
-        let as_fast = |(calm, frozen): &(Duration, Duration)| *frozen <= calm.mul_f64(1.2) + Duration::from_millis(5);
+        let margin = within(Duration::from_millis(5));
+        let as_fast = |(calm, frozen): &(Duration, Duration)| *frozen <= calm.mul_f64(1.2) + margin;
         if times.iter().all(as_fast) {
             return Ok(());
         }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use blaze_tests::flow::{FlowProcess, FlowSpec};
 use blaze_tests::plain::{KafkaReader, KafkaWriter, Record};
 use blaze_tests::servers::{shared_kafka, shared_redis, unique_name};
-use blaze_tests::wait;
+use blaze_tests::{wait, within};
 use serde_json::{Value, json};
 
 use crate::support::{RedisReader, RobotAndCloud, SOON, connect, turn};
@@ -83,7 +83,7 @@ fn redis_publish_reaches_a_kafka_consumer() -> anyhow::Result<()> {
     system.tell_cloud(&json!({"op":"withdraw","topic":TOPIC,"service":"logger"}))?;
     wait::until(
         "the bridges end within a second of the withdraw",
-        Duration::from_secs(1),
+        within(Duration::from_secs(1)),
         || system.robot.bridges_up().is_empty(),
         || format!("{:?}", system.robot.bridges()),
     )?;

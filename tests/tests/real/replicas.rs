@@ -13,7 +13,7 @@ use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::ledger::{Fate, Identity, Ledger};
 use blaze_tests::plain::{self, KafkaReader, KafkaWriter, RedisReader};
 use blaze_tests::servers::{shared_kafka, shared_redis, unique_name};
-use blaze_tests::wait;
+use blaze_tests::{wait, within};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use serde_json::{Value, json};
@@ -376,7 +376,7 @@ fn round(system: &mut System, end: End, victim: Victim) -> anyhow::Result<()> {
             }
             End::Stopped => {
                 anyhow::ensure!(found.lost == 0 && again == 0, "lost or repeated: {}", fault());
-                anyhow::ensure!(gap < STOPPED_GAP, "gap: {}", fault());
+                anyhow::ensure!(gap < within(STOPPED_GAP), "gap: {}", fault());
             }
         }
     }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use blaze_tests::flow::FlowProcess;
 use blaze_tests::plain::KafkaWriter;
 use blaze_tests::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer};
-use blaze_tests::wait;
+use blaze_tests::{wait, within};
 use serde_json::{Value, json};
 
 use crate::support::{RobotAndCloud, SOON, turn};
@@ -157,7 +157,7 @@ fn kill_and_restart(
         }
     }
     stream
-        .wait_fresh(FLOWING)
+        .wait_fresh(within(FLOWING))
         .map_err(|error| anyhow::anyhow!("{victim:?}: {error}\n{}\n{}", system.robot.tail(), system.cloud.tail()))
 }
 

@@ -7,8 +7,8 @@ use blaze_tests::flow::FlowProcess;
 use blaze_tests::long;
 use blaze_tests::network::Plan;
 use blaze_tests::scenario::{BrokerKind, Flow, Running, Scenario, Stream};
-use blaze_tests::wait;
 use blaze_tests::wan::{Shape, Ways};
+use blaze_tests::{wait, within};
 use serde_json::Value;
 
 use super::layers::{IMU, broker, flow, service, stream};
@@ -199,7 +199,10 @@ fn cut(running: &Running, ways: Ways) -> anyhow::Result<()> {
         healed.flowing[IMU],
         busiest * 100.0
     );
-    anyhow::ensure!(healed.flowing[IMU] <= healed.hello + FLOWING, "{ways:?}: too late");
+    anyhow::ensure!(
+        healed.flowing[IMU] <= healed.hello + within(FLOWING),
+        "{ways:?}: too late"
+    );
     anyhow::ensure!(busiest <= 1.0, "{ways:?}: more than the limit");
     for ((stream, before), lifespan) in
         streams()
@@ -222,7 +225,7 @@ fn cut(running: &Running, ways: Ways) -> anyhow::Result<()> {
         if let Some(lifespan) = lifespan {
             let oldest = route.latency_ms(1.0).unwrap_or_default();
             anyhow::ensure!(
-                oldest <= (lifespan + DELIVERY).as_secs_f64() * 1e3,
+                oldest <= (lifespan + within(DELIVERY)).as_secs_f64() * 1e3,
                 "{ways:?}: {topic} of {oldest} ms arrived"
             );
         }

@@ -1,11 +1,9 @@
 //! Many nodes join at once, each in a namespace of its own, and ask for what is flowing: those who had it go on having it.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use blaze_tests::flow::{FlowProcess, FlowSpec};
+use blaze_tests::machine::Idler;
 use blaze_tests::network::{Host, Plan, Topology, inside};
 use blaze_tests::plain::{self, KafkaWriter};
 use blaze_tests::servers::{KafkaOptions, KafkaServer, RedisKind, RedisOptions, RedisServer};
@@ -21,40 +19,9 @@ const DOMAIN: u16 = 20;
 /// The longest time that the route may be silent; its messages come every 20 ms. Beyond it counts what the machine had nobody
 /// do anything: all nodes start on the same processors here.
 const GAP: Duration = Duration::from_millis(200);
-/// How often a thread that does nothing else looks at the time.
-const LOOK: Duration = Duration::from_millis(5);
 const SOON: Duration = Duration::from_secs(30);
 /// After the last one has what it asked for.
 const AFTER: Duration = Duration::from_secs(3);
-
-/// A thread that sees how long the machine lets nobody do anything.
-struct Idler {
-    stop: Arc<AtomicBool>,
-    thread: JoinHandle<Duration>,
-}
-
-impl Idler {
-    fn start() -> Self {
-        let stop = Arc::<AtomicBool>::default();
-        let stopped = Arc::clone(&stop);
-        let thread = std::thread::spawn(move || {
-            let mut longest = Duration::ZERO;
-            while !stopped.load(Ordering::Relaxed) {
-                let before = Instant::now();
-                std::thread::sleep(LOOK);
-                longest = longest.max(before.elapsed().saturating_sub(LOOK));
-            }
-            longest
-        });
-        Self { stop, thread }
-    }
-
-    /// By how much it woke up too late at most.
-    fn end(self) -> anyhow::Result<Duration> {
-        self.stop.store(true, Ordering::Relaxed);
-        self.thread.join().map_err(|_| anyhow::anyhow!("the idler panicked"))
-    }
-}
 
 fn redis(host: &Host) -> anyhow::Result<RedisServer> {
     let options = RedisOptions {
@@ -155,7 +122,7 @@ fn nodes_that_join_at_once_disturb_nobody() -> anyhow::Result<()> {
         || format!("{} of {}", peers_up(&robot), NODES + 1),
     )?;
     std::thread::sleep(AFTER);
-    let (end, late) = (Instant::now(), idler.end()?);
+    let (end, late) = (Instant::now(), idler.latest());
     let (before, during) = (stream.gap(calm, joined), stream.gap(joined, end));
     let (twice, reordered) = stream.faults();
     println!(

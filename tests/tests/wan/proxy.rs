@@ -4,10 +4,12 @@ use std::io::{ErrorKind, Read as _, Write as _};
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
 use std::time::{Duration, Instant};
 
+use blaze_tests::machine::Idler;
 use blaze_tests::network::{Plan, Topology, connect};
 use blaze_tests::proxy::Proxy;
 use blaze_tests::wait;
 use blaze_tests::wan::Shape;
+use blaze_tests::within;
 
 use super::support::turn;
 
@@ -115,11 +117,18 @@ fn a_delay_is_kept_both_ways() -> anyhow::Result<()> {
     let mut stream = client(&proxy)?;
     exchange(&mut stream, b"before")?;
     proxy.delay(Duration::from_millis(50))?;
+    let idler = Idler::start();
     let took = exchange(&mut stream, b"delayed")?;
-    assert!((100..300).contains(&took.as_millis()), "{took:?}");
+    let late = idler.latest();
+    let delayed = Duration::from_millis(100)..Duration::from_millis(300) + late;
+    assert!(delayed.contains(&took), "{took:?}, the machine was late by {late:?}");
     proxy.heal()?;
-    let took = exchange(&mut stream, b"healed")?;
-    assert!(took < Duration::from_millis(50), "{took:?}");
+    // Whatever else the machine does, it is not each time.
+    let took: Vec<Duration> = (0..5)
+        .map(|_| exchange(&mut stream, b"healed"))
+        .collect::<Result<_, _>>()?;
+    let fastest = took.iter().min();
+    assert!(fastest < Some(&Duration::from_millis(50)), "{took:?}");
     Ok(())
 }
 
@@ -132,9 +141,11 @@ fn a_throttle_holds_its_rate() -> anyhow::Result<()> {
     // A second up, and the same time down behind it.
     let took = exchange(&mut stream, &vec![7; 50_000])?;
     println!("50,000 bytes at 50,000 bytes/s there and back: {took:?}");
-    assert!((950..1_500).contains(&took.as_millis()), "{took:?}");
+    let limit = within(Duration::from_millis(1_500));
+    assert!((Duration::from_millis(950)..limit).contains(&took), "{took:?}");
     proxy.heal()?;
-    assert!(exchange(&mut stream, &vec![7; 50_000])? < Duration::from_millis(500));
+    let took = exchange(&mut stream, &vec![7; 50_000])?;
+    assert!(took < Duration::from_millis(900), "the rate is held no more: {took:?}");
     Ok(())
 }
 

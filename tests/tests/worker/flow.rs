@@ -4,13 +4,15 @@ use std::time::{Duration, Instant};
 
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::plain::{self, RedisReader};
-use blaze_tests::wait;
+use blaze_tests::{wait, within};
 use serde_json::{Value, json};
 
 use super::stage::{PATIENCE, Stage, Worker, next, rest};
 
 /// What is acknowledged to a user is in effect so soon.
-pub(crate) const SOON: Duration = Duration::from_secs(1);
+pub(crate) fn soon() -> Duration {
+    within(Duration::from_secs(1))
+}
 
 pub(crate) fn spec(stage: &Stage, node: &str) -> FlowSpec {
     FlowSpec::new("edge", node).on_redis(&stage.redis.url(), "")
@@ -116,7 +118,7 @@ async fn a_limit_of_layer_or_node_is_in_effect_within_a_second_and_nobody_else_h
     let mut own = service.listen("blaze-flow").await;
     // There is no document of the service `blaze-flow`: programs are there without one.
     stage.put("/layers/edge", layer(&limit(12.0))).await;
-    let took = has_limit(&flow, 12.0, SOON);
+    let took = has_limit(&flow, 12.0, soon());
     let notice = next(&mut own).await;
     assert_eq!(notice["paths"], json!(["/flow/bandwidth/limit_mbps"]));
     let ack = acks.next("applied");
@@ -127,15 +129,15 @@ async fn a_limit_of_layer_or_node_is_in_effect_within_a_second_and_nobody_else_h
             json!({ "layer": "edge", "overrides": { "blaze-flow": limit(9.5) } }),
         )
         .await;
-    let again = has_limit(&flow, 9.5, SOON);
+    let again = has_limit(&flow, 9.5, soon());
     eprintln!("a changed limit is in effect after {took:?} and {again:?}");
     let effective = stage.get("/effective?service=blaze-flow&node=robot-1").await;
     assert_eq!(effective["config"]["flow"]["bandwidth"]["limit_mbps"], 9.5);
     // What is taken away gives the weaker value again, at last that of the file.
     stage.put("/nodes/robot-1", json!({ "layer": "edge" })).await;
-    has_limit(&flow, 12.0, SOON);
+    has_limit(&flow, 12.0, soon());
     stage.put("/layers/edge", layer(&json!({}))).await;
-    has_limit(&flow, 30.0, SOON);
+    has_limit(&flow, 30.0, soon());
     next(&mut own).await;
     let others = (rest(&mut slam).await, rest(&mut nav).await);
     assert!(others.0.is_empty() && others.1.is_empty(), "{others:?}");
@@ -247,7 +249,7 @@ async fn the_node_file_and_blaze_config_change_apart_from_each_other() {
         status == "failed" && detail.contains("share")
     });
     stage.put("/layers/edge", layer(&limit(21.0))).await;
-    has_limit(&flow, 21.0, SOON);
+    has_limit(&flow, 21.0, soon());
     check(&flow, "the file is still faulty", |status, detail| {
         status == "failed" && detail.contains("share")
     });

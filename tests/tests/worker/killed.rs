@@ -10,6 +10,7 @@ use blaze_domain::Scope;
 use blaze_sdk::{ConfigSource, ServiceManager, ServiceOptions};
 use blaze_tests::proxy::Proxy;
 use blaze_tests::servers::{MongoOptions, MongoServer};
+use blaze_tests::within;
 use reqwest::Method;
 use serde_json::{Value, json};
 use tokio::time::Instant;
@@ -46,10 +47,11 @@ impl Last {
     /// A plain client, a key and a service with the SDK have it, from the copy. `up`: when the broker came back.
     async fn is_served(&self, robot: &Robot, up: Instant, what: &str) {
         let mut plain = robot.service().await;
-        let left = || SERVED.saturating_sub(up.elapsed());
+        let served = within(SERVED);
+        let left = || served.saturating_sub(up.elapsed());
         let answer = plain.ask(json!({ "service": "slam", "instance": "0" }), left()).await;
         let took = up.elapsed();
-        assert!(took <= SERVED, "{what}: {took:?}");
+        assert!(took <= served, "{what}: {took:?}");
         println!("{what}: answered {took:?} after the broker was back");
         assert_eq!(
             (&answer["hash"], &answer["source"]),
@@ -169,7 +171,7 @@ async fn all_is_killed_and_comes_back(alone: bool) {
     let mut notices = listener.listen("slam").await;
     link.heal().unwrap();
     let healed = Instant::now();
-    stage.equal(&worker, EQUAL).await;
+    stage.equal(&worker, within(EQUAL)).await;
     println!("equal {:?} after the link was whole", healed.elapsed());
     let notice = next_that(&mut notices, |notice| notice["instance"] == "0").await;
     assert_eq!(

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use blaze_tests::within;
 use serde_json::{Value, json};
 
 use super::stage::{PATIENCE, Stage, next, rest};
@@ -42,7 +43,7 @@ async fn without_the_main_service_everything_is_answered_and_afterwards_all_is_m
         stage.put("/services/slam", rate(rate_hz)).await;
     }
     stage.send(reqwest::Method::DELETE, "/services/nav", None).await;
-    stage.equal(&worker, EQUAL).await;
+    stage.equal(&worker, within(EQUAL)).await;
     let mut last = next(&mut slam).await;
     while last["config"]["camera"]["rate_hz"] != 3 {
         last = next(&mut slam).await;
@@ -79,7 +80,7 @@ async fn after_everything_was_killed_services_get_their_last_configuration_at_on
     stage.redis.restart().unwrap();
     let worker = stage.worker("robot-1");
     let mut service = stage.service().await;
-    let answer = service.ask(asks, Duration::from_secs(2)).await;
+    let answer = service.ask(asks, within(Duration::from_secs(2))).await;
     assert_eq!(
         (&answer["hash"], &answer["config"]),
         (&before["hash"], &before["config"])
@@ -102,7 +103,7 @@ async fn after_everything_was_killed_services_get_their_last_configuration_at_on
     assert!(String::from_utf8_lossy(&key).contains(before["hash"].as_str().unwrap()));
 
     let _main = stage.main();
-    stage.equal(&worker, EQUAL).await;
+    stage.equal(&worker, within(EQUAL)).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -4,13 +4,14 @@ use std::time::{Duration, Instant};
 
 use blaze_tests::process::Signal;
 use blaze_tests::servers::{KafkaOptions, KafkaServer, MongoOptions, MongoServer};
+use blaze_tests::within;
 use serde_json::{Value, json};
 
 use super::stage::{PATIENCE, Stage, Worker};
 
 /// `worker.lease_ms`, unless set.
 const LEASE: Duration = Duration::from_secs(5);
-/// Between two looks at the status, and what a look may take on a machine that does much else.
+/// Between two looks at the status.
 const LOOK: Duration = Duration::from_millis(250);
 /// How long after the signal whoever ends has given it up and the other one has looked.
 const GIVEN: Duration = Duration::from_secs(1);
@@ -61,7 +62,7 @@ async fn takeovers(name: &str, stage: &Stage, sections: &Value) {
     let leader = other;
     let other = stage.layer_worker("fog-3", sections);
     stage.equal(&other, PATIENCE).await;
-    assert_eq!(other.leads().await, Some(false));
+    assert!(!other.is_leader().await);
     let since = Instant::now();
     leader.signal(Signal::STOP);
     let stopped = until_it_leads(&other, since).await;
@@ -74,16 +75,16 @@ async fn takeovers(name: &str, stage: &Stage, sections: &Value) {
         assert_ne!(other.leads().await, Some(false), "it has the lease: {}", other.tail());
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
-    assert_eq!((leader.leads().await, other.leads().await), (Some(false), Some(true)));
+    assert_eq!((leader.is_leader().await, other.is_leader().await), (false, true));
 
     let since = Instant::now();
     other.stop();
     let ended = until_it_leads(&leader, since).await;
     println!("{name}: taken over {killed:?} after a kill, {stopped:?} after a stop, {ended:?} after an end");
-    let lost = LEASE + LOOK;
+    let (lost, given) = (LEASE + within(LOOK), within(GIVEN));
     assert!(killed <= lost, "after a kill {killed:?}, not {lost:?}");
     assert!(stopped <= lost, "after a stop {stopped:?}, not {lost:?}");
-    assert!(ended <= GIVEN, "after an end {ended:?}, not {GIVEN:?}");
+    assert!(ended <= given, "after an end {ended:?}, not {given:?}");
     leader.stop();
 }
 
@@ -174,7 +175,7 @@ async fn whoever_was_stopped_writes_nothing_older_over_what_the_next_one_wrote()
         until_it_leads(&leader, Instant::now()).await;
         other.signal(Signal::CONT);
         stage.equal(&other, PATIENCE).await;
-        assert_eq!(other.leads().await, Some(false));
+        assert!(!other.is_leader().await);
     }
 }
 

@@ -1,7 +1,7 @@
 //! A main service without tokens, a broker, and workers of layer `edge`.
 
 use std::collections::BTreeMap;
-use std::net::{SocketAddr, TcpListener};
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,7 +14,7 @@ use blaze_brokers::{
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::{NodeBroker, NodeFile};
 use blaze_tests::process::{Process, Signal};
-use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
+use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer, free_port};
 use blaze_tests::wait;
 use bytes::Bytes;
 use serde_json::{Value, json};
@@ -53,7 +53,7 @@ pub(crate) struct Worker {
 }
 
 fn free() -> SocketAddr {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap()
+    SocketAddr::from((Ipv4Addr::LOCALHOST, free_port().unwrap()))
 }
 
 fn launch(program: &str, node_file: &str) -> anyhow::Result<(Process, BTreeMap<String, SocketAddr>)> {
@@ -324,6 +324,17 @@ impl Worker {
         let text = tokio::time::timeout(Duration::from_millis(100), answer).await.ok()??;
         let status: Value = serde_json::from_str(&text).ok()?;
         status["leader"].as_bool()
+    }
+
+    /// Whether it leads, as it says when it is asked until it answers.
+    pub(crate) async fn is_leader(&self) -> bool {
+        let start = tokio::time::Instant::now();
+        loop {
+            if let Some(leads) = self.leads().await {
+                return leads;
+            }
+            assert!(start.elapsed() < PATIENCE, "it does not answer: {}", self.tail());
+        }
     }
 
     pub(crate) fn kill(mut self) {

@@ -11,6 +11,7 @@ use std::time::Duration;
 use blaze_proto::v1;
 use blaze_proto::v1::sync_request::Msg as Said;
 use blaze_proto::v1::sync_response::Msg as Told;
+use blaze_tests::wait;
 use bytes::Bytes;
 use futures::StreamExt as _;
 use prost::Message as _;
@@ -304,11 +305,8 @@ async fn the_worker_understands_main_services_that_were_recorded() {
 async fn says(worker: &Worker, words: &str) {
     let is_there = |status: &Value| status["reason"].as_str().is_some_and(|reason| reason.contains(words));
     worker.until(words, is_there).await;
-    assert!(
-        worker.log().iter().any(|line| line.contains(words)),
-        "{:?}",
-        worker.log()
-    );
+    let is_logged = || worker.log().iter().any(|line| line.contains(words));
+    wait::until(words, PATIENCE, is_logged, || worker.tail()).unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

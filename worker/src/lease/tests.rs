@@ -191,19 +191,19 @@ impl conformance::Fixture for InMemory {
     }
 
     fn time(&self) -> Duration {
-        Duration::from_millis(200)
+        Duration::from_millis(500)
     }
 
     fn runs_out_within(&self) -> Duration {
-        Duration::from_millis(400)
+        Duration::from_millis(1500)
     }
 
     fn given_within(&self) -> Duration {
-        Duration::from_millis(100)
+        Duration::from_millis(500)
     }
 
     fn first_within(&self) -> Duration {
-        Duration::from_millis(100)
+        Duration::from_millis(500)
     }
 }
 

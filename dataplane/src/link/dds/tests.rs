@@ -100,7 +100,7 @@ impl Flow {
     }
 }
 
-pub(super) const DISCOVERY: Duration = Duration::from_secs(2);
+pub(super) const DISCOVERY: Duration = Duration::from_secs(10);
 
 #[test]
 fn topics_name_endpoint_and_class() {

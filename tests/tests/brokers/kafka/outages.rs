@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use blaze_brokers::{Broker as _, Health, Role};
+use blaze_tests::within;
 
 use super::{Flow, frame, health, open, publish, publisher, reader, start_server};
 
@@ -31,7 +32,7 @@ async fn nothing_reliable_is_lost_or_repeated_by_a_killed_server() {
         server.kill().unwrap();
         publish_some(500);
         let down = tokio::join!(health(&flow.broker, Health::Down), health(&service, Health::Down));
-        assert!(down.0 < SHOWS && down.1 < SHOWS, "{down:?}");
+        assert!(down.0.max(down.1) < within(SHOWS), "{down:?}");
         publish_some(500);
         server.restart().unwrap();
         let start = Instant::now();
@@ -64,7 +65,7 @@ async fn a_frozen_server_shows_and_nothing_reliable_is_lost() {
             publish(publisher.as_ref(), &frame(&channel, 1, sequence));
         }
         health(&flow.broker, Health::Down).await;
-        assert!(start.elapsed() < SHOWS, "{:?}", start.elapsed());
+        assert!(start.elapsed() < within(SHOWS), "{:?}", start.elapsed());
         println!("down {:?} after the server froze", start.elapsed());
         for sequence in first + 50..first + 100 {
             publish(publisher.as_ref(), &frame(&channel, 1, sequence));

@@ -12,7 +12,7 @@ use serde_json::json;
 
 use super::support::{Server, channel, section_of, subscribe, wait_for};
 
-const SHORT: Duration = Duration::from_millis(300);
+const SHORT: Duration = Duration::from_secs(2);
 const LONG: Duration = Duration::from_secs(60);
 
 fn keys_of(server: &Server) -> RedisKeys {

@@ -30,7 +30,7 @@ async fn a_frozen_server_is_noticed_and_nothing_comes_twice() {
                 taken.push(sequence);
             } else if source.status().borrow().health == Health::Down {
                 assert!(
-                    frozen.elapsed() < Duration::from_secs(3),
+                    frozen.elapsed() < Duration::from_secs(4),
                     "down after {:?}",
                     frozen.elapsed()
                 );
@@ -60,7 +60,11 @@ async fn a_frozen_server_is_noticed_and_nothing_comes_twice() {
         wait_for(&sink, Health::Up).await;
         let after = sequence + 1;
         publish(publisher.as_ref(), 1, after);
-        let found = numbers_until_silence(&mut reader).await;
+        let mut found = Vec::new();
+        while found.last() != Some(&after) {
+            found.push(next_number(&mut reader).await.1);
+        }
+        found.extend(numbers_until_silence(&mut reader).await);
         assert_eq!(found.last(), Some(&after));
         assert!(found.is_sorted_by(|a, b| a < b), "{found:?}");
         let late: Vec<_> = found
