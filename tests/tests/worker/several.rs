@@ -11,7 +11,7 @@ use super::stage::{PATIENCE, Stage, Worker};
 
 /// `worker.lease_ms`, unless set.
 const LEASE: Duration = Duration::from_secs(5);
-/// Between two looks at the status.
+/// What a look at the status may take.
 const LOOK: Duration = Duration::from_millis(250);
 /// How long after the signal whoever ends has given it up and the other one has looked.
 const GIVEN: Duration = Duration::from_secs(1);

@@ -334,6 +334,7 @@ impl Worker {
                 return leads;
             }
             assert!(start.elapsed() < PATIENCE, "it does not answer: {}", self.tail());
+            tokio::time::sleep(Duration::from_millis(10)).await;
         }
     }
 

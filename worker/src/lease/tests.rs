@@ -199,7 +199,7 @@ impl conformance::Fixture for InMemory {
     }
 
     fn given_within(&self) -> Duration {
-        Duration::from_millis(500)
+        Duration::from_millis(250)
     }
 
     fn first_within(&self) -> Duration {

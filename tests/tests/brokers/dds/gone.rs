@@ -133,13 +133,11 @@ impl Source {
             while self.due <= Instant::now() {
                 self.sequence += 1;
                 let frame = frame(&self.topic, 1, self.sequence, self.bytes);
-                assert_eq!(self.publisher.publish(&frame, None), PublishOutcome::Taken);
-                let now = Instant::now();
-                let pause = self
-                    .sent
-                    .replace(now)
-                    .map_or(Duration::ZERO, |sent| now.duration_since(sent));
+                // Without the call itself, which must not wait for any reader.
+                let pause = self.sent.map_or(Duration::ZERO, |sent| sent.elapsed());
                 self.longest_pause = self.longest_pause.max(pause);
+                assert_eq!(self.publisher.publish(&frame, None), PublishOutcome::Taken);
+                self.sent = Some(Instant::now());
                 self.due += self.period;
             }
             tokio::time::sleep_until(self.due.into()).await;
