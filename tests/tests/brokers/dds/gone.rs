@@ -8,6 +8,7 @@ use blaze_brokers::{Broker, PublishOutcome, Publisher, PublisherOptions};
 use blaze_domain::names::ChannelName;
 use blaze_tests::machine::Idler;
 use blaze_tests::process::Process;
+use blaze_tests::within;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -68,7 +69,7 @@ impl Peer {
         let gap = Duration::from_secs_f64(report["gap_ms"].as_f64().unwrap() / 1e3);
         let (pause, late) = (source.longest_pause, source.idler.latest());
         assert!(
-            gap < LONGEST_GAP + pause + late,
+            gap < within(LONGEST_GAP) + pause + late,
             "{}: {report}; the source paused for {pause:?}, the machine was late by {late:?}",
             self.name
         );
