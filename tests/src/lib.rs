@@ -1,5 +1,7 @@
 //! What end-to-end tests stand on: real processes and servers, emulated networks, faults, and waits on conditions.
 
+use std::time::Duration;
+
 pub mod admin;
 pub mod fleet;
 pub mod flow;
@@ -19,11 +21,12 @@ pub mod stream;
 pub mod wait;
 pub mod wan;
 
-/// A limit of delay: as it is where each test has the machine for itself (`scripts/test --long`), else four times as much, as
-/// others that run beside take their share of two processors.
+/// A limit of delay: as it is where each test has the machine for itself (`scripts/test --long`), else four times as much and at
+/// most two seconds more, as others that run beside take their share of two processors.
 #[must_use]
-pub fn within(limit: std::time::Duration) -> std::time::Duration {
-    if long() { limit } else { limit * 4 }
+pub fn within(limit: Duration) -> Duration {
+    const MOST: Duration = Duration::from_secs(2);
+    if long() { limit } else { limit + (limit * 3).min(MOST) }
 }
 
 /// Whether the full counts are wanted (`scripts/test --long`).
