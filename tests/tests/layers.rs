@@ -82,7 +82,7 @@ const OUTSIDE: &[(&str, &[&str])] = &[
         ],
     ),
     ("mongodb", &["blaze-config", "blaze-worker", "blaze-tests"]),
-    ("rusqlite", &["blaze-config", "blaze-worker"]),
+    ("rusqlite", &["blaze-config"]),
     (
         "tokio",
         &[

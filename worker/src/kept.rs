@@ -1,6 +1,6 @@
 //! Which copies a worker has, and what it begins from.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
@@ -8,15 +8,13 @@ use blaze_domain::node_file::DatabaseSection;
 use blaze_runtime::Supervisor;
 use tokio::sync::mpsc;
 
-use crate::copy::{
-    Copies, DATABASE_LIMIT, DATABASE_NAME, FileCopy, Found, LocalCopy, Notes, SqliteCopy, Start, Target, Vault, choose,
-};
+use crate::copy::{Copies, DATABASE_LIMIT, FileCopy, Found, LocalCopy, Start, Target, Vault, choose};
 use crate::settings::WorkerSettings;
 
 /// Where copies are kept.
 pub(crate) struct Kept {
-    database: Option<Arc<dyn LocalCopy>>,
     file: Option<Arc<dyn LocalCopy>>,
+    database: Option<Arc<dyn LocalCopy>>,
 }
 
 impl Kept {
@@ -28,53 +26,42 @@ impl Kept {
         settings: &WorkerSettings,
         folder: Option<PathBuf>,
         vault: &Vault,
-        supervisor: &Supervisor,
     ) -> anyhow::Result<Self> {
         let layer = &settings.site.layer;
-        if let Some(folder) = &folder {
-            make_folder(folder).await?;
-        }
-        let sqlite = |path: PathBuf| -> anyhow::Result<Arc<dyn LocalCopy>> {
-            let copy = SqliteCopy::new(path, layer.clone(), vault.clone(), supervisor)?;
-            Ok(Arc::new(copy))
+        let folder = match &settings.database {
+            Some(DatabaseSection::Embedded { path }) => Some(path.clone()),
+            Some(DatabaseSection::MongoDb { .. }) | None => folder,
         };
-        let database = match (&settings.database, &folder) {
-            (Some(DatabaseSection::Embedded { path }), _) => {
-                make_folder(path).await?;
-                Some(sqlite(path.join(DATABASE_NAME)).context("database.embedded")?)
+        let file = match folder {
+            None => None,
+            Some(folder) => {
+                make_folder(&folder).await?;
+                Some(Arc::new(FileCopy::new(&folder, layer.clone(), vault.clone())) as Arc<dyn LocalCopy>)
             }
-            (Some(DatabaseSection::MongoDb { uri, database }), _) => {
+        };
+        let database = match &settings.database {
+            Some(DatabaseSection::MongoDb { uri, database }) => {
                 Some(mongodb(uri.clone(), database, settings, vault).context("database.mongodb")?)
             }
-            (None, Some(folder)) => Some(sqlite(folder.join(DATABASE_NAME)).context("the copy")?),
-            (None, None) => None,
+            Some(DatabaseSection::Embedded { .. }) | None => None,
         };
-        let file = folder
-            .map(|folder| -> Arc<dyn LocalCopy> { Arc::new(FileCopy::new(&folder, layer.clone(), vault.clone())) });
-        Ok(Self { database, file })
+        Ok(Self { file, database })
     }
 
     /// Reads what is there and keeps it up to date from now on; `find` takes what can be read only later.
     pub(crate) async fn begin(self, supervisor: &Supervisor, find: &mpsc::Sender<Found>) -> (Option<Copies>, Start) {
-        let start = choose(self.database.as_ref(), self.file.as_ref(), DATABASE_LIMIT).await;
-        let notes = start.loaded.as_ref().map(|loaded| Arc::clone(&loaded.notes));
-        let current = [start.is_database_current, start.is_file_current];
-        let targets = [self.database, self.file].into_iter().zip(current);
+        let start = choose(self.file.as_ref(), self.database.as_ref(), DATABASE_LIMIT).await;
+        let targets = [self.file, self.database].into_iter().flatten();
         let targets: Vec<Target> = targets
-            .filter_map(|(copy, is_current)| {
-                let copy = copy?;
-                Some(Target {
-                    is_read: !start.is_unread(&*copy),
-                    copy,
-                    is_current,
-                })
+            .map(|copy| Target {
+                is_read: !start.unread.contains(&copy.describe()),
+                copy,
             })
             .collect();
         if targets.is_empty() {
             return (None, start);
         }
-        let notes = notes.unwrap_or_else(|| Arc::new(Notes::default()));
-        (Some(Copies::start(supervisor, targets, &notes, find)), start)
+        (Some(Copies::start(supervisor, targets, find)), start)
     }
 }
 
@@ -101,7 +88,7 @@ fn mongodb(
 }
 
 /// For its owner alone: what is in it says how the whole layer is configured.
-async fn make_folder(path: &std::path::Path) -> anyhow::Result<()> {
+async fn make_folder(path: &Path) -> anyhow::Result<()> {
     tokio::fs::DirBuilder::new()
         .recursive(true)
         .mode(0o700)

@@ -4,7 +4,7 @@
 //! ```text
 //! main service ──Sync──▶ core::Replica ──▶ core::Served ──▶ answers and notices on the local broker
 //!                            │   ▲
-//!                            ▼   │ at the start: local database, else last-known-good file, else mounted file
+//!                            ▼   │ at the start: last-known-good file or MongoDB, else mounted file
 //!                          copy::Copies
 //! ```
 

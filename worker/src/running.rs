@@ -1,7 +1,7 @@
 //! A worker put together: what it starts, in which order, and how it ends.
 //!
 //! ```text
-//! key ─▶ copies (database, file) ─▶ what to serve first ─▶ engine ─▶ stream, broker, lease, mounted file
+//! key ─▶ copies (file, database) ─▶ what to serve first ─▶ engine ─▶ stream, broker, lease, mounted file
 //! end: copies hold what was stored ─▶ lease given up
 //! ```
 
@@ -31,7 +31,7 @@ use crate::serve::{BrokerOutlet, Channels, Speaker, SpeakerCounts};
 use crate::settings::WorkerSettings;
 use crate::sync::{MainService, follow};
 
-/// Copies that may be read late: database and file.
+/// Copies that may be read late: file and database.
 const COPIES: usize = 2;
 /// Between two looks at the mounted file.
 const LOOK_AT_FILE: Duration = Duration::from_millis(500);
@@ -93,7 +93,7 @@ impl RunningWorker {
             instance,
         } = options;
         let vault = Vault::load(settings.key_file.as_deref()).context("worker.key_file")?;
-        let kept = Kept::open(&settings, folder, &vault, supervisor).await?;
+        let kept = Kept::open(&settings, folder, &vault).await?;
         let (find, found) = mpsc::channel(COPIES);
         let (copies, start) = kept.begin(supervisor, &find).await;
         if let Some(from) = &start.from {

@@ -29,7 +29,7 @@ pub struct WorkerSpec {
     pub brokers: Value,
     /// `config.server`.
     pub server: String,
-    /// Where its copies are kept, a SQLite file and the last-known-good file; `None`: nowhere.
+    /// Where its copy is kept, the last-known-good file; `None`: nowhere.
     pub folder: Option<PathBuf>,
 }
 

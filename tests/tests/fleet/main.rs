@@ -49,7 +49,7 @@ fn service(name: &str, config: &Value) -> Value {
     json!({ "kind": "Service", "name": name, "spec": { "config": config } })
 }
 
-/// Workers of the first nodes, with a SQLite file each and a broker in memory.
+/// Workers of the first nodes, with a copy in a file each and a broker in memory.
 async fn start_workers(main: &MainService, folder: &Path, count: usize) -> Vec<Worker> {
     let mut workers = Vec::with_capacity(count);
     for number in 0..count {

@@ -298,7 +298,7 @@ async fn everything_changes_behind_a_cut(namespace: &str) {
             let hash = notices.last().unwrap()["hash"].as_str().map(str::to_owned);
             robot.before.insert(place, (hash, begin));
         }
-        robot.worker.has_kept_all(2).await;
+        robot.worker.has_kept_all(1).await;
     }
     let uid = stage.get("/services/again").await["uid"].clone();
 
@@ -345,7 +345,7 @@ async fn everything_changes_behind_a_cut(namespace: &str) {
     assert!(gone.contains(&GONE) && !gone.contains(&AGAIN));
     for robot in &mut robots {
         // All has been told by then.
-        robot.worker.has_kept_all(2).await;
+        robot.worker.has_kept_all(1).await;
         robot.check_state(&stage, &changes.is_there).await;
     }
     let marker = change_all(&stage, "after", &gone).await;

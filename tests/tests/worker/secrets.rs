@@ -284,7 +284,7 @@ async fn copies(with_key: bool, database: Option<&MongoServer>) {
     let worker = robot.worker_logged(&stage, &log);
     stage.equal(&worker, PATIENCE).await;
     everything(&stage, &robot, &worker, true).await;
-    worker.has_kept_all(2).await;
+    worker.has_kept_all(1 + usize::from(database.is_some())).await;
     operator_sees_none(&worker, &[&main_log, &log]).await;
     assert!(
         keys(&robot.redis).contains(CANARY),

@@ -1,53 +1,35 @@
 //! Writes the newest state to every copy, each at its own pace.
 //!
 //! ```text
-//! store(update) ──▶ slot of the database ──▶ task ──▶ advance, or replace after a failure
-//!               └─▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time, and once a second
-//!                                                      at most while the database keeps up
+//! store(update) ──▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time
+//!               └─▶ slot of the database ──▶ task ──▶ replace, likewise
 //! could not be read at the start ─▶ task: load until it can be ──▶ Found ──▶ engine
 //! ```
 //!
-//! A slot holds one update: a newer one is merged into it and counted. So whoever stores never waits, a copy that is slow or
-//! away costs one state and the keys that changed since, and what is written is always the newest.
+//! A slot holds one update; a newer update replaces it and is counted. So a caller never waits, a copy that is slow or away
+//! costs one state, and the newest state is written.
 
-use std::collections::BTreeSet;
 use std::fmt;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use blaze_domain::config::Key;
 use blaze_domain::config::state::State;
 use blaze_runtime::{Supervisor, TaskPolicy};
-use tokio::sync::{mpsc, oneshot, watch};
+use parking_lot::Mutex;
+use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tokio::time::Instant;
 
-use super::slot::{Next, Slot};
 use super::{CopyError, Loaded, LocalCopy, Notes, Position};
 
 /// Bounds of the pause after a failure; the pause is drawn from zero to the bound, which doubles.
 const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(30));
-/// A copy that always writes everything rests this many times as long as the write took, between these bounds.
+/// A copy rests this many times as long as the write took, between these bounds: each write is of all documents, which
+/// costs processor time and wears out flash memory.
 const REST: u32 = 4;
-const REST_BOUNDS: (Duration, Duration) = (Duration::from_millis(50), Duration::from_secs(10));
-
-/// It rests at least so long while another copy keeps up, and so may be this old when that one is lost: to write all documents for each change of one wears out
-/// flash memory, and is most of what a change costs a worker that it does not concern.
-const REST_BESIDE: Duration = Duration::from_secs(1);
-/// A copy keeps up that holds what was stored so long ago: what comes later is on its way there.
-const KEEPS_UP: Duration = Duration::from_millis(100);
-
-/// Where only the time of the position moves on, such a copy is written again when it is this old.
+const REST_BOUNDS: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(10));
+/// Where only the time of the position moves on, a copy is written again when it is this old.
 const MAX_AGE: Duration = Duration::from_secs(300);
-
-/// What changed since the last update.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Changed {
-    /// Perhaps everything: a snapshot, another store.
-    All,
-    /// These documents: they are new, other ones, or gone.
-    Keys(Vec<Key>),
-}
 
 /// A state that is to be kept.
 #[derive(Debug, Clone)]
@@ -56,10 +38,10 @@ pub struct Update {
     pub position: Position,
     /// The documents of the layer's view.
     pub state: State,
-    /// What is new in it.
-    pub changed: Changed,
-    /// The notes, if they changed.
-    pub notes: Option<Arc<Notes>>,
+    /// The notes.
+    pub notes: Arc<Notes>,
+    /// Documents or notes differ from the last update; else only the time has moved on.
+    pub has_changed: bool,
 }
 
 /// A copy, and what is known of it at the start.
@@ -67,8 +49,6 @@ pub struct Update {
 pub struct Target {
     /// The copy.
     pub copy: Arc<dyn LocalCopy>,
-    /// It holds what the first update is counted from; else the first write is everything.
-    pub is_current: bool,
     /// What it holds is known, or that nobody here can read it; else it is read before anything is written.
     pub is_read: bool,
 }
@@ -113,39 +93,116 @@ pub struct Copies {
     answers: watch::Sender<bool>,
 }
 
+/// What waits for one copy, and what became of it.
+struct Slot {
+    place: String,
+    next: Mutex<Option<Update>>,
+    wake: Notify,
+    /// Somebody waits for it: no rest now.
+    hurry: Notify,
+    /// Updates that were stored.
+    stored: AtomicU64,
+    /// Of these, how many the copy holds.
+    done: watch::Sender<u64>,
+    written: AtomicU64,
+    failed: AtomicU64,
+    coalesced: AtomicU64,
+    error: Mutex<Option<String>>,
+}
+
+impl Slot {
+    fn new(place: String) -> Self {
+        Self {
+            place,
+            next: Mutex::new(None),
+            wake: Notify::new(),
+            hurry: Notify::new(),
+            stored: AtomicU64::new(0),
+            done: watch::Sender::new(0),
+            written: AtomicU64::new(0),
+            failed: AtomicU64::new(0),
+            coalesced: AtomicU64::new(0),
+            error: Mutex::new(None),
+        }
+    }
+
+    fn put(&self, update: &Update) {
+        let mut update = update.clone();
+        let mut next = self.next.lock();
+        if let Some(before) = next.take() {
+            self.coalesced.fetch_add(1, Ordering::Relaxed);
+            update.has_changed |= before.has_changed;
+        }
+        *next = Some(update);
+        self.stored.fetch_add(1, Ordering::AcqRel);
+        drop(next);
+        self.wake.notify_one();
+    }
+
+    /// What is to be written now, and how many updates are in it.
+    fn take(&self) -> Option<(Update, u64)> {
+        let mut next = self.next.lock();
+        Some((next.take()?, self.stored.load(Ordering::Acquire)))
+    }
+
+    /// A write that failed waits again, unless a newer one does.
+    fn put_back(&self, update: Update) {
+        let mut next = self.next.lock();
+        match &mut *next {
+            Some(newer) => {
+                newer.has_changed = true;
+                self.coalesced.fetch_add(1, Ordering::Relaxed);
+            }
+            None => *next = Some(update),
+        }
+    }
+
+    /// Whether the copy holds all that was stored.
+    fn is_current(&self) -> bool {
+        *self.done.borrow() >= self.stored.load(Ordering::Acquire)
+    }
+
+    fn counts(&self) -> Counts {
+        let number = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        Counts {
+            place: self.place.clone(),
+            written: number(&self.written),
+            failed: number(&self.failed),
+            coalesced: number(&self.coalesced),
+            is_current: self.is_current(),
+            error: self.error.lock().clone(),
+        }
+    }
+}
+
 impl Copies {
-    /// Starts one task per copy. `notes` are those that the copies were started from; `found` takes what is read later.
+    /// Starts one task per copy. `found` takes what is read later.
     #[must_use]
-    pub fn start(
-        supervisor: &Supervisor,
-        targets: Vec<Target>,
-        notes: &Arc<Notes>,
-        found: &mpsc::Sender<Found>,
-    ) -> Self {
-        let slot = |target: &Target| Arc::new(Slot::new(target.copy.describe(), notes));
-        let slots: Arc<[Arc<Slot>]> = targets.iter().map(slot).collect();
+    pub fn start(supervisor: &Supervisor, targets: Vec<Target>, found: &mpsc::Sender<Found>) -> Self {
         let answers = watch::Sender::new(false);
-        for (target, slot) in targets.into_iter().zip(&*slots) {
-            let name = format!("copy to {}", slot.place);
-            let (stop, writer) = (
-                supervisor.shutdown_token(),
-                Writer::new(
-                    target,
-                    Arc::clone(slot),
-                    Arc::clone(&slots),
-                    found.clone(),
-                    answers.subscribe(),
-                ),
-            );
-            supervisor.spawn(name, TaskPolicy::Essential, async move {
+        let start = |target: Target| {
+            let slot = Arc::new(Slot::new(target.copy.describe()));
+            let writer = Writer {
+                copy: target.copy,
+                slot: Arc::clone(&slot),
+                found: found.clone(),
+                is_read: target.is_read,
+                is_overtaken: false,
+                main_answers: answers.subscribe(),
+                failures: 0,
+                written: None,
+            };
+            let stop = supervisor.shutdown_token();
+            supervisor.spawn(format!("copy to {}", slot.place), TaskPolicy::Essential, async move {
                 tokio::select! {
                     () = writer.run() => {}
                     () = stop.cancelled() => {}
                 }
             });
-        }
+            slot
+        };
         Self {
-            slots,
+            slots: targets.into_iter().map(start).collect(),
             owed: Arc::default(),
             answers,
         }
@@ -211,43 +268,18 @@ impl fmt::Debug for Copies {
 struct Writer {
     copy: Arc<dyn LocalCopy>,
     slot: Arc<Slot>,
-    /// Of all copies, this one too.
-    all: Arc<[Arc<Slot>]>,
     found: mpsc::Sender<Found>,
     /// What the copy holds is known, or newer than nothing that is served.
     is_read: bool,
-    /// The copy holds what the next update is counted from.
-    is_current: bool,
     /// Another worker of the layer has written something newer, which is not read yet.
     is_overtaken: bool,
     main_answers: watch::Receiver<bool>,
     failures: u32,
-    /// What it was last written with.
+    /// What it was last written with; none after a failure.
     written: Option<Position>,
 }
 
 impl Writer {
-    fn new(
-        target: Target,
-        slot: Arc<Slot>,
-        all: Arc<[Arc<Slot>]>,
-        found: mpsc::Sender<Found>,
-        main_answers: watch::Receiver<bool>,
-    ) -> Self {
-        Self {
-            copy: target.copy,
-            slot,
-            all,
-            found,
-            is_read: target.is_read,
-            is_current: target.is_current,
-            is_overtaken: false,
-            main_answers,
-            failures: 0,
-            written: None,
-        }
-    }
-
     async fn run(mut self) {
         loop {
             if !self.is_read {
@@ -262,7 +294,7 @@ impl Writer {
                     () = self.slot.wake.notified() => {}
                     Ok(()) = self.main_answers.changed(), if self.is_overtaken => {}
                 },
-                Some(next) => self.write_one(next).await,
+                Some((next, number)) => self.write(next, number).await,
             }
         }
     }
@@ -301,29 +333,32 @@ impl Writer {
         self.recovered();
     }
 
-    /// Writes, and rests for as long as that one is to.
-    async fn write_one(&mut self, next: Next) {
+    /// Writes, and rests.
+    async fn write(&mut self, next: Update, number: u64) {
         if self.is_spared(&next) {
-            self.slot.finish(next.number);
+            self.slot.done.send_replace(number);
             return;
         }
         let began = Instant::now();
-        let written = self.write(&next).await;
-        self.is_current = written.is_ok();
+        let whole = Loaded {
+            position: next.position.clone(),
+            documents: next.state.all().map(|(_, held)| Arc::clone(&held.document)).collect(),
+            notes: Arc::clone(&next.notes),
+        };
+        let written = self.copy.replace(&whole).await;
         self.is_overtaken = matches!(written, Err(CopyError::Newer { .. }));
+        self.written = written.is_ok().then_some(whole.position);
         match written {
             Ok(()) => {
                 self.slot.written.fetch_add(1, Ordering::Relaxed);
                 self.recovered();
-                self.slot.finish(next.number);
-                self.written = Some(next.position);
-                if self.copy.writes_whole() {
-                    self.rest(began).await;
-                }
+                self.slot.done.send_replace(number);
+                self.pause((began.elapsed() * REST).clamp(REST_BOUNDS.0, REST_BOUNDS.1))
+                    .await;
             }
             // Another process of this layer writes it and has newer documents; notes of this one come with its next write.
             Err(CopyError::Newer { .. }) => {
-                self.slot.finish(next.number);
+                self.slot.done.send_replace(number);
             }
             Err(error) => {
                 self.slot.put_back(next);
@@ -333,68 +368,22 @@ impl Writer {
         }
     }
 
-    /// How long a copy rests that always writes everything. By time alone: whether another one holds the newest at this very
-    /// instant is chance.
-    async fn rest(&self, began: Instant) {
-        let wrote = Instant::now();
-        let rest = ((wrote - began) * REST).clamp(REST_BOUNDS.0, REST_BOUNDS.1);
-        let mut is_over = self.pause(rest).await;
-        while !is_over && wrote.elapsed() < REST_BESIDE && self.another_keeps_up() {
-            is_over = self.pause(REST_BOUNDS.0).await;
-        }
-    }
-
-    fn another_keeps_up(&self) -> bool {
-        let mut others = self.all.iter().filter(|slot| !Arc::ptr_eq(slot, &self.slot));
-        others.any(|slot| slot.error.lock().is_none() && slot.lag() < KEEPS_UP)
-    }
-
-    /// Waits, unless somebody waits for this copy; returns whether somebody does.
-    async fn pause(&self, pause: Duration) -> bool {
+    /// Waits, unless somebody waits for this copy.
+    async fn pause(&self, pause: Duration) {
         tokio::select! {
-            () = tokio::time::sleep(pause) => false,
-            () = self.slot.hurry.notified() => true,
+            () = tokio::time::sleep(pause) => {}
+            () = self.slot.hurry.notified() => {}
         }
     }
 
-    /// Whether a copy that always writes everything is spared a write for the time alone, which moves on every few seconds.
-    fn is_spared(&self, next: &Next) -> bool {
-        let has_same = !next.have_notes_changed && next.keys.as_ref().is_some_and(BTreeSet::is_empty);
-        let is_young = |written: &Position| {
-            let age_ms = next
-                .position
-                .as_of
-                .as_millis()
-                .saturating_sub(written.as_of.as_millis());
-            let is_same = (&written.store_id, written.revision) == (&next.position.store_id, next.position.revision);
-            is_same && u128::from(age_ms.unsigned_abs()) < MAX_AGE.as_millis()
+    /// Whether a write is spared that is for the time alone, which moves on every few seconds.
+    fn is_spared(&self, next: &Update) -> bool {
+        let Some(written) = self.written.as_ref().filter(|_| !next.has_changed) else {
+            return false;
         };
-        self.copy.writes_whole() && self.is_current && has_same && self.written.as_ref().is_some_and(is_young)
-    }
-
-    async fn write(&self, next: &Next) -> Result<(), CopyError> {
-        if let Some(keys) = next
-            .keys
-            .as_ref()
-            .filter(|_| self.is_current && !self.copy.writes_whole())
-        {
-            let document = |key: &Key| next.state.get(key).map(|held| Arc::clone(&held.document));
-            let puts: Vec<_> = keys.iter().filter_map(document).collect();
-            let is_gone = |key: &&Key| next.state.get(key).is_none();
-            let removes: Vec<Key> = keys.iter().filter(is_gone).cloned().collect();
-            let notes = next.have_notes_changed.then_some(&*next.notes);
-            match self.copy.advance(&next.position, &puts, &removes, notes).await {
-                // It has lost what it had, or never had it: no failure yet.
-                Err(CopyError::Behind { .. }) => {}
-                advanced => return advanced,
-            }
-        }
-        let whole = Loaded {
-            position: next.position.clone(),
-            documents: next.state.all().map(|(_, held)| Arc::clone(&held.document)).collect(),
-            notes: Arc::clone(&next.notes),
-        };
-        self.copy.replace(&whole).await
+        let age_ms = next.position.as_of.as_millis().saturating_sub(written.as_of.as_millis());
+        let is_same = (&written.store_id, written.revision) == (&next.position.store_id, next.position.revision);
+        is_same && u128::from(age_ms.unsigned_abs()) < MAX_AGE.as_millis()
     }
 
     /// It can be used, whatever was the matter before.

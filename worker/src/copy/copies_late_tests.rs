@@ -4,25 +4,13 @@ use super::*;
 
 /// With a copy that could not be read at the start, which holds this.
 fn unread(held: Loaded) -> (Fixture, mpsc::Receiver<Found>) {
-    let supervisor = Supervisor::new("test");
-    let fake = Arc::new(Fake {
+    let fake = Fake {
         is_away: true.into(),
         ..Fake::new("fake")
-    });
+    };
     *fake.held.lock() = Some(held);
-    let target = Target {
-        copy: Arc::clone(&fake) as Arc<dyn LocalCopy>,
-        is_current: false,
-        is_read: false,
-    };
     let (find, found) = mpsc::channel(1);
-    let copies = Copies::start(&supervisor, vec![target], &Arc::default(), &find);
-    let fixture = Fixture {
-        supervisor,
-        fake,
-        copies,
-        state: State::default(),
-    };
+    let fixture = Fixture::new(fake, false, &find);
     (fixture, found)
 }
 
@@ -41,11 +29,11 @@ async fn a_copy_that_could_not_be_read_is_read_before_it_is_written() {
         !fixture.copies.flush(Duration::from_secs(60)).await,
         "it is not taken into account yet"
     );
-    assert_eq!(fixture.calls(), (0, 0));
+    assert_eq!(fixture.writes(), 0);
     assert_eq!(fixture.copies.counts()[0].error, None);
     taken.send(()).unwrap();
     assert!(fixture.copies.flush(LONG).await);
-    assert_eq!((fixture.calls(), fixture.held().position), ((1, 0), position(6)));
+    assert_eq!((fixture.writes(), fixture.held().position), (1, position(6)));
 }
 
 #[tokio::test(start_paused = true)]
@@ -60,7 +48,7 @@ async fn what_is_newer_there_is_never_written_over_and_is_told() {
         one.taken.send(()).unwrap();
     }
     assert!(fixture.copies.flush(LONG).await, "nothing of it is missing there");
-    assert_eq!((fixture.calls(), fixture.held()), ((0, 0), loaded(5, [])));
+    assert_eq!((fixture.writes(), fixture.held()), (0, loaded(5, [])));
     assert_eq!(fixture.copies.counts()[0].failed, 0);
     fixture.put("b", 6);
     assert!(fixture.copies.flush(LONG).await);
@@ -87,5 +75,5 @@ async fn who_is_always_second_reads_only_when_the_main_service_is_gone() {
     fixture.copies.set_main_answers(false);
     tokio::time::sleep(LONG).await;
     assert!(found.try_recv().is_err());
-    assert_eq!(fixture.calls(), (0, 0));
+    assert_eq!(fixture.writes(), 0);
 }

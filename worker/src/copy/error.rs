@@ -59,16 +59,6 @@ pub enum CopyError {
         /// The newest that is known here.
         known: u64,
     },
-    /// A commit cannot be added to it: it is empty, of another store, newer, or somebody else has changed it.
-    #[error("{place} cannot go on to revision {revision}: {detail}")]
-    Behind {
-        /// Which copy.
-        place: String,
-        /// Revision of the commit.
-        revision: u64,
-        /// Why.
-        detail: String,
-    },
     /// It holds a later state of the same store, which nothing older replaces.
     #[error("{place} is at revision {held} of this store, so that {offered} is not written over it")]
     Newer {
@@ -98,7 +88,6 @@ impl CopyError {
             Self::Broken { .. } | Self::OtherKey { .. } | Self::OtherLayer { .. } | Self::NewerFormat { .. } => true,
             Self::Away { .. }
             | Self::Refused { .. }
-            | Self::Behind { .. }
             | Self::Newer { .. }
             | Self::Key { .. }
             | Self::Sealing => false,

@@ -4,11 +4,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use async_trait::async_trait;
-use blaze_domain::config::{Document, Key};
 use parking_lot::Mutex;
 use tokio::sync::{Notify, Semaphore};
 
-use super::{CopyError, Loaded, LocalCopy, Notes, Position, progress};
+use super::{CopyError, Loaded, LocalCopy};
 
 pub(crate) struct Fake {
     pub(super) name: &'static str,
@@ -18,8 +17,6 @@ pub(crate) struct Fake {
     /// Each call needs one.
     pub(super) permits: Semaphore,
     pub(super) replaced: AtomicUsize,
-    pub(super) advanced: AtomicUsize,
-    pub(super) is_whole: bool,
     /// Told before each call waits for its permit.
     pub(super) called: Notify,
 }
@@ -32,8 +29,6 @@ impl Fake {
             is_away: AtomicBool::new(false),
             permits: Semaphore::new(Semaphore::MAX_PERMITS),
             replaced: AtomicUsize::new(0),
-            advanced: AtomicUsize::new(0),
-            is_whole: false,
             called: Notify::new(),
         }
     }
@@ -67,32 +62,15 @@ impl LocalCopy for Fake {
     async fn replace(&self, whole: &Loaded) -> Result<(), CopyError> {
         self.call().await?;
         let mut held = self.held.lock();
-        progress::check_whole(held.as_ref().map(|held| &held.position), &whole.position, self.name)?;
+        if let Some(held) = &*held {
+            held.position.check_replaced_by(&whole.position, self.name)?;
+        }
         self.replaced.fetch_add(1, Ordering::Relaxed);
         *held = Some(whole.clone());
         Ok(())
     }
 
-    async fn advance(
-        &self,
-        position: &Position,
-        puts: &[Arc<Document>],
-        removes: &[Key],
-        notes: Option<&Notes>,
-    ) -> Result<(), CopyError> {
-        self.call().await?;
-        let mut held = self.held.lock();
-        let next = progress::advanced(held.clone(), position.clone(), puts, removes, notes.cloned(), self.name)?;
-        self.advanced.fetch_add(1, Ordering::Relaxed);
-        *held = Some(next);
-        Ok(())
-    }
-
     fn describe(&self) -> String {
         self.name.to_owned()
-    }
-
-    fn writes_whole(&self) -> bool {
-        self.is_whole
     }
 }

@@ -4,7 +4,6 @@ use serde_json::json;
 use tempfile::TempDir;
 
 use super::*;
-use crate::copy::aside::KEPT_ASIDE;
 use crate::copy::samples::{loaded, service, with_secret};
 
 fn layer(name: &str) -> LayerName {
@@ -92,4 +91,24 @@ async fn a_folder_that_is_not_there_is_named() {
         matches!(&error, CopyError::Refused { place, .. } if place.contains("missing")),
         "{error}"
     );
+}
+
+/// A process that is killed during the write has written the first bytes of the new file, or all of it and perhaps the rename.
+#[tokio::test]
+async fn a_write_that_ends_at_any_byte_leaves_the_old_or_the_new() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, new) = (folder.path().join(FILE_NAME), folder.path().join("last-known-good.new"));
+    let (old, next) = (loaded(7, [with_secret("slam", 7, "canary")]), loaded(8, []));
+    let vault = Vault::with_key([7; 32]);
+    let content = super::format::encode(&next, &vault).unwrap();
+    copy(&folder, vault.clone()).replace(&old).await.unwrap();
+    for length in 0..=content.len() {
+        fs::write(&new, &content[..length]).unwrap();
+        assert_eq!(copy(&folder, vault.clone()).load().await.unwrap().as_ref(), Some(&old));
+    }
+    fs::rename(&new, &path).unwrap();
+    assert_eq!(copy(&folder, vault.clone()).load().await.unwrap(), Some(next));
+    fs::write(&new, "rest").unwrap();
+    copy(&folder, vault).replace(&loaded(9, [])).await.unwrap();
+    assert_eq!(names(&folder), [FILE_NAME]);
 }

@@ -1,4 +1,4 @@
-//! A process that writes both copies of one folder is killed again and again, at no particular instant: what is found then
+//! A process that writes the file is killed again and again, at no particular instant: what is found then
 //! is one revision, whole, and none that was said to be written is missing.
 
 use std::io::{BufRead as _, BufReader};
@@ -6,12 +6,11 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 
-use blaze_runtime::Supervisor;
 use blaze_runtime::environment::variable;
 use serde_json::json;
 
 use super::samples::{loaded, notes, service};
-use super::{DATABASE_NAME, FileCopy, Loaded, LocalCopy, SqliteCopy, Vault};
+use super::{FileCopy, Loaded, LocalCopy, Vault};
 
 /// Names the folder to the process that is killed.
 const FOLDER: &str = "BLAZE_TEST_COPY_FOLDER";
@@ -29,32 +28,19 @@ fn at(revision: u64) -> Loaded {
     }
 }
 
-fn copies(folder: &Path, supervisor: &Supervisor) -> [Box<dyn LocalCopy>; 2] {
-    let (layer, vault) = (|| "edge".parse().unwrap(), Vault::with_key([7; 32]));
-    let database = SqliteCopy::new(folder.join(DATABASE_NAME), layer(), vault.clone(), supervisor);
-    [
-        Box::new(database.unwrap()),
-        Box::new(FileCopy::new(folder, layer(), vault)),
-    ]
+fn copy(folder: &Path) -> FileCopy {
+    FileCopy::new(folder, "edge".parse().unwrap(), Vault::with_key([7; 32]))
 }
 
-/// Not a test of its own: it writes until it is killed, and says each revision that both copies hold.
+/// Not a test of its own: it writes until it is killed, and says each revision that the file holds.
 #[tokio::test]
 async fn a_process_that_writes_until_it_is_killed() {
     let Some(folder) = variable(FOLDER) else { return };
-    let copies = copies(Path::new(&folder), &Supervisor::new("test"));
-    let found = copies[0].load().await.unwrap();
+    let copy = copy(Path::new(&folder));
+    let found = copy.load().await.unwrap();
     let start = found.map_or(0, |found| found.position.revision);
     for revision in start + 1.. {
-        let whole = at(revision);
-        for copy in &copies {
-            let all = (&whole.position, &whole.documents, Some(&*whole.notes));
-            if revision == 1 || revision % 3 == 0 || copy.writes_whole() {
-                copy.replace(&whole).await.unwrap();
-            } else {
-                copy.advance(all.0, all.1, &[], all.2).await.unwrap();
-            }
-        }
+        copy.replace(&at(revision)).await.unwrap();
         println!("\nwritten {revision}");
     }
 }
@@ -83,17 +69,10 @@ async fn a_process_that_is_killed_leaves_one_revision_whole() {
         last = written.take(usize::try_from(kill * 2).unwrap()).last().unwrap_or(last);
         child.kill().unwrap();
         child.wait().unwrap();
-        let supervisor = Supervisor::new("test");
-        for copy in copies(folder.path(), &supervisor) {
-            let found = copy.load().await.unwrap().unwrap();
-            let revision = found.position.revision;
-            assert!(
-                revision >= last,
-                "{} has {revision}, {last} was written",
-                copy.describe()
-            );
-            assert!(found == at(revision), "{} is not whole at {revision}", copy.describe());
-        }
+        let found = copy(folder.path()).load().await.unwrap().unwrap();
+        let revision = found.position.revision;
+        assert!(revision >= last, "it has {revision}, {last} was written");
+        assert!(found == at(revision), "it is not whole at {revision}");
     }
     assert!(last >= KILLS * (KILLS + 1), "it was written in between: {last}");
 }

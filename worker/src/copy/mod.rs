@@ -1,26 +1,24 @@
-//! The copy of the layer's view that outlives the process: a local database and a last-known-good file.
+//! The copy of the layer's view that outlives the process: one file, and a MongoDB where one is configured.
 //!
 //! ```text
-//!                      ┌─[newest state, coalesced]─▶ writer ──▶ SqliteCopy | MongoCopy      (local database)
+//!                      ┌─[newest state, coalesced]─▶ writer ──▶ FileCopy
 //! Replica ──▶ Copies ──┤
-//!                      └─[newest state, coalesced]─▶ writer ──▶ FileCopy                    (last-known-good file)
+//!                      └─[newest state, coalesced]─▶ writer ──▶ MongoCopy     (where the node file has `database.mongodb`)
 //!
-//! at the start:  local database, else last-known-good file  ([`choose`]), else mounted file  ([`defaults`])
+//! at the start:  the newer of both ([`choose`]), else the mounted file ([`defaults`])
 //! later:         a copy that could not be read at the start ──[Found]──▶ engine, before anything is written there
 //! ```
 //!
-//! A copy is never replaced by an older state of the same store: what was read in time may be older than what was not.
-//!
-//! A write is all or nothing: whoever dies in the middle of it leaves the old content or the new one, whole. Serving never
-//! waits for a write. A file that cannot be read is never written over: the first write moves it aside. In MongoDB a copy that
-//! is broken gives way, and one of a newer format stays and is not written.
+//! Both hold the same bytes (module `format`). A write replaces the whole copy and is all or nothing: a process that dies
+//! during a write leaves the old content or the new content. A copy is never replaced by an older state of the same store.
+//! Serving never waits for a write. An unreadable file is moved aside by the first write; an unreadable copy in MongoDB is
+//! replaced, except one of a newer format.
 //!
 //! # Secrets at rest
-//! In each copy alike, the text of a secret is there only encrypted under `worker.key_file`. Without such a key the texts
-//! are left out and the versions kept ([`Vault`]): the configuration has the same hash, and the worker asks the main
-//! service for everything again to have the texts ([`Loaded::lacks_secrets`]).
+//! With `worker.key_file` a copy is encrypted as a whole, but for its first line. Without a key the texts of secrets are
+//! left out and the versions stay ([`Vault`]): the configuration has the same hash, and the worker asks the main service
+//! for everything again to have the texts ([`Loaded::lacks_secrets`]).
 
-mod aside;
 #[cfg(test)]
 mod conformance;
 mod copies;
@@ -29,7 +27,7 @@ mod error;
 #[cfg(test)]
 pub(crate) mod fake;
 mod file;
-mod file_format;
+mod format;
 mod json;
 #[cfg(test)]
 mod kill_tests;
@@ -37,17 +35,10 @@ mod kill_tests;
 mod mongo;
 #[cfg(feature = "mongodb")]
 pub(crate) mod mongo_client;
-#[cfg(feature = "mongodb")]
-mod mongo_rows;
 mod notes;
-mod progress;
 #[cfg(test)]
 mod samples;
-mod slot;
-mod sqlite;
-mod sqlite_database;
 mod start;
-mod steps;
 mod vault;
 
 use std::fmt;
@@ -56,17 +47,16 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use blaze_domain::LayerName;
 use blaze_domain::config::secret::{self, Secret};
-use blaze_domain::config::{Document, Key, Timestamp};
+use blaze_domain::config::{Document, Timestamp};
 
-pub use copies::{Changed, Copies, Counts, Found, Target, Update};
+pub use copies::{Copies, Counts, Found, Target, Update};
 pub use error::CopyError;
 pub use file::{FILE_NAME, FileCopy};
 pub use json::{FormError, document_from_json};
 #[cfg(feature = "mongodb")]
 pub use mongo::MongoCopy;
 pub use notes::{MAX_FAILED, MAX_TOLD, Notes, Told};
-pub use sqlite::{DATABASE_NAME, SqliteCopy};
-pub use start::{DATABASE_LIMIT, Problem, Start, choose};
+pub use start::{DATABASE_LIMIT, Start, choose};
 pub use vault::Vault;
 
 /// How far a copy is.
@@ -91,6 +81,21 @@ impl Position {
         } else {
             self.as_of > other.as_of
         }
+    }
+
+    /// Whether a copy at this position may be replaced by a state at `next`.
+    ///
+    /// # Errors
+    /// [`CopyError::Newer`].
+    pub(crate) fn check_replaced_by(&self, next: &Self, place: &str) -> Result<(), CopyError> {
+        if self.store_id == next.store_id && self.revision > next.revision {
+            return Err(CopyError::Newer {
+                place: place.to_owned(),
+                held: self.revision,
+                offered: next.revision,
+            });
+        }
+        Ok(())
     }
 }
 
@@ -146,33 +151,15 @@ pub trait LocalCopy: Send + Sync {
     /// [`CopyError`].
     async fn load(&self) -> Result<Option<Loaded>, CopyError>;
 
-    /// Makes this the content, whatever was there before but a later state of the same store.
+    /// Makes this the content, unless a later state of the same store is there.
     ///
     /// # Errors
-    /// [`CopyError::Newer`] for that one; else [`CopyError`]: the old content is still there, or, where the answer was lost, the new one.
+    /// [`CopyError::Newer`] for a later state; else [`CopyError`]: the old content is still there or, where the answer was
+    /// lost, the new content.
     async fn replace(&self, whole: &Loaded) -> Result<(), CopyError>;
-
-    /// Takes over one or many commits at once: documents that are new or changed, and those that are gone. Notes that are
-    /// not given stay as they are.
-    ///
-    /// # Errors
-    /// [`CopyError::Behind`] if there is nothing of this store to go on from, or something newer: then [`Self::replace`].
-    /// Else as there.
-    async fn advance(
-        &self,
-        position: &Position,
-        puts: &[Arc<Document>],
-        removes: &[Key],
-        notes: Option<&Notes>,
-    ) -> Result<(), CopyError>;
 
     /// What it is, for people: kind and place, no password.
     fn describe(&self) -> String;
-
-    /// Whether [`Self::advance`] costs as much as [`Self::replace`], so that whoever has everything at hand gives everything.
-    fn writes_whole(&self) -> bool {
-        false
-    }
 }
 
 #[cfg(test)]

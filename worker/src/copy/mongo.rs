@@ -1,48 +1,35 @@
 //! The copy in a MongoDB, standalone or replica set: no transactions.
 //!
 //! ```text
-//! replace   rows of a new generation ─▶ head: this generation, turn 1 ─▶ delete rows of earlier generations
-//! advance   rows at turn n+1         ─▶ head: turn n to n+1           ─▶ delete rows of these keys before n+1
-//!           (deletions as rows without text)                             ─▶ delete the rows without text
-//! load      head ─▶ rows of its generation; of each key the one with the highest turn up to the head's ─▶ head again
+//! replace   chunks of a new generation ─▶ head: from the old generation to this one ─▶ delete chunks of earlier ones
+//! load      head ─▶ chunks of its generation ─▶ head again
 //! ```
 //!
-//! The head moves by one update of one document, which MongoDB does wholly or not at all. Before it, a reader takes the old
-//! rows, for the new ones have a generation or turn that the head does not name; after it, the new ones, for of two rows
-//! of one key the later counts. Deleting only removes what no head names any more, the rows without text last: a row that
-//! is still there is never again the newest of its key.
-//!
-//! A write whose answer is lost may reach the server late. So after a failure, and after a start, the next write is a
-//! `replace`, with a generation of its own: rows that come late belong to one that counts no more, and a head that comes
-//! late finds a newer generation and changes nothing. Generations begin with the time, later than that of the head.
-//!
-//! A head that names a later revision of the same store stays: another process wrote it, or this one in an earlier life.
+//! The head moves by one update of one document, which MongoDB does wholly or not at all, and only from the generation that
+//! was there before. So a write that reaches the server late changes nothing, and of two workers that write at once one
+//! tries again. Deleting only removes generations that no head names any more. Generations begin with the time, later than
+//! that of the head.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use async_trait::async_trait;
-use blaze_domain::config::{self, Key};
+use blaze_domain::config::Timestamp;
 use blaze_domain::node_file::SecretText;
 use blaze_domain::{LayerName, NodeName};
 use futures::TryStreamExt as _;
-use mongodb::bson::{Document, doc};
+use mongodb::bson::spec::BinarySubtype;
+use mongodb::bson::{Binary, Bson, Document, doc};
 use mongodb::options::{ReadPreference, SelectionCriteria};
-use tokio::sync::Mutex;
 
 use super::mongo_client::{Server, Tables, is_duplicate};
-use super::mongo_rows::{self as rows, Head, NOTES, Row};
-use super::steps::Steps;
-use super::{CopyError, Loaded, LocalCopy, Notes, Position, Vault, json, progress};
+use super::{CopyError, Loaded, LocalCopy, Position, Vault, format};
 
-/// Rows and bytes of one insertion.
-const ROWS: usize = 500;
-const BYTES: usize = 4 * 1024 * 1024;
-/// Keys whose old rows one operation deletes.
-const KEYS: usize = 200;
-/// How often the rows are read again when the head moves meanwhile.
+/// Bytes of a chunk; a document has at most 16 MiB.
+const CHUNK_BYTES: usize = 8 * 1024 * 1024;
+/// How often the chunks are read again when the head moves meanwhile.
 const TRIES: usize = 3;
+
 /// The copy in a MongoDB. It is connected to at the first use. Several workers may share a database: each has a copy of its
 /// own, by layer and node.
 pub struct MongoCopy {
@@ -50,17 +37,7 @@ pub struct MongoCopy {
     copy: String,
     place: String,
     layer: LayerName,
-    vault: Vault,
-    steps: Steps,
-    rows_at_once: usize,
-    /// Held during a write. What this process wrote last; none at the start and after a failure.
-    written: Mutex<Option<Written>>,
-}
-
-struct Written {
-    generation: String,
-    turn: i64,
-    keys: BTreeSet<Key>,
+    vault: Arc<Vault>,
 }
 
 impl MongoCopy {
@@ -75,7 +52,7 @@ impl MongoCopy {
         node: Option<&NodeName>,
         vault: Vault,
     ) -> Result<Self, CopyError> {
-        // Names have no dot and no slash, so no two copies have the same name and none begins as another's rows do.
+        // Names have no dot and no slash: no two copies have one name, and no name begins as the chunks of another copy do.
         let copy = node.map_or_else(|| layer.to_string(), |node| format!("{layer}.{node}"));
         let place = format!("MongoDB {database}, copy {copy}");
         Ok(Self {
@@ -83,28 +60,11 @@ impl MongoCopy {
             place,
             copy,
             layer,
-            vault,
-            steps: Steps::default(),
-            rows_at_once: ROWS,
-            written: Mutex::new(None),
+            vault: Arc::new(vault),
         })
     }
 
-    #[cfg(test)]
-    pub(super) fn crashing_after(mut self, steps: usize) -> Self {
-        self.steps = Steps::crash_after(steps);
-        self.rows_at_once = 1;
-        self
-    }
-
-    fn broken(&self, detail: impl std::fmt::Display) -> CopyError {
-        CopyError::Broken {
-            place: self.place.clone(),
-            detail: detail.to_string(),
-        }
-    }
-
-    /// The head record. `preference` is who may answer: at the start also a member that is not the primary.
+    /// The head record. `preference`: which members may answer; at the start also one that is not the primary.
     async fn head(&self, tables: &Tables, preference: ReadPreference) -> Result<Option<Document>, CopyError> {
         let find = tables.head.find_one(doc! { "_id": &self.copy });
         self.server
@@ -112,196 +72,81 @@ impl MongoCopy {
             .await
     }
 
-    async fn insert(&self, tables: &Tables, generation: &str, turn: i64, all: &[Row]) -> Result<(), CopyError> {
-        let mut left = all;
-        while !left.is_empty() {
-            let mut bytes = 0;
-            let fits = |row: &&Row| {
-                bytes += row.text.as_ref().map_or(0, String::len) + 256;
-                bytes <= BYTES
-            };
-            let count = left.iter().take(self.rows_at_once).take_while(fits).count().max(1);
-            let (now, rest) = left.split_at(count.min(left.len()));
-            left = rest;
-            self.steps.pass()?;
-            let documents = now.iter().map(|row| rows::write_row(&self.copy, generation, turn, row));
-            self.server
-                .limited(tables.documents.insert_many(documents).ordered(false))
-                .await?;
+    /// Whether a copy with this head may be replaced.
+    fn check(&self, head: &Document, next: &Position) -> Result<(), CopyError> {
+        let number = |name: &str| integer(head, name).and_then(|number| u64::try_from(number).ok());
+        let format = number("format").unwrap_or(0);
+        // An older version would lose what the newer one keeps there.
+        if format > format::FORMAT {
+            return Err(CopyError::NewerFormat {
+                place: self.place.clone(),
+                found: format,
+                known: format::FORMAT,
+            });
         }
-        Ok(())
+        let held = Position {
+            store_id: head.get_str("store_id").unwrap_or_default().to_owned(),
+            layer: next.layer.clone(),
+            revision: number("revision").unwrap_or(0),
+            as_of: Timestamp::default(),
+        };
+        held.check_replaced_by(next, &self.place)
     }
 
-    async fn delete(&self, tables: &Tables, filter: Document) -> Result<(), CopyError> {
-        self.steps.pass()?;
-        self.server
-            .limited(tables.documents.delete_many(filter))
-            .await
-            .map(|_| ())
+    async fn chunks(&self, tables: &Tables, generation: &str) -> Result<Vec<u8>, CopyError> {
+        let read = async {
+            let nearest = SelectionCriteria::ReadPreference(primary_preferred());
+            let find = tables.chunks.find(of_generation(&self.copy, generation));
+            let mut cursor = find.sort(doc! { "_id": 1 }).selection_criteria(nearest).await?;
+            let mut content = Vec::new();
+            while let Some(chunk) = cursor.try_next().await? {
+                // What is missing or has another form does not fit the hash.
+                content.extend_from_slice(chunk.get_binary_generic("data").map_or(&[][..], |data| data));
+            }
+            Ok(content)
+        };
+        self.server.limited(read).await
     }
 
-    fn row(&self, document: &Arc<config::Document>) -> Result<Row, CopyError> {
-        Ok(Row {
-            key: document.key.to_string(),
-            text: Some(self.vault.seal(document)?.to_json().to_string()),
-        })
-    }
-
-    async fn write_whole(&self, whole: &Loaded) -> Result<Written, CopyError> {
-        let mut all = vec![notes_row(&whole.notes)];
-        for document in &whole.documents {
-            all.push(self.row(document)?);
-        }
+    async fn write(&self, content: &[u8], position: &Position) -> Result<(), CopyError> {
         let tables = self.server.tables().await?;
         let present = self.head(&tables, ReadPreference::Primary).await?;
-        match present.as_ref().map(|present| rows::read_head(present, &self.place)) {
-            // An older version would lose what the newer one keeps there.
-            Some(Err(error @ CopyError::NewerFormat { .. })) => return Err(error),
-            Some(Ok(held)) => progress::check_whole(Some(&held.position), &whole.position, &self.place)?,
-            Some(Err(_)) | None => {}
+        if let Some(present) = &present {
+            self.check(present, position)?;
         }
-        let present = present.as_ref().and_then(|present| present.get_str("generation").ok());
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let generation = rows::new_generation(u64::try_from(now.as_millis()).unwrap_or(0), present);
-        self.insert(&tables, &generation, 1, &all).await?;
-        let head = Head {
-            generation: generation.clone(),
-            turn: 1,
-            documents: count(whole.documents.len()),
-            position: whole.position.clone(),
+        let before = present.as_ref().and_then(|present| present.get("generation"));
+        let generation = new_generation(now_ms(), before.and_then(Bson::as_str));
+        for (number, chunk) in content.chunks(CHUNK_BYTES).enumerate() {
+            let data = Binary {
+                subtype: BinarySubtype::Generic,
+                bytes: chunk.to_vec(),
+            };
+            let chunk = doc! { "_id": format!("{}/{generation}/{number:08x}", self.copy), "data": data };
+            self.server.limited(tables.chunks.insert_one(chunk)).await?;
+        }
+        let revision = i64::try_from(position.revision).unwrap_or(i64::MAX);
+        let head = doc! {
+            "format": i64::try_from(format::FORMAT).unwrap_or(i64::MAX), "generation": &generation,
+            "store_id": &position.store_id, "revision": revision,
         };
-        self.steps.pass()?;
-        let update = doc! { "$set": rows::write_head(&head) };
-        let older = rows::older_head(&self.copy, &head);
-        let moved = tables.head.update_one(older, update).upsert(true);
+        // `null` also matches a head that has none.
+        let from = doc! { "_id": &self.copy, "generation": before.cloned().unwrap_or(Bson::Null) };
+        let moved = tables.head.update_one(from, doc! { "$set": head }).upsert(true);
         match self.server.within(moved).await? {
-            Err(error) if is_duplicate(&error) => return Err(self.taken(&whole.position)),
-            moved => moved.map_err(|error| self.server.failed(&error)).map(|_| ())?,
-        }
-        self.delete(&tables, rows::of_earlier(&self.copy, &generation)).await?;
-        Ok(Written {
-            generation,
-            turn: 1,
-            keys: whole.documents.iter().map(|document| document.key.clone()).collect(),
-        })
-    }
-
-    /// Another process writes this copy.
-    fn taken(&self, position: &Position) -> CopyError {
-        CopyError::Behind {
-            place: self.place.clone(),
-            revision: position.revision,
-            detail: "another worker of this layer and node has written it meanwhile".to_owned(),
-        }
-    }
-
-    async fn write_commits(
-        &self,
-        mut written: Written,
-        position: &Position,
-        (puts, removes): (&[Arc<config::Document>], &[Key]),
-        notes: Option<&Notes>,
-    ) -> Result<Written, CopyError> {
-        let mut all: Vec<Row> = notes.map(notes_row).into_iter().collect();
-        for document in puts {
-            all.push(self.row(document)?);
-            written.keys.insert(document.key.clone());
-        }
-        let is_put: BTreeSet<&Key> = puts.iter().map(|document| &document.key).collect();
-        let mut gone = Vec::new();
-        for key in removes.iter().filter(|key| !is_put.contains(key)) {
-            // What was not there needs no row.
-            if written.keys.remove(key) {
-                let (key, text) = (key.to_string(), None);
-                gone.push(Row { key, text });
+            Ok(_) => {}
+            Err(error) if is_duplicate(&error) => {
+                return Err(CopyError::Away {
+                    place: self.place.clone(),
+                    detail: "another worker of this layer and node has written it meanwhile".to_owned(),
+                });
             }
+            Err(error) => return Err(self.server.failed(&error)),
         }
-        let gone_at = all.len();
-        all.append(&mut gone);
-        let tables = self.server.tables().await?;
-        let (generation, turn) = (written.generation.as_str(), written.turn + 1);
-        self.insert(&tables, generation, turn, &all).await?;
-        let head = Head {
-            generation: generation.to_owned(),
-            turn,
-            documents: count(written.keys.len()),
-            position: position.clone(),
-        };
-        self.steps.pass()?;
-        let here = doc! { "_id": &self.copy, "generation": generation, "turn": written.turn };
-        let update = doc! { "$set": rows::write_head(&head) };
-        let moved = self.server.limited(tables.head.update_one(here, update)).await?;
-        if moved.matched_count != 1 {
-            return Err(self.taken(position));
-        }
-        for some in all.chunks(KEYS) {
-            let old = some
-                .iter()
-                .map(|row| rows::before_turn(&self.copy, generation, &row.key, turn));
-            self.delete(&tables, doc! { "$or": old.collect::<Vec<_>>() }).await?;
-        }
-        // Only now: before, one of them may have hidden an older row.
-        for some in all.get(gone_at..).unwrap_or_default().chunks(KEYS) {
-            let ids = some
-                .iter()
-                .map(|row| rows::row_id(&self.copy, generation, &row.key, turn));
-            self.delete(&tables, doc! { "_id": { "$in": ids.collect::<Vec<_>>() } })
-                .await?;
-        }
-        written.turn = turn;
-        Ok(written)
-    }
-
-    /// The rows that count, by key.
-    async fn rows(&self, tables: &Tables, head: &Head) -> Result<BTreeMap<String, String>, CopyError> {
-        let read = async {
-            let find = tables.documents.find(rows::of_generation(&self.copy, &head.generation));
-            let nearest = SelectionCriteria::ReadPreference(primary_preferred());
-            let mut cursor = find.sort(doc! { "_id": 1 }).selection_criteria(nearest).await?;
-            let mut found = BTreeMap::new();
-            let mut strange = 0_usize;
-            while let Some(row) = cursor.try_next().await? {
-                match rows::read_row(&row, &self.copy, &head.generation) {
-                    Some((_, turn, _)) if turn > head.turn => {}
-                    // They come in the order of their turns.
-                    Some((key, _, Some(text))) => drop(found.insert(key.to_owned(), text.to_owned())),
-                    Some((key, _, None)) => drop(found.remove(key)),
-                    None => strange += 1,
-                }
-            }
-            Ok((found, strange))
-        };
-        match self.server.limited(read).await? {
-            (found, 0) => Ok(found),
-            (_, strange) => Err(self.broken(format_args!("{strange} rows have another form"))),
-        }
-    }
-
-    fn read(&self, head: Head, mut found: BTreeMap<String, String>) -> Result<Loaded, CopyError> {
-        let notes = found
-            .remove(NOTES)
-            .ok_or_else(|| self.broken("its notes are missing"))?;
-        if count(found.len()) != head.documents {
-            return Err(self.broken(format_args!("it has {} documents of {}", found.len(), head.documents)));
-        }
-        let notes = json::value_from_text(notes.as_bytes()).and_then(json::notes_from_json);
-        let mut documents = Vec::with_capacity(found.len());
-        let mut lost = 0;
-        for text in found.into_values() {
-            let document = json::document_from_text(text.as_bytes()).map_err(|error| self.broken(error))?;
-            let (document, unopened) = self.vault.open(document);
-            lost += unopened;
-            documents.push(Arc::new(document));
-        }
-        if lost > 0 {
-            tracing::warn!(copy = self.place, lost, "secrets of the local database do not open");
-        }
-        documents.sort_by(|one, other| one.key.cmp(&other.key));
-        Ok(Loaded {
-            position: head.position,
-            documents,
-            notes: Arc::new(notes.map_err(|error| self.broken(error))?),
-        })
+        let earlier = of_earlier(&self.copy, &generation);
+        self.server
+            .limited(tables.chunks.delete_many(earlier))
+            .await
+            .map(|_| ())
     }
 }
 
@@ -311,20 +156,13 @@ impl LocalCopy for MongoCopy {
         let tables = self.server.tables().await?;
         let mut before = self.head(&tables, primary_preferred()).await?;
         for _ in 0..TRIES {
-            let Some(found) = before else { return Ok(None) };
-            let head = rows::read_head(&found, &self.place)?;
-            if head.position.layer != self.layer {
-                return Err(CopyError::OtherLayer {
-                    place: self.place.clone(),
-                    found: head.position.layer,
-                    wanted: self.layer.clone(),
-                });
-            }
-            let all = self.rows(&tables, &head).await;
-            // Rows that the head names are deleted only after it has moved.
+            let Some(head) = before else { return Ok(None) };
+            let generation = head.get_str("generation").unwrap_or_default();
+            let content = self.chunks(&tables, generation).await;
+            // Chunks that the head names are deleted only after it has moved.
             let after = self.head(&tables, primary_preferred()).await?;
-            if after.as_ref() == Some(&found) {
-                return self.read(head, all?).map(Some);
+            if after.as_ref() == Some(&head) {
+                return format::decode(&content?, &self.place, &self.layer, &self.vault).map(Some);
             }
             before = after;
         }
@@ -335,34 +173,10 @@ impl LocalCopy for MongoCopy {
     }
 
     async fn replace(&self, whole: &Loaded) -> Result<(), CopyError> {
-        let mut written = self.written.lock().await;
-        // Also when this future is dropped halfway, the next write has a generation of its own.
-        *written = None;
-        *written = Some(self.write_whole(whole).await?);
-        Ok(())
-    }
-
-    async fn advance(
-        &self,
-        position: &Position,
-        puts: &[Arc<config::Document>],
-        removes: &[Key],
-        notes: Option<&Notes>,
-    ) -> Result<(), CopyError> {
-        let mut held = self.written.lock().await;
-        let Some(written) = held.take() else {
-            return Err(CopyError::Behind {
-                place: self.place.clone(),
-                revision: position.revision,
-                detail: "the first write, and the one after a failure, writes everything".to_owned(),
-            });
-        };
-        let tables = self.server.tables().await?;
-        let head = self.head(&tables, ReadPreference::Primary).await?;
-        let head = head.map(|head| rows::read_head(&head, &self.place)).transpose()?;
-        progress::check(head.as_ref().map(|head| &head.position), position, &self.place)?;
-        *held = Some(self.write_commits(written, position, (puts, removes), notes).await?);
-        Ok(())
+        let (copied, vault) = (whole.clone(), Arc::clone(&self.vault));
+        let encoded = tokio::task::spawn_blocking(move || format::encode(&copied, &vault)).await;
+        let content = encoded.unwrap_or(Err(CopyError::Sealing))?;
+        self.write(&content, &whole.position).await
     }
 
     fn describe(&self) -> String {
@@ -374,15 +188,35 @@ fn primary_preferred() -> ReadPreference {
     ReadPreference::PrimaryPreferred { options: None }
 }
 
-fn notes_row(notes: &Notes) -> Row {
-    Row {
-        key: NOTES.to_owned(),
-        text: Some(json::notes_to_json(notes).to_string()),
-    }
+fn now_ms() -> u64 {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(now.as_millis()).unwrap_or(0)
 }
 
-fn count(length: usize) -> i64 {
-    i64::try_from(length).unwrap_or(i64::MAX)
+/// A generation that sorts behind those that began earlier. `after` is the present one, for clocks may go back.
+fn new_generation(now_ms: u64, after: Option<&str>) -> String {
+    let known = after.and_then(|text| u64::from_str_radix(text.split('-').next()?, 16).ok());
+    let start = known.map_or(now_ms, |known| now_ms.max(known.saturating_add(1)));
+    format!("{start:016x}-{:016x}", rand::random::<u64>())
+}
+
+/// Filter for all chunks of a generation. `0` is the character after `/`.
+fn of_generation(copy: &str, generation: &str) -> Document {
+    doc! { "_id": { "$gte": format!("{copy}/{generation}/"), "$lt": format!("{copy}/{generation}0") } }
+}
+
+/// Filter for all chunks of earlier generations.
+fn of_earlier(copy: &str, generation: &str) -> Document {
+    doc! { "_id": { "$gte": format!("{copy}/"), "$lt": format!("{copy}/{generation}/") } }
+}
+
+/// In any width, as tools that copy databases do not keep it.
+fn integer(found: &Document, name: &str) -> Option<i64> {
+    match found.get(name) {
+        Some(Bson::Int64(value)) => Some(*value),
+        Some(Bson::Int32(value)) => Some(i64::from(*value)),
+        _ => None,
+    }
 }
 
 #[cfg(test)]

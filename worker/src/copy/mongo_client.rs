@@ -37,7 +37,7 @@ pub(crate) struct Server {
 #[derive(Clone)]
 pub(crate) struct Tables {
     pub(crate) head: Collection<Document>,
-    pub(crate) documents: Collection<Document>,
+    pub(crate) chunks: Collection<Document>,
     pub(crate) leases: Collection<Document>,
 }
 
@@ -92,7 +92,7 @@ impl Server {
         let database = client.database_with_options(&self.database, options);
         let tables = Tables {
             head: database.collection("head"),
-            documents: database.collection("documents"),
+            chunks: database.collection("chunks"),
             leases: database.collection("leases"),
         };
         Ok(held.insert(tables).clone())

@@ -32,3 +32,28 @@ async fn a_server_that_is_away_is_no_broken_copy_and_its_password_is_not_told() 
     assert!(matches!(error, CopyError::Away { .. }), "{error}");
     assert!(!error.to_string().contains("canary"), "{error}");
 }
+
+#[test]
+fn chunks_of_one_copy_or_generation_are_apart_from_others() {
+    let within = |filter: &Document, id: &str| {
+        let range = filter.get_document("_id").unwrap();
+        (range.get_str("$gte").unwrap()..range.get_str("$lt").unwrap()).contains(&id)
+    };
+    let (one, two) = (new_generation(5, None), new_generation(6, None));
+    let id = |copy: &str, generation: &str| format!("{copy}/{generation}/00000003");
+    assert!(within(&of_generation("edge", &one), &id("edge", &one)));
+    assert!(!within(&of_generation("edge", &one), &id("edge", &two)));
+    assert!(within(&of_earlier("edge", &two), &id("edge", &one)));
+    for (copy, generation) in [("edge", &two), ("edge.robot-1", &one), ("edge-1", &one), ("e", &one)] {
+        assert!(!within(&of_earlier("edge", &two), &id(copy, generation)), "{copy}");
+    }
+}
+
+#[test]
+fn a_new_generation_sorts_behind_the_present_one_whatever_the_clock_says() {
+    let present = new_generation(1_000, None);
+    for now in [0, 999, 1_000, 1_001] {
+        assert!(new_generation(now, Some(&present)) > present);
+    }
+    assert!(new_generation(1, Some("nonsense")) > new_generation(0, None));
+}

@@ -1,14 +1,7 @@
-//! Secrets at rest, under `worker.key_file`.
+//! The key of the copies, `worker.key_file`.
 //!
-//! ```text
-//! {"$secret":…} ──[seal]──▶ with a key:    {"$secret":{"key":"worker.key_file","nonce":salt,"data":…,"version":n}}
-//!                           without a key: {"$secret":{"redacted":true,"version":n}}
-//!               ◀─[open]──  with the key:  as it was; else redacted, and counted
-//! ```
-//!
-//! Each secret and each file gets a key of its own, derived by HKDF-SHA256 from the key of the file and 32 random bytes.
-//! So no number of writes, with however many secrets, comes near the limit that random nonces of 96 bits would have.
-//! A secret is bound to kind, service, name and uid of its document, and does not open in another one.
+//! Each write of a copy has a key of its own, derived by HKDF-SHA256 from the key of the file and 32 random bytes. So no
+//! number of writes comes near the limit that random nonces of 96 bits would have.
 
 use std::fmt;
 use std::path::Path;
@@ -19,12 +12,9 @@ use aws_lc_rs::hkdf::{HKDF_SHA256, Salt};
 use aws_lc_rs::hmac;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use blaze_domain::ServiceName;
-use blaze_domain::config::secret::{self, Secret};
-use blaze_domain::config::{Document, Key};
+use blaze_domain::config::{Document, secret};
 use blaze_runtime::state::read_small;
-use serde_json::Value;
-use zeroize::Zeroizing;
+use zeroize::{Zeroize as _, Zeroizing};
 
 use super::CopyError;
 
@@ -33,12 +23,9 @@ pub(super) const KEY_BYTES: usize = 32;
 /// Bytes of what a derived key is made with.
 pub(super) const SALT_BYTES: usize = 32;
 /// Bytes that something encrypted has more.
-pub(super) const TAG_BYTES: usize = 16;
-/// By which secrets that are encrypted here are known. No key of a main service has such an id: it is no name.
-const OWN: &str = "worker.key_file";
-/// What a derived key is for: one for this is none for that.
-const FOR_SECRETS: &[u8] = b"blaze worker copy: secret";
-const FOR_FILES: &[u8] = b"blaze worker copy: file";
+const TAG_BYTES: usize = 16;
+/// Purpose of a derived key.
+const FOR_COPIES: &[u8] = b"blaze worker copy: whole";
 const FOR_ID: &[u8] = b"blaze worker copy: id";
 
 /// The key of the copies, or none. Clones share it.
@@ -92,93 +79,45 @@ impl Vault {
         self.master.as_ref().map(|master| master.id.as_str())
     }
 
-    /// The key of one file; `None` without a key.
+    /// The document as it may be written: without a key the texts of secrets are left out.
+    pub(super) fn writable(&self, document: &Arc<Document>) -> Arc<Document> {
+        let has_secret = secret::contains(&document.spec) || document.status.as_ref().is_some_and(secret::contains);
+        if self.master.is_some() || !has_secret {
+            return Arc::clone(document);
+        }
+        let mut out = (**document).clone();
+        out.spec = Arc::new(secret::redact(&document.spec).into_owned());
+        out.status = document.status.as_ref().map(|status| secret::redact(status).into_owned());
+        Arc::new(out)
+    }
+
+    /// Encrypts a copy, bound to its first line; without a key it stays as it is.
     ///
     /// # Errors
     /// [`CopyError::Sealing`].
-    pub(super) fn file_key(&self, salt: &[u8; SALT_BYTES]) -> Result<Option<LessSafeKey>, CopyError> {
-        let master = self.master.as_ref();
-        master.map(|master| master.derive(salt, FOR_FILES)).transpose()
+    pub(super) fn encrypt(&self, salt: &[u8; SALT_BYTES], header: &[u8], body: &mut Vec<u8>) -> Result<(), CopyError> {
+        let Some(master) = &self.master else { return Ok(()) };
+        // Room for the tag from the start: bytes that grow leave a copy of the texts behind.
+        let mut room = Vec::with_capacity(body.len() + TAG_BYTES);
+        room.extend_from_slice(body);
+        body.zeroize();
+        *body = room;
+        master
+            .derive(salt)?
+            .seal_in_place_append_tag(only_nonce(), Aad::from(header), body)
+            .map_err(|_| CopyError::Sealing)
     }
 
-    /// The document as it may be written. The same one if it has no secret.
+    /// Decrypts what [`Self::encrypt`] has encrypted under the same key.
     ///
     /// # Errors
     /// [`CopyError::Sealing`].
-    pub fn seal(&self, document: &Arc<Document>) -> Result<Arc<Document>, CopyError> {
-        let mut failed = None;
-        let sealed = with_secrets(document, &mut |secret| match self.sealed(document, secret) {
-            Ok(sealed) => sealed,
-            Err(error) => {
-                failed = Some(error);
-                // Not written: the error is what comes of it.
-                None
-            }
-        });
-        failed.map_or(Ok(sealed), Err)
-    }
-
-    fn sealed(&self, document: &Document, secret: &Value) -> Result<Option<Value>, CopyError> {
-        let version = match Secret::of(secret) {
-            Some(Ok(Secret::Redacted { .. })) => return Ok(None),
-            // Encrypted by somebody else, it needs no more.
-            Some(Ok(Secret::Stored { key, .. })) if key != OWN => return Ok(None),
-            Some(Ok(other)) => other.version(),
-            Some(Err(_)) | None => 0,
-        };
-        let Some(master) = &self.master else {
-            return Ok(Some(Secret::Redacted { version }.to_json()));
-        };
-        let salt = new_salt()?;
-        // The whole value, so that it is afterwards in the same form.
-        let mut bytes = Zeroizing::new(secret.to_string().into_bytes());
-        // Room for the tag from the start: bytes that grow leave a copy of the text behind.
-        let mut room = Zeroizing::new(Vec::with_capacity(bytes.len() + TAG_BYTES));
-        room.append(&mut bytes);
-        let key = master.derive(&salt, FOR_SECRETS)?;
-        key.seal_in_place_append_tag(only_nonce(), Aad::from(binding(document)), &mut *room)
-            .map_err(|_| CopyError::Sealing)?;
-        let stored = Secret::Stored {
-            key: OWN,
-            nonce: &STANDARD.encode(salt),
-            data: &STANDARD.encode(&*room),
-            version,
-        };
-        Ok(Some(stored.to_json()))
-    }
-
-    /// The document as it was before it was sealed, and how many of its secrets do not open: these are redacted.
-    #[must_use]
-    pub fn open(&self, document: Document) -> (Document, usize) {
-        let mut lost = 0;
-        let document = Arc::new(document);
-        let opened = with_secrets(&document, &mut |secret| {
-            let Some(Ok(Secret::Stored {
-                key: OWN,
-                nonce,
-                data,
-                version,
-            })) = Secret::of(secret)
-            else {
-                return None;
-            };
-            let text = self.opened(&document, nonce, data);
-            if text.is_none() {
-                lost += 1;
-            }
-            Some(text.unwrap_or_else(|| Secret::Redacted { version }.to_json()))
-        });
-        drop(document);
-        (Arc::unwrap_or_clone(opened), lost)
-    }
-
-    fn opened(&self, document: &Document, salt: &str, data: &str) -> Option<Value> {
-        let salt: [u8; SALT_BYTES] = STANDARD.decode(salt).ok()?.try_into().ok()?;
-        let key = self.master.as_ref()?.derive(&salt, FOR_SECRETS).ok()?;
-        let mut bytes = Zeroizing::new(STANDARD.decode(data).ok()?);
-        let bound = Aad::from(binding(document));
-        let text = key.open_in_place(only_nonce(), bound, &mut bytes).ok()?;
-        serde_json::from_slice(text).ok()
+    pub(super) fn decrypt(&self, salt: &[u8; SALT_BYTES], header: &[u8], body: &mut Vec<u8>) -> Result<(), CopyError> {
+        let master = self.master.as_ref().ok_or(CopyError::Sealing)?;
+        let opened = master.derive(salt)?.open_in_place(only_nonce(), Aad::from(header), body);
+        let length = opened.map_err(|_| CopyError::Sealing)?.len();
+        body.truncate(length);
+        Ok(())
     }
 }
 
@@ -190,9 +129,9 @@ impl fmt::Debug for Vault {
 }
 
 impl Master {
-    fn derive(&self, salt: &[u8; SALT_BYTES], purpose: &[u8]) -> Result<LessSafeKey, CopyError> {
+    fn derive(&self, salt: &[u8; SALT_BYTES]) -> Result<LessSafeKey, CopyError> {
         let drawn = Salt::new(HKDF_SHA256, salt).extract(&*self.key);
-        let purposes = [purpose];
+        let purposes = [FOR_COPIES];
         let key = drawn.expand(&purposes, &AES_256_GCM).map_err(|_| CopyError::Sealing)?;
         Ok(LessSafeKey::new(UnboundKey::from(key)))
     }
@@ -213,106 +152,45 @@ fn only_nonce() -> Nonce {
     Nonce::assume_unique_for_key([0; 12])
 }
 
-/// What a secret belongs to. None of the parts but the last can hold the separator.
-fn binding(document: &Document) -> Vec<u8> {
-    let key: &Key = &document.key;
-    let service = key.service_name().map_or("", ServiceName::as_str);
-    [key.kind().as_str(), service, key.name().as_str(), &document.uid]
-        .join("\0")
-        .into_bytes()
-}
-
-/// The document with something else in place of its secrets; where `change` gives `None`, the secret stays.
-fn with_secrets(document: &Arc<Document>, change: &mut impl FnMut(&Value) -> Option<Value>) -> Arc<Document> {
-    let status_has = document.status.as_ref().is_some_and(secret::contains);
-    if !secret::contains(&document.spec) && !status_has {
-        return Arc::clone(document);
-    }
-    let mut changed = |value: &Value| {
-        let mut value = value.clone();
-        secret::map(&mut value, &mut |_, secret| change(secret));
-        value
-    };
-    let mut out = (**document).clone();
-    out.spec = Arc::new(changed(&document.spec));
-    out.status = document.status.as_ref().map(&mut changed);
-    Arc::new(out)
-}
-
 #[cfg(test)]
 mod tests {
-    use proptest::prelude::*;
-    use serde_json::json;
-
     use super::*;
-    use crate::copy::samples::{any_document, service, with_secret};
+    use crate::copy::samples::with_secret;
 
     const CANARY: &str = "canary-5f1c";
+    const SALT: [u8; SALT_BYTES] = [1; SALT_BYTES];
 
     fn key() -> Vault {
         Vault::with_key([7; KEY_BYTES])
     }
 
-    proptest! {
-        #[test]
-        fn what_was_sealed_opens_as_it_was(document in any_document()) {
-            let document = Arc::new(document);
-            let sealed = key().seal(&document).unwrap();
-            let (opened, lost) = key().open((*sealed).clone());
-            prop_assert_eq!((opened, lost), ((*document).clone(), 0));
-        }
-
-        #[test]
-        fn without_a_key_only_texts_are_lost(document in any_document()) {
-            let document = Arc::new(document);
-            let sealed = Vault::default().seal(&document).unwrap();
-            prop_assert_eq!(&*sealed.spec, &*secret::redact(&document.spec));
-            let (opened, lost) = Vault::default().open((*sealed).clone());
-            prop_assert_eq!((opened, lost), ((*sealed).clone(), 0));
-        }
+    #[test]
+    fn without_a_key_no_text_is_written_and_its_version_is() {
+        let document = Arc::new(with_secret("slam", 7, CANARY));
+        let text = Vault::default().writable(&document).to_json().to_string();
+        assert!(!text.contains(CANARY) && text.contains("\"version\":7"), "{text}");
+        assert!(Arc::ptr_eq(&key().writable(&document), &document));
     }
 
     #[test]
-    fn no_text_is_written_with_or_without_a_key() {
-        let document = Arc::new(with_secret("slam", 7, CANARY));
-        for vault in [key(), Vault::default()] {
-            let text = vault.seal(&document).unwrap().to_json().to_string();
-            assert!(!text.contains(CANARY), "{text}");
-            assert!(text.contains("\"version\":7"), "{text}");
-        }
-    }
-
-    #[test]
-    fn another_key_or_document_opens_nothing() {
-        let document = Arc::new(with_secret("slam", 7, CANARY));
-        let sealed = key().seal(&document).unwrap();
-        let redacted = secret::redact(&document.spec).into_owned();
-        for vault in [Vault::with_key([8; KEY_BYTES]), Vault::default()] {
-            let (opened, lost) = vault.open((*sealed).clone());
-            assert_eq!((&*opened.spec, lost), (&redacted, 2));
-        }
-        let elsewhere = Document {
-            uid: "another".to_owned(),
-            ..(*sealed).clone()
+    fn another_key_salt_or_header_opens_nothing() {
+        let mut sealed = CANARY.as_bytes().to_vec();
+        key().encrypt(&SALT, b"header", &mut sealed).unwrap();
+        assert!(!String::from_utf8_lossy(&sealed).contains(CANARY));
+        let opened = |vault: Vault, salt: [u8; SALT_BYTES], header: &[u8]| {
+            let mut bytes = sealed.clone();
+            vault.decrypt(&salt, header, &mut bytes).ok().map(|()| bytes)
         };
-        assert_eq!(key().open(elsewhere).1, 2);
-        let mut broken = (*sealed).clone();
-        broken.spec = Arc::new(json!({ "config": { "a": { "$secret": {
-            "key": OWN, "nonce": "AAAA", "data": "!", "version": 3 } } } }));
-        let (opened, lost) = key().open(broken);
-        assert_eq!(lost, 1);
-        assert_eq!(
-            *opened.spec,
-            json!({ "config": { "a": { "$secret": { "redacted": true, "version": 3 } } } })
-        );
-    }
-
-    #[test]
-    fn two_secrets_never_look_alike() {
-        let document = Arc::new(with_secret("slam", 7, CANARY));
-        assert_ne!(key().seal(&document).unwrap(), key().seal(&document).unwrap());
-        let plain = Arc::new(service("slam", 7, json!({ "config": {} })));
-        assert!(Arc::ptr_eq(&key().seal(&plain).unwrap(), &plain));
+        assert_eq!(opened(key(), SALT, b"header").as_deref(), Some(CANARY.as_bytes()));
+        let other = Vault::with_key([8; KEY_BYTES]);
+        for (vault, salt, header) in [
+            (other, SALT, b"header"),
+            (Vault::default(), SALT, b"header"),
+            (key(), [2; SALT_BYTES], b"header"),
+            (key(), SALT, b"heads!"),
+        ] {
+            assert_eq!(opened(vault, salt, header), None);
+        }
     }
 
     #[test]

@@ -10,6 +10,7 @@
 //! A place that fades is noted as gone, so that a worker that is restarted takes it away as well.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_brokers::KeyedMessage;
@@ -144,7 +145,7 @@ impl Engine {
                 self.fades.channels_differ = true;
                 if self.served.told_at(&place).is_none() {
                     self.unnoted.remove(&place);
-                    self.notes.forget(&tell::at(&place, &self.identity.site));
+                    Arc::make_mut(&mut self.notes).forget(&tell::at(&place, &self.identity.site));
                     is_noted = true;
                 }
             } else if self.tells && !fading.taken_away {
@@ -162,7 +163,7 @@ impl Engine {
             }
         }
         if is_noted {
-            self.keep_notes();
+            self.keep(true);
         }
         self.serve_channels();
     }

@@ -7,7 +7,6 @@ use blaze_proto::v1;
 use tokio::time::Instant;
 
 use super::{Engine, now};
-use crate::copy::Changed;
 use crate::core::messages::Delivery;
 use crate::core::{Applied, Incoming, PROTOCOL};
 use crate::sync::SyncEvent;
@@ -48,7 +47,7 @@ impl Engine {
                 }
                 match applied {
                     // It is known to be the newest by now, which the copies are to know too.
-                    Ok(Applied::Nothing) if self.replica.is_in_sync() => self.keep(Changed::Keys(Vec::new())),
+                    Ok(Applied::Nothing) if self.replica.is_in_sync() => self.keep(false),
                     Ok(Applied::Nothing) => {}
                     Ok(Applied::Changed(change)) => {
                         self.counts.changes += 1;
@@ -58,7 +57,7 @@ impl Engine {
                         self.note_catching_up();
                         self.note_texts(&change);
                         self.owe_notes();
-                        self.keep(Changed::Keys(change.keys));
+                        self.keep(true);
                         self.flush_soon();
                     }
                     Ok(Applied::GoAway { retry_after, reason }) => {

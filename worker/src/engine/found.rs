@@ -8,7 +8,9 @@
 use tokio::time::Instant;
 
 use super::{Engine, tell};
-use crate::copy::{Changed, Found, Loaded, Notes};
+use std::sync::Arc;
+
+use crate::copy::{Found, Loaded, Notes};
 use crate::core::Replica;
 
 impl Engine {
@@ -41,8 +43,7 @@ impl Engine {
         }
         if is_wanted || !is_of_another {
             self.take_notes(&notes);
-            self.keep_notes();
-            self.keep(Changed::All);
+            self.keep(true);
             self.flush_soon();
         }
         // Whoever asks may have gone.
@@ -57,7 +58,7 @@ impl Engine {
         }
         self.served
             .restore_late(tell::told_of(notes), Instant::now().into_std());
-        self.notes.merge(notes);
+        Arc::make_mut(&mut self.notes).merge(notes);
         self.fade_from_notes();
     }
 }

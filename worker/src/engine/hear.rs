@@ -90,9 +90,9 @@ impl Engine {
                 self.counts.failed_rollouts += 1;
                 self.served.fail_rollout(&failure.uid);
                 self.has_undone = true;
-                self.notes.fail(&failure.uid);
+                Arc::make_mut(&mut self.notes).fail(&failure.uid);
                 // A new life must not try it again, whether it tells anybody of the former configuration or not.
-                self.keep_notes();
+                self.keep(true);
                 self.flush_soon();
                 self.acknowledge_soon();
             }

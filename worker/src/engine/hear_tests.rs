@@ -36,10 +36,9 @@ fn copies() -> (Supervisor, Arc<Fake>, Copies) {
     let fake = Arc::new(Fake::new("fake"));
     let target = Target {
         copy: Arc::clone(&fake) as Arc<dyn LocalCopy>,
-        is_current: false,
         is_read: true,
     };
-    let copies = Copies::start(&supervisor, vec![target], &Arc::default(), &mpsc::channel(1).0);
+    let copies = Copies::start(&supervisor, vec![target], &mpsc::channel(1).0);
     (supervisor, fake, copies)
 }
 

@@ -36,7 +36,7 @@ use blaze_proto::v1;
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
-use crate::copy::{Changed, Loaded, Notes, Position, Update, defaults, lacks_text};
+use crate::copy::{Loaded, Notes, Position, Update, defaults, lacks_text};
 use crate::core::{Gate, Notice, Place, Replica, Served, Signs, Source};
 use crate::lease::Mark;
 use fade::Fades;
@@ -70,7 +70,7 @@ pub struct Engine {
     outputs: Outputs,
     replica: Replica,
     served: Served,
-    notes: Notes,
+    notes: Arc<Notes>,
     /// What came could not be read, and would come again: everything is to be asked for.
     wants_all: bool,
     /// The text of a secret is not here.
@@ -134,7 +134,7 @@ impl Engine {
         let mut engine = Self {
             served: Served::new(identity.site.clone()),
             replica: Replica::new(layer.clone()),
-            notes: Notes::default(),
+            notes: Arc::default(),
             wants_all: false,
             lacks_texts: false,
             owes_texts: false,
@@ -186,7 +186,7 @@ impl Engine {
         let told = tell::told_of(&loaded.notes);
         let failed: Vec<String> = loaded.notes.failed().map(str::to_owned).collect();
         self.served.restore(told, failed, now.into_std());
-        self.notes = (*loaded.notes).clone();
+        self.notes = loaded.notes;
         self.replica = Replica::from_copy(layer, Some(store_id), state.clone(), Some(as_of));
         // Nothing was loaded before it.
         if let Err(error) = self.served.load(state, Source::Copy) {
@@ -197,7 +197,7 @@ impl Engine {
         self.note_all_services();
         self.flush_at = Some(now);
         // The one of the copies that is behind the other catches up.
-        self.keep(Changed::Keys(Vec::new()));
+        self.keep(true);
     }
 
     /// Documents of a copy or of a file, as they are kept here.
@@ -273,18 +273,8 @@ impl Engine {
         self.outputs.acks.send_replace(Some(ack));
     }
 
-    /// Has the newest state kept.
-    fn keep(&mut self, changed: Changed) {
-        self.store(changed, None);
-    }
-
-    /// Has the notes kept beside the newest state.
-    fn keep_notes(&mut self) {
-        let notes = Arc::new(self.notes.clone());
-        self.store(Changed::Keys(Vec::new()), Some(notes));
-    }
-
-    fn store(&self, changed: Changed, notes: Option<Arc<Notes>>) {
+    /// Has the newest state kept, with the notes. `has_changed`: not only the time has moved on.
+    fn keep(&self, has_changed: bool) {
         let Some(copies) = &self.outputs.copies else { return };
         let (Some(store_id), Some(as_of)) = (self.replica.store_id(), self.replica.as_of()) else {
             return;
@@ -297,8 +287,8 @@ impl Engine {
                 as_of,
             },
             state: self.replica.state().clone(),
-            changed,
-            notes,
+            notes: Arc::clone(&self.notes),
+            has_changed,
         });
     }
 

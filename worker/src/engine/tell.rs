@@ -84,7 +84,7 @@ impl Engine {
             if !self.fade(place, &noted) {
                 // Whether anything is still owed is seen when the rest settles.
                 self.unnoted.remove(place);
-                self.notes.forget(&noted);
+                Arc::make_mut(&mut self.notes).forget(&noted);
             }
             self.missed.forget(place);
             told.extend(self.without_key(place));
@@ -291,11 +291,11 @@ impl Engine {
                     revision,
                     hash: hash.map(Arc::from),
                 };
-                self.notes.tell(at(&place, &self.identity.site), told);
+                Arc::make_mut(&mut self.notes).tell(at(&place, &self.identity.site), told);
             }
         }
         if has_some {
-            self.keep_notes();
+            self.keep(true);
         }
         self.owe_notes();
     }

@@ -1,40 +1,36 @@
-//! The content of the last-known-good file.
+//! The bytes of a copy, the same in the file and in MongoDB.
 //!
 //! ```text
-//! blaze-copy 1 <SHA-256 of all that follows, hex> {"position":{…},"documents":n,"encryption":null}
-//! {"failed":[…],"told":[…]}                                      notes
-//! {"kind":"Layer","name":"edge",…}                               documents, one a line, secrets sealed
+//! blaze-copy 2 <SHA-256 of all that follows, hex> {"position":{…},"documents":n,"encryption":null}
+//! {"failed":[…],…}                                               notes
+//! {"kind":"Layer","name":"edge",…}                               documents, one a line
 //! ```
 //!
-//! With a key, `encryption` names it and the salt, and everything after the first line is cut into chunks of 64 KiB, each
-//! encrypted with its number as nonce. A chunk is bound to its number, to whether it is the last one, and to the first
-//! line: what is cut off, put in another order or taken from another file does not open. The hash is there for files
-//! without a key: it tells of a disk that fails, not of somebody who changes both.
+//! With a key, `encryption` names it and the salt, and everything after the first line is encrypted and bound to the first
+//! line. Without a key the texts of secrets are left out. The hash is there for copies without a key: it detects a disk that
+//! fails, not a person who changes both.
 
 use std::io::Write as _;
 use std::sync::Arc;
 
-use aws_lc_rs::aead::{Aad, LessSafeKey, Nonce};
-use aws_lc_rs::digest::{SHA256, digest};
+use aws_lc_rs::digest::{Context, SHA256};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use blaze_domain::LayerName;
 use serde_json::{Value, json};
 
 use super::json::{self, FormError};
-use super::vault::{SALT_BYTES, TAG_BYTES, new_salt};
+use super::vault::{SALT_BYTES, new_salt};
 use super::{CopyError, Loaded, Position, Vault};
 
-/// Begins every such file.
+/// Begins every copy.
 const MAGIC: &str = "blaze-copy";
 /// What is written here, and the newest that is read.
-const FORMAT: u64 = 1;
-/// Bytes of a chunk before it is encrypted.
-const CHUNK_BYTES: usize = 64 * 1024;
+pub(super) const FORMAT: u64 = 2;
 /// Longest first line.
 const MAX_HEADER_BYTES: usize = 4 * 1024;
 
-/// The whole file.
+/// The whole copy.
 ///
 /// # Errors
 /// [`CopyError::Sealing`].
@@ -42,36 +38,35 @@ pub(super) fn encode(whole: &Loaded, vault: &Vault) -> Result<Vec<u8>, CopyError
     let mut body = format!("{}\n", json::notes_to_json(&whole.notes)).into_bytes();
     for document in &whole.documents {
         // A vector takes whatever is written to it.
-        let _ = writeln!(body, "{}", vault.seal(document)?.to_json());
+        let _ = writeln!(body, "{}", vault.writable(document).to_json());
     }
     let salt = new_salt()?;
-    let key = vault.file_key(&salt)?;
     let encryption = match vault.key_id() {
         Some(id) => json!({ "key": id, "salt": STANDARD.encode(salt) }),
         None => Value::Null,
     };
     let header = json!({
-        "position": json::position_to_json(&whole.position), "documents": whole.documents.len(), "encryption": encryption,
+        "position": json::position_to_json(&whole.position), "documents": whole.documents.len(),
+        "encryption": encryption,
     });
     let header = format!("{header}\n");
-    if let Some(key) = key {
-        body = encrypt(&key, header.as_bytes(), &body)?;
-    }
-    let mut out = format!("{MAGIC} {FORMAT} {} {header}", hash(header.as_bytes(), &body)).into_bytes();
+    vault.encrypt(&salt, header.as_bytes(), &mut body)?;
+    let hash = hash(header.as_bytes(), &body);
+    let mut out = format!("{MAGIC} {FORMAT} {hash} {header}").into_bytes();
     out.append(&mut body);
     Ok(out)
 }
 
 /// Of the first line from its JSON on, and of what follows.
 fn hash(header: &[u8], body: &[u8]) -> String {
-    let mut context = aws_lc_rs::digest::Context::new(&SHA256);
+    let mut context = Context::new(&SHA256);
     context.update(header);
     context.update(body);
     let bytes = context.finish();
     bytes.as_ref().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Reads a file: what it holds, and how many of its secrets do not open.
+/// Reads a copy.
 ///
 /// # Errors
 /// [`CopyError::Broken`], [`CopyError::OtherKey`], [`CopyError::OtherLayer`], [`CopyError::NewerFormat`].
@@ -80,7 +75,7 @@ pub(super) fn decode(
     place: &str,
     layer: &LayerName,
     vault: &Vault,
-) -> Result<(Loaded, usize), CopyError> {
+) -> Result<Loaded, CopyError> {
     let broken = |detail: &str| CopyError::Broken {
         place: place.to_owned(),
         detail: detail.to_owned(),
@@ -99,29 +94,24 @@ pub(super) fn decode(
     let count = read["documents"]
         .as_u64()
         .ok_or_else(|| broken("it does not say how many documents it has"))?;
-    let body = match &read["encryption"] {
-        Value::Null => body.to_vec(),
-        Value::Object(encryption) => {
-            let text = |name: &str| encryption.get(name).and_then(Value::as_str).unwrap_or_default();
-            let salt = STANDARD.decode(text("salt")).ok();
-            let salt: Option<[u8; SALT_BYTES]> = salt.and_then(|salt| salt.try_into().ok());
-            let salt = salt.ok_or_else(|| broken("its encryption has another form"))?;
-            let other_key = || CopyError::OtherKey {
+    let mut body = body.to_vec();
+    if !read["encryption"].is_null() {
+        let text = |name: &str| read["encryption"][name].as_str().unwrap_or_default();
+        let salt = STANDARD.decode(text("salt")).ok();
+        let salt: Option<[u8; SALT_BYTES]> = salt.and_then(|salt| salt.try_into().ok());
+        let salt = salt.ok_or_else(|| broken("its encryption has another form"))?;
+        if vault.key_id() != Some(text("key")) {
+            return Err(CopyError::OtherKey {
                 place: place.to_owned(),
                 found: text("key").chars().take(16).collect(),
                 own: vault.key_id().map(str::to_owned),
-            };
-            let key = vault.file_key(&salt)?.ok_or_else(other_key)?;
-            if vault.key_id() != Some(text("key")) {
-                return Err(other_key());
-            }
-            decrypt(&key, header, body).ok_or_else(|| broken("it does not open: it was cut off or changed"))?
+            });
         }
-        Value::Bool(_) | Value::Number(_) | Value::String(_) | Value::Array(_) => {
-            return Err(broken("its encryption has another form"));
-        }
-    };
-    read_body(&body, position, count, vault).map_err(|detail| broken(&detail))
+        vault
+            .decrypt(&salt, header, &mut body)
+            .map_err(|_| broken("it does not open: it was cut off or changed"))?;
+    }
+    read_body(&body, position, count).map_err(|detail| broken(&detail))
 }
 
 /// The first line from its JSON on, with its end, and what follows; the hash is right.
@@ -136,7 +126,7 @@ fn open_envelope<'c>(content: &'c [u8], place: &str) -> Result<(&'c [u8], &'c [u
     let mut words = line.splitn(4, |byte| *byte == b' ');
     let mut word = || words.next().unwrap_or_default();
     if word() != MAGIC.as_bytes() {
-        return Err(broken("it does not begin as such a file does"));
+        return Err(broken("it does not begin as a copy does"));
     }
     let format: Option<u64> = std::str::from_utf8(word()).ok().and_then(|text| text.parse().ok());
     match format {
@@ -148,7 +138,7 @@ fn open_envelope<'c>(content: &'c [u8], place: &str) -> Result<(&'c [u8], &'c [u
                 known: FORMAT,
             });
         }
-        Some(_) | None => return Err(broken("its format is none")),
+        Some(_) | None => return Err(broken("its format is not read any more")),
     }
     let (wanted, header) = (word(), word());
     if hash(header, body).as_bytes() != wanted {
@@ -157,69 +147,24 @@ fn open_envelope<'c>(content: &'c [u8], place: &str) -> Result<(&'c [u8], &'c [u
     Ok((header, body))
 }
 
-fn read_body(body: &[u8], position: Position, count: u64, vault: &Vault) -> Result<(Loaded, usize), String> {
+fn read_body(body: &[u8], position: Position, count: u64) -> Result<Loaded, String> {
     let body = body.strip_suffix(b"\n").ok_or("it does not end with a line")?;
     let mut lines = body.split(|byte| *byte == b'\n');
-    let mut lost = 0;
     let notes = json::value_from_text(lines.next().unwrap_or_default()).and_then(json::notes_from_json);
     let notes = notes.map_err(|error| format!("notes: {error}"))?;
     let mut documents = Vec::new();
     for (number, line) in (1_usize..).zip(lines) {
         let document = json::document_from_text(line).map_err(|error| format!("document {number}: {error}"))?;
-        let (document, unopened) = vault.open(document);
-        lost += unopened;
         documents.push(Arc::new(document));
     }
     if u64::try_from(documents.len()) != Ok(count) {
         return Err(format!("it has {} documents of {count}", documents.len()));
     }
-    let notes = Arc::new(notes);
-    Ok((
-        Loaded {
-            position,
-            documents,
-            notes,
-        },
-        lost,
-    ))
-}
-
-/// Number of a chunk, and what it is bound to.
-fn bound(number: usize, is_last: bool, header: &[u8]) -> (Nonce, Aad<Vec<u8>>) {
-    let number = u64::try_from(number).unwrap_or(u64::MAX).to_be_bytes();
-    let mut nonce = [0; 12];
-    nonce[4..].copy_from_slice(&number);
-    let mut parts = digest(&SHA256, header).as_ref().to_vec();
-    parts.extend(number);
-    parts.push(u8::from(is_last));
-    (Nonce::assume_unique_for_key(nonce), Aad::from(parts))
-}
-
-fn encrypt(key: &LessSafeKey, header: &[u8], body: &[u8]) -> Result<Vec<u8>, CopyError> {
-    let count = body.len().div_ceil(CHUNK_BYTES);
-    let mut out = Vec::with_capacity(body.len() + count * TAG_BYTES);
-    for (number, chunk) in body.chunks(CHUNK_BYTES).enumerate() {
-        let (nonce, bound) = bound(number, number + 1 == count, header);
-        let start = out.len();
-        out.extend_from_slice(chunk);
-        let written = out.get_mut(start..).unwrap_or_default();
-        let tag = key
-            .seal_in_place_separate_tag(nonce, bound, written)
-            .map_err(|_| CopyError::Sealing)?;
-        out.extend_from_slice(tag.as_ref());
-    }
-    Ok(out)
-}
-
-fn decrypt(key: &LessSafeKey, header: &[u8], body: &[u8]) -> Option<Vec<u8>> {
-    let count = body.len().div_ceil(CHUNK_BYTES + TAG_BYTES);
-    let mut out = Vec::with_capacity(body.len());
-    for (number, chunk) in body.chunks(CHUNK_BYTES + TAG_BYTES).enumerate() {
-        let (nonce, bound) = bound(number, number + 1 == count, header);
-        let mut chunk = chunk.to_vec();
-        out.extend_from_slice(key.open_in_place(nonce, bound, &mut chunk).ok()?);
-    }
-    Some(out)
+    Ok(Loaded {
+        position,
+        documents,
+        notes: Arc::new(notes),
+    })
 }
 
 #[cfg(test)]
@@ -235,7 +180,7 @@ mod tests {
         Vault::with_key([7; 32])
     }
 
-    fn read(content: &[u8], vault: &Vault) -> Result<(Loaded, usize), CopyError> {
+    fn read(content: &[u8], vault: &Vault) -> Result<Loaded, CopyError> {
         decode(content, "file x", &"edge".parse().unwrap(), vault)
     }
 
@@ -257,40 +202,8 @@ mod tests {
         fn what_is_written_is_read(documents in any_documents(), notes in any_notes()) {
             let whole = Loaded { position: position(7), documents, notes: Arc::new(notes) };
             let content = encode(&whole, &key()).unwrap();
-            prop_assert_eq!(read(&content, &key()).unwrap(), (whole, 0));
+            prop_assert_eq!(read(&content, &key()).unwrap(), whole);
         }
-    }
-
-    #[test]
-    fn many_chunks_are_read() {
-        let text = "x".repeat(1_000);
-        let documents = (0..400).map(|number| service(&format!("s{number}"), 3, json!({ "config": { "a": text } })));
-        let whole = loaded(7, documents);
-        let content = encode(&whole, &key()).unwrap();
-        assert!(content.len() > 4 * CHUNK_BYTES);
-        assert_eq!(read(&content, &key()).unwrap().0, whole);
-    }
-
-    #[test]
-    fn chunks_that_change_places_or_files_do_not_open() {
-        let text = "x".repeat(3 * CHUNK_BYTES);
-        let drawn = key().file_key(&[1; SALT_BYTES]).unwrap().unwrap();
-        let sealed = encrypt(&drawn, b"header", text.as_bytes()).unwrap();
-        let size = CHUNK_BYTES + TAG_BYTES;
-        assert_eq!(decrypt(&drawn, b"header", &sealed).unwrap(), text.as_bytes());
-        assert_eq!(decrypt(&drawn, b"other", &sealed), None);
-        assert_eq!(
-            decrypt(&drawn, b"header", &sealed[..2 * size]),
-            None,
-            "the last one is missing"
-        );
-        assert_eq!(
-            decrypt(&drawn, b"header", &sealed[size..]),
-            None,
-            "the first one is missing"
-        );
-        let swapped = [&sealed[size..2 * size], &sealed[..size], &sealed[2 * size..]].concat();
-        assert_eq!(decrypt(&drawn, b"header", &swapped), None);
     }
 
     #[test]
@@ -326,8 +239,8 @@ mod tests {
             assert!(!String::from_utf8_lossy(&content).contains(CANARY));
         }
         let content = encode(&small(), &Vault::default()).unwrap();
-        let (whole, lost) = read(&content, &Vault::default()).unwrap();
-        assert!(whole.lacks_secrets() && lost == 0);
+        let whole = read(&content, &Vault::default()).unwrap();
+        assert!(whole.lacks_secrets());
         assert_eq!(
             blaze_domain::config::canonical::hash(&whole.documents[1].spec),
             blaze_domain::config::canonical::hash(&small().documents[1].spec)
@@ -346,9 +259,11 @@ mod tests {
         }
         let error = decode(&content, "file x", &"fog".parse().unwrap(), &key()).unwrap_err();
         assert!(matches!(error, CopyError::OtherLayer { .. }), "{error}");
-        let newer = [b"blaze-copy 2 ".as_slice(), &content[13..]].concat();
+        let newer = [b"blaze-copy 3 ".as_slice(), &content[13..]].concat();
         let error = read(&newer, &key()).unwrap_err();
-        assert_eq!(error.to_string(), "file x has format 2; this version reads up to 1");
+        assert_eq!(error.to_string(), "file x has format 3; this version reads up to 2");
+        let older = [b"blaze-copy 1 ".as_slice(), &content[13..]].concat();
+        assert!(matches!(read(&older, &key()), Err(CopyError::Broken { .. })));
         // A file that was written before there was a key is read with it.
         let plain = encode(&small(), &Vault::default()).unwrap();
         assert!(read(&plain, &key()).is_ok());

@@ -1,0 +1,289 @@
+//! What every copy must do, run on each of them. MongoDB only where `BLAZE_TEST_MONGODB_URI` (or `BLAZE_TEST_MONGODB`) names
+//! a server, standalone or replica set.
+
+use std::sync::Arc;
+
+use blaze_domain::LayerName;
+use blaze_domain::config::Document;
+use proptest::prelude::*;
+use proptest::test_runner::TestRunner;
+use serde_json::json;
+use tempfile::TempDir;
+use tokio::runtime::Runtime;
+
+use super::samples::{any_documents, any_notes, loaded, notes, position, service, with_secret};
+use super::{FileCopy, Loaded, LocalCopy, Position, Vault};
+
+/// Which copy.
+enum Kind {
+    File,
+    #[cfg(feature = "mongodb")]
+    Mongo {
+        uri: String,
+        database: String,
+    },
+}
+
+/// One copy that can be opened again and again.
+struct Subject {
+    kind: Kind,
+    folder: TempDir,
+    runtime: Runtime,
+}
+
+impl Subject {
+    fn new(kind: Kind) -> Self {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
+        Self {
+            kind,
+            folder: tempfile::tempdir().unwrap(),
+            runtime,
+        }
+    }
+
+    fn open(&self) -> Box<dyn LocalCopy> {
+        self.open_with(Vault::with_key([7; 32]))
+    }
+
+    fn open_with(&self, vault: Vault) -> Box<dyn LocalCopy> {
+        let layer: LayerName = "edge".parse().unwrap();
+        match &self.kind {
+            Kind::File => Box::new(FileCopy::new(self.folder.path(), layer, vault)),
+            #[cfg(feature = "mongodb")]
+            Kind::Mongo { uri, database } => {
+                Box::new(super::MongoCopy::new(uri.clone().into(), database, layer, None, vault).unwrap())
+            }
+        }
+    }
+
+    /// What a process that starts now finds.
+    async fn found(&self) -> Option<Loaded> {
+        self.open().load().await.unwrap()
+    }
+}
+
+/// A server, and a database that no other test has.
+#[cfg(feature = "mongodb")]
+fn mongo_server() -> Option<Kind> {
+    use blaze_runtime::environment::variable;
+    let uri = variable("BLAZE_TEST_MONGODB_URI").or_else(|| variable("BLAZE_TEST_MONGODB"))?;
+    let database = format!("blaze_copy_{:016x}", rand::random::<u64>());
+    Some(Kind::Mongo { uri, database })
+}
+
+#[cfg(feature = "mongodb")]
+impl Drop for Subject {
+    fn drop(&mut self) {
+        if let Kind::Mongo { uri, database } = &self.kind {
+            // What is left behind on a test server does no harm.
+            let _ = self.runtime.block_on(async {
+                let client = mongodb::Client::with_uri_str(uri).await?;
+                client.database(database).drop().await
+            });
+        }
+    }
+}
+
+fn sample(revision: u64) -> Loaded {
+    let text = |name: &str| json!({ "config": { "a": format!("{name} at {revision}") } });
+    Loaded {
+        notes: Arc::new(notes(&format!("uid-{revision}"), revision)),
+        ..loaded(
+            revision,
+            [
+                service("a", revision, text("a")),
+                service("b", 1, text("b")),
+                with_secret("c", revision, "canary-5f1c"),
+            ],
+        )
+    }
+}
+
+fn what_was_written_is_found(subject: &Subject) {
+    assert_eq!(subject.runtime.block_on(subject.found()), None);
+    let mut runner = TestRunner::new(ProptestConfig::with_cases(24));
+    let any = (any_documents(), any_notes(), 1..1_u64 << 53);
+    let same = runner.run(&any, |(documents, notes, revision)| {
+        let whole = Loaded {
+            position: Position {
+                revision,
+                // Revisions begin anew.
+                store_id: format!("store-{:016x}", rand::random::<u64>()),
+                ..position(1)
+            },
+            documents,
+            notes: Arc::new(notes),
+        };
+        let found = subject.runtime.block_on(async {
+            subject.open().replace(&whole).await.unwrap();
+            subject.found().await
+        });
+        prop_assert_eq!(found, Some(whole));
+        Ok(())
+    });
+    same.unwrap();
+}
+
+fn a_large_copy_is_kept(subject: &Subject) {
+    subject.runtime.block_on(async {
+        let text = "\u{e4}".repeat(120 * 1024);
+        let whole = loaded(
+            7,
+            (0..80).map(|number| service(&format!("s{number}"), 7, json!({ "config": { "a": text } }))),
+        );
+        subject.open().replace(&whole).await.unwrap();
+        assert!(subject.found().await == Some(whole));
+    });
+}
+
+/// Whoever began from an older state, because this copy could not be read then, does not write it over the newer one.
+fn nothing_older_of_the_same_store_replaces_it(subject: &Subject) {
+    subject.runtime.block_on(async {
+        let held = sample(5);
+        subject.open().replace(&held).await.unwrap();
+        for copy in [subject.open(), subject.open()] {
+            let refused = copy.replace(&sample(4)).await.unwrap_err();
+            assert!(!refused.is_unreadable(), "{refused}");
+            assert_eq!(subject.found().await.as_ref(), Some(&held));
+        }
+        let again = Loaded {
+            documents: Vec::new(),
+            ..held
+        };
+        for _ in 0..3 {
+            subject.open().replace(&again).await.unwrap();
+            assert_eq!(
+                subject.found().await.as_ref(),
+                Some(&again),
+                "of the same revision the later counts"
+            );
+        }
+        // A restored store has another identity.
+        let mut other = sample(3);
+        other.position.store_id = "store-b".to_owned();
+        subject.open().replace(&other).await.unwrap();
+        assert_eq!(subject.found().await, Some(other));
+    });
+}
+
+fn without_a_key_texts_are_left_out_and_all_else_is_there(subject: &Subject) {
+    subject.runtime.block_on(async {
+        let whole = sample(7);
+        let plain = subject.open_with(Vault::default());
+        plain.replace(&whole).await.unwrap();
+        let found = plain.load().await.unwrap().unwrap();
+        assert!(found.lacks_secrets() && !whole.lacks_secrets());
+        assert!(!format!("{:?}", found.documents).contains("canary"));
+        let hashes = |loaded: &Loaded| -> Vec<String> {
+            let hash = |document: &Arc<Document>| blaze_domain::config::canonical::hash(&document.spec);
+            loaded.documents.iter().map(hash).collect()
+        };
+        assert_eq!(hashes(&found), hashes(&whole));
+        assert_eq!((found.position, found.notes), (whole.position, whole.notes));
+    });
+}
+
+fn names_without_passwords(subject: &Subject) {
+    let place = subject.open().describe();
+    assert!(!place.is_empty() && !place.contains("://"), "{place}");
+}
+
+macro_rules! suite {
+    ($module:ident, $kind:expr, [$($test:ident),* $(,)?]) => {
+        mod $module {
+            $(#[test]
+            fn $test() {
+                let Some(kind) = $kind else { return };
+                super::$test(&super::Subject::new(kind));
+            })*
+        }
+    };
+    ($module:ident, $kind:expr) => {
+        suite!($module, $kind, [
+            what_was_written_is_found,
+            a_large_copy_is_kept,
+            nothing_older_of_the_same_store_replaces_it,
+            without_a_key_texts_are_left_out_and_all_else_is_there,
+            names_without_passwords,
+        ]);
+    };
+}
+
+suite!(file, Some(super::Kind::File));
+#[cfg(feature = "mongodb")]
+suite!(mongo, super::mongo_server());
+
+/// A write to MongoDB that ends after each of its steps, and what reaches the server late.
+#[cfg(feature = "mongodb")]
+mod in_mongodb {
+    use futures::TryStreamExt as _;
+    use mongodb::bson::{Binary, Document, doc, spec::BinarySubtype};
+
+    use super::*;
+    use crate::copy::CopyError;
+
+    #[test]
+    fn a_write_that_ended_in_the_middle_leaves_the_old_and_goes_with_the_next() {
+        let Some(kind) = mongo_server() else { return };
+        let subject = Subject::new(kind);
+        let Kind::Mongo { uri, database } = &subject.kind else {
+            return;
+        };
+        subject.runtime.block_on(async {
+            let client = mongodb::Client::with_uri_str(uri).await.unwrap();
+            let database = client.database(database);
+            let (head, chunks) = (database.collection::<Document>("head"), database.collection("chunks"));
+            let held = sample(5);
+            subject.open().replace(&held).await.unwrap();
+            let before = head.find_one(doc! {}).await.unwrap().unwrap();
+            let generation = before.get_str("generation").unwrap();
+            let later = u64::from_str_radix(&generation[..16], 16).unwrap() + 1;
+            let bytes = b"cut off".to_vec();
+            let chunk = Binary {
+                subtype: BinarySubtype::Generic,
+                bytes,
+            };
+            let stray = doc! { "_id": format!("edge/{later:016x}-0/00000000"), "data": chunk };
+            chunks.insert_one(stray).await.unwrap();
+            assert_eq!(subject.found().await.as_ref(), Some(&held));
+            subject.open().replace(&sample(6)).await.unwrap();
+            assert_eq!(subject.found().await, Some(sample(6)));
+            tokio::time::sleep(std::time::Duration::from_millis(5)).await;
+            subject.open().replace(&sample(7)).await.unwrap();
+            let left: Vec<Document> = chunks.find(doc! {}).await.unwrap().try_collect().await.unwrap();
+            assert_eq!(left.len(), 1, "{left:?}");
+            assert!(!format!("{left:?}").contains("canary"));
+        });
+    }
+
+    #[test]
+    fn a_newer_format_stays_and_a_broken_copy_gives_way() {
+        let Some(kind) = mongo_server() else { return };
+        let subject = Subject::new(kind);
+        let Kind::Mongo { uri, database } = &subject.kind else {
+            return;
+        };
+        subject.runtime.block_on(async {
+            let client = mongodb::Client::with_uri_str(uri).await.unwrap();
+            let head = client.database(database).collection::<Document>("head");
+            for (change, is_newer) in [
+                (doc! { "$set": { "format": 99 } }, true),
+                (doc! { "$set": { "generation": "elsewhere" } }, false),
+                (doc! { "$unset": { "generation": "", "format": "" } }, false),
+            ] {
+                head.delete_many(doc! {}).await.unwrap();
+                subject.open().replace(&sample(5)).await.unwrap();
+                head.update_one(doc! {}, change).await.unwrap();
+                let next = subject.open().replace(&sample(6)).await;
+                assert_eq!(matches!(next, Err(CopyError::NewerFormat { .. })), is_newer, "{next:?}");
+                if !is_newer {
+                    assert_eq!(subject.found().await, Some(sample(6)));
+                }
+            }
+        });
+    }
+}
