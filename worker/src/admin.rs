@@ -232,18 +232,6 @@ fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
         &plain(speaker.waiting as f64),
     );
     let counts = status.counts;
-    one(
-        "blaze_worker_notices_unconfirmed",
-        "gauge",
-        "Places that another worker is to tell, until it is known that it has.",
-        &plain(status.unconfirmed as f64),
-    );
-    one(
-        "blaze_worker_notices_forgotten_total",
-        "counter",
-        "Places that would not be told on a takeover, because too many are unconfirmed.",
-        &plain(counts.missed as f64),
-    );
     let requests = [
         ("answered", counts.answered),
         ("refused", counts.refused),

@@ -381,7 +381,11 @@ impl Writer {
         let Some(written) = self.written.as_ref().filter(|_| !next.has_changed) else {
             return false;
         };
-        let age_ms = next.position.as_of.as_millis().saturating_sub(written.as_of.as_millis());
+        let age_ms = next
+            .position
+            .as_of
+            .as_millis()
+            .saturating_sub(written.as_of.as_millis());
         let is_same = (&written.store_id, written.revision) == (&next.position.store_id, next.position.revision);
         is_same && u128::from(age_ms.unsigned_abs()) < MAX_AGE.as_millis()
     }

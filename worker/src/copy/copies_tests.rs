@@ -87,7 +87,7 @@ async fn each_write_is_everything() {
     assert!(fixture.copies.flush(LONG).await);
     let held = fixture.held();
     assert_eq!((held.documents, held.position), (fixture.expected(), position(3)));
-    assert!(held.notes.has_failed("uid"));
+    assert!(held.notes.failed.contains(&"uid".to_owned()));
     assert!(fixture.supervisor.shutdown(LONG).await.is_clean());
 }
 

@@ -86,11 +86,7 @@ impl CopyError {
     pub fn is_unreadable(&self) -> bool {
         match self {
             Self::Broken { .. } | Self::OtherKey { .. } | Self::OtherLayer { .. } | Self::NewerFormat { .. } => true,
-            Self::Away { .. }
-            | Self::Refused { .. }
-            | Self::Newer { .. }
-            | Self::Key { .. }
-            | Self::Sealing => false,
+            Self::Away { .. } | Self::Refused { .. } | Self::Newer { .. } | Self::Key { .. } | Self::Sealing => false,
         }
     }
 }

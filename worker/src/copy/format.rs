@@ -70,12 +70,7 @@ fn hash(header: &[u8], body: &[u8]) -> String {
 ///
 /// # Errors
 /// [`CopyError::Broken`], [`CopyError::OtherKey`], [`CopyError::OtherLayer`], [`CopyError::NewerFormat`].
-pub(super) fn decode(
-    content: &[u8],
-    place: &str,
-    layer: &LayerName,
-    vault: &Vault,
-) -> Result<Loaded, CopyError> {
+pub(super) fn decode(content: &[u8], place: &str, layer: &LayerName, vault: &Vault) -> Result<Loaded, CopyError> {
     let broken = |detail: &str| CopyError::Broken {
         place: place.to_owned(),
         detail: detail.to_owned(),

@@ -10,12 +10,12 @@
 use std::str::FromStr;
 use std::sync::Arc;
 
-use blaze_domain::config::effective::At;
 use blaze_domain::config::{Document, Key, Kind, Labels, Timestamp};
-use blaze_domain::{DocumentName, LayerName, NodeName, ServiceName};
+use blaze_domain::{InstanceName, NodeName};
 use serde_json::{Map, Value, json};
 
-use super::{Notes, Position, Told};
+use super::{Notes, Position};
+use crate::core::Place;
 
 /// Which member is missing or of another form. Never repeats a value, for it may be a secret.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -139,51 +139,40 @@ pub(super) fn position_from_json(value: Value) -> Result<Position, FormError> {
 }
 
 pub(super) fn notes_to_json(notes: &Notes) -> Value {
-    let told = |(at, told): (&At, &Told)| {
-        let mut out = Map::new();
-        let names = [
-            ("service", at.service.as_ref().map(ServiceName::as_str)),
-            ("instance", at.instance.as_ref().map(DocumentName::as_str)),
-            ("layer", at.layer.as_ref().map(LayerName::as_str)),
-            ("node", at.node.as_ref().map(NodeName::as_str)),
-            ("hash", told.hash.as_deref()),
-        ];
-        for (name, text) in names {
-            out.extend(text.map(|text| (name.to_owned(), Value::from(text))));
-        }
-        out.insert("revision".to_owned(), told.revision.into());
-        Value::Object(out)
+    let place = |place: &Place| {
+        json!({
+            "service": place.service.as_str(), "instance": place.instance.as_ref().map(InstanceName::as_str),
+            "node": place.node.as_ref().map(NodeName::as_str),
+        })
     };
-    let failed: Vec<&str> = notes.failed().collect();
-    json!({ "failed": failed, "told": notes.all_told().map(told).collect::<Vec<_>>() })
+    let places: Vec<Value> = notes.places.iter().map(place).collect();
+    json!({ "failed": notes.failed, "places": places, "floor": notes.floor })
 }
 
 pub(super) fn notes_from_json(value: Value) -> Result<Notes, FormError> {
     let mut members = members(value, "notes")?;
+    let floor = whole(&members, "floor")?;
     let mut list = |name: &'static str| match members.remove(name) {
         Some(Value::Array(items)) => Ok(items),
         _ => Err(wrong(name, "is no list")),
     };
-    let (failed, told) = (list("failed")?, list("told")?);
-    let mut notes = Notes::default();
-    for uid in &failed {
-        notes.fail(uid.as_str().ok_or(wrong("failed", "holds what is no text"))?);
-    }
-    for entry in told {
-        let entry = self::members(entry, "told")?;
-        let at = At {
-            service: optional(&entry, "service")?,
-            instance: optional(&entry, "instance")?,
-            layer: optional(&entry, "layer")?,
-            node: optional(&entry, "node")?,
-        };
-        let told = Told {
-            revision: whole(&entry, "revision")?,
-            hash: optional::<String>(&entry, "hash")?.map(Arc::from),
-        };
-        notes.tell(at, told);
-    }
-    Ok(notes)
+    let uid = |uid: Value| match uid {
+        Value::String(uid) => Ok(uid),
+        _ => Err(wrong("failed", "holds what is no text")),
+    };
+    let place = |place: Value| {
+        let place = self::members(place, "places")?;
+        Ok(Place {
+            service: parsed(&place, "service")?,
+            instance: optional(&place, "instance")?,
+            node: optional(&place, "node")?,
+        })
+    };
+    Ok(Notes {
+        failed: list("failed")?.into_iter().map(uid).collect::<Result<_, _>>()?,
+        places: list("places")?.into_iter().map(place).collect::<Result<_, _>>()?,
+        floor,
+    })
 }
 
 #[cfg(test)]

@@ -55,7 +55,7 @@ pub use file::{FILE_NAME, FileCopy};
 pub use json::{FormError, document_from_json};
 #[cfg(feature = "mongodb")]
 pub use mongo::MongoCopy;
-pub use notes::{MAX_FAILED, MAX_TOLD, Notes, Told};
+pub use notes::Notes;
 pub use start::{DATABASE_LIMIT, Start, choose};
 pub use vault::Vault;
 

@@ -2,12 +2,12 @@
 
 use std::sync::Arc;
 
-use blaze_domain::config::effective::At;
 use blaze_domain::config::{Document, Key, Labels, Timestamp};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
-use super::{Loaded, Notes, Position, Told};
+use super::{Loaded, Notes, Position};
+use crate::core::Place;
 
 /// A document of any kind.
 pub(super) fn document(key: &str, revision: u64, spec: Value) -> Document {
@@ -52,18 +52,16 @@ pub(super) fn loaded(revision: u64, documents: impl IntoIterator<Item = Document
 }
 
 /// Notes with one failed roll-out and one place.
-pub(super) fn notes(uid: &str, revision: u64) -> Notes {
-    let mut notes = Notes::default();
-    notes.fail(uid);
-    let at = At {
-        service: Some("slam".parse().unwrap()),
-        instance: Some("0".parse().unwrap()),
-        layer: Some("edge".parse().unwrap()),
-        node: None,
-    };
-    let hash = Some(Arc::from(format!("sha256:{revision:064x}")));
-    notes.tell(at, Told { revision, hash });
-    notes
+pub(super) fn notes(uid: &str, floor: u64) -> Notes {
+    Notes {
+        failed: vec![uid.to_owned()],
+        places: vec![Place {
+            service: "slam".parse().unwrap(),
+            instance: Some("0".parse().unwrap()),
+            node: None,
+        }],
+        floor,
+    }
 }
 
 /// A service whose configuration holds a text that must not be found anywhere.
@@ -156,23 +154,16 @@ pub(super) fn any_documents() -> impl Strategy<Value = Vec<Arc<Document>>> {
 /// Any notes.
 pub(super) fn any_notes() -> impl Strategy<Value = Notes> {
     let name = || prop::option::of("[a-c]{1,2}");
-    let hash = prop::option::of("sha256:[0-9a-f]{4}");
-    let told = ((name(), name(), name(), name()), any::<u32>(), hash);
+    let place = ("[a-c]{1,2}", name(), name()).prop_map(|(service, instance, node)| Place {
+        service: service.parse().unwrap(),
+        instance: instance.map(|name| name.parse().unwrap()),
+        node: node.map(|name| name.parse().unwrap()),
+    });
     let failed = prop::collection::vec("[0-9a-f]{1,4}", 0..5);
-    (failed, prop::collection::vec(told, 0..6)).prop_map(|(failed, told)| {
-        let mut notes = Notes::default();
-        failed.iter().for_each(|uid| notes.fail(uid));
-        for ((service, instance, layer, node), revision, hash) in told {
-            let at = At {
-                service: service.map(|name| name.parse().unwrap()),
-                instance: instance.map(|name| name.parse().unwrap()),
-                layer: layer.map(|name| name.parse().unwrap()),
-                node: node.map(|name| name.parse().unwrap()),
-            };
-            let (revision, hash) = (revision.into(), hash.map(Arc::from));
-            notes.tell(at, Told { revision, hash });
-        }
-        notes
+    (failed, prop::collection::vec(place, 0..6), 0..1_u64 << 53).prop_map(|(failed, places, floor)| Notes {
+        failed,
+        places,
+        floor,
     })
 }
 

@@ -87,7 +87,10 @@ impl Vault {
         }
         let mut out = (**document).clone();
         out.spec = Arc::new(secret::redact(&document.spec).into_owned());
-        out.status = document.status.as_ref().map(|status| secret::redact(status).into_owned());
+        out.status = document
+            .status
+            .as_ref()
+            .map(|status| secret::redact(status).into_owned());
         Arc::new(out)
     }
 
@@ -114,7 +117,9 @@ impl Vault {
     /// [`CopyError::Sealing`].
     pub(super) fn decrypt(&self, salt: &[u8; SALT_BYTES], header: &[u8], body: &mut Vec<u8>) -> Result<(), CopyError> {
         let master = self.master.as_ref().ok_or(CopyError::Sealing)?;
-        let opened = master.derive(salt)?.open_in_place(only_nonce(), Aad::from(header), body);
+        let opened = master
+            .derive(salt)?
+            .open_in_place(only_nonce(), Aad::from(header), body);
         let length = opened.map_err(|_| CopyError::Sealing)?.len();
         body.truncate(length);
         Ok(())

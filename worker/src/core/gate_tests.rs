@@ -224,7 +224,7 @@ fn one_that_has_ended_is_forgotten_and_one_that_failed_before_is_not_tried() {
     assert_eq!(w.phases(), []);
 
     let mut served = Served::new(site(Some("robot-1")));
-    served.restore([], ["Rollout/slam-slower".to_owned()], w.start);
+    served.fail_rollout("Rollout/slam-slower");
     served
         .load(state(10, documents(vec![rollout("slam", 0, "canary")])), Source::Copy)
         .unwrap();

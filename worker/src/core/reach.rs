@@ -25,6 +25,8 @@ use super::told::Told;
 pub(super) struct Places {
     told: BTreeMap<Place, Told>,
     on_node: BTreeSet<(NodeName, Place)>,
+    /// How often a place came or went.
+    version: u64,
 }
 
 impl Places {
@@ -36,7 +38,12 @@ impl Places {
         if let Some(node) = &place.node {
             self.on_node.insert((node.clone(), place.clone()));
         }
-        self.told.insert(place, told);
+        self.version += u64::from(self.told.insert(place, told).is_none());
+    }
+
+    /// Another number whenever a place has come or gone.
+    pub(super) fn version(&self) -> u64 {
+        self.version
     }
 
     /// Whether it was there.
@@ -44,7 +51,9 @@ impl Places {
         if let Some(node) = &place.node {
             self.on_node.remove(&(node.clone(), place.clone()));
         }
-        self.told.remove(place).is_some()
+        let was_there = self.told.remove(place).is_some();
+        self.version += u64::from(was_there);
+        was_there
     }
 
     pub(super) fn all(&self) -> impl Iterator<Item = (&Place, &Told)> {

@@ -13,12 +13,10 @@
 //! Answers come from the documents of the last [`Served::flush`], as notices do: so what a place was told last is always
 //! what its configuration is in the shown documents, and no configuration has to be kept beside them.
 
-#[path = "served_late.rs"]
-mod late;
 #[path = "served_trial.rs"]
 mod trial;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fmt;
 use std::time::Instant;
 
@@ -60,8 +58,8 @@ pub struct Served {
     asked: Asked,
     /// Places that went since the last flush.
     untracked: Vec<Place>,
-    /// Places of which more became known since the last flush, and whether it is open what they have.
-    late: BTreeMap<Place, bool>,
+    /// Places of another life that were not looked at yet: nobody knows what they were told.
+    restored: BTreeSet<Place>,
 }
 
 /// Without the documents: they hold secrets in clear.
@@ -91,7 +89,7 @@ impl Served {
             places: Places::default(),
             asked: Asked::default(),
             untracked: Vec::new(),
-            late: BTreeMap::new(),
+            restored: BTreeSet::new(),
         }
     }
 
@@ -126,12 +124,6 @@ impl Served {
     /// Every place that is told of changes, with what it was told last.
     pub fn told(&self) -> impl Iterator<Item = (&Place, &Told)> {
         self.places.all()
-    }
-
-    /// What a place was told last, if it is told of changes.
-    #[must_use]
-    pub fn told_at(&self, place: &Place) -> Option<&Told> {
-        self.places.get(place)
     }
 
     /// Whether an instance of a service, or the service without one, is told of changes anywhere.
@@ -212,7 +204,7 @@ impl Served {
     #[must_use]
     pub fn has_pending(&self) -> bool {
         let has_documents = !self.pending.is_empty() || self.next.is_loaded != self.shown.is_loaded;
-        has_documents || !self.untracked.is_empty() || (self.next.is_loaded && !self.late.is_empty())
+        has_documents || !self.untracked.is_empty() || (self.next.is_loaded && !self.restored.is_empty())
     }
 
     /// Shows the newest documents, and tells whose configuration is another one than the last that they were told.
@@ -231,14 +223,10 @@ impl Served {
         if self.next.is_loaded {
             let (old, new) = (&self.shown.state, &self.next.state);
             let mut looked = concerned(&self.site, &self.places, old, new, &keys);
-            if !self.shown.is_loaded {
-                // What an earlier life told may have changed, or gone, without any trace in these documents.
-                looked.extend(self.places.all().map(|(place, _)| place.clone()));
-            }
-            let late = std::mem::take(&mut self.late);
-            looked.extend(late.keys().cloned());
+            let restored = std::mem::take(&mut self.restored);
+            looked.extend(restored.iter().cloned());
             for place in looked {
-                let is_open = late.get(&place).copied().unwrap_or(false);
+                let is_open = restored.contains(&place);
                 self.look(place, is_open, &mut out);
             }
         }
@@ -276,13 +264,56 @@ impl Served {
         }
     }
 
-    /// How a place that is told of changes stands, for one that had something with this hash, of which no more is known.
+    /// A notice for each place, for a worker that begins to notify. They have the newest revision: other workers may have
+    /// notified the same state with a later one than is known here.
+    pub fn announce(&mut self) -> Vec<Notice> {
+        let places: Vec<(Place, String)> = self
+            .places
+            .all()
+            .filter_map(|(place, told)| Some((place.clone(), told.hash.clone()?)))
+            .collect();
+        let revision = self.floor;
+        let mut notices = Vec::with_capacity(places.len());
+        for (place, hash) in places {
+            let Some(sources) = self.shown.at(&self.site, &place) else {
+                continue;
+            };
+            notices.push(self.notice(&place, revision, None, None, Some((sources, hash.clone()))));
+            let hash = Some(hash);
+            self.places.insert(place, Told { revision, hash });
+        }
+        notices
+    }
+
+    /// Takes over what another life, or another worker, knew: places that it notified, and the revision up to which it did. The
+    /// places count as if they had asked now, because they may well be running.
+    pub fn restore(&mut self, floor: u64, places: impl IntoIterator<Item = Place>, now: Instant) {
+        self.floor = self.floor.max(floor);
+        for place in places {
+            self.note_asked(&place, now);
+            if self.places.get(&place).is_none() {
+                self.restored.insert(place);
+            }
+        }
+    }
+
+    /// Takes a later state of the store that is served: it replaces even what the main service told.
+    pub fn take_later(&mut self, state: State) {
+        self.pending.extend(difference(&self.next.state, &state));
+        let rank = self.rank.map_or(Source::Copy, |rank| rank.max(Source::Copy));
+        self.replace(state, rank);
+    }
+
+    /// No place is notified with a lower revision.
     #[must_use]
-    pub fn notice_of(&self, place: &Place, previous_hash: Option<String>) -> Option<Notice> {
-        let told = self.places.get(place)?;
-        let hash = told.hash.clone()?;
-        let sources = self.shown.at(&self.site, place)?;
-        Some(self.notice(place, told.revision, previous_hash, None, Some((sources, hash))))
+    pub fn floor(&self) -> u64 {
+        self.floor
+    }
+
+    /// Another number whenever a place has come or gone.
+    #[must_use]
+    pub fn places_version(&self) -> u64 {
+        self.places.version()
     }
 
     /// `old` is what the place was told last, as far as it is known.

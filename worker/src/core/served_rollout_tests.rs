@@ -77,9 +77,12 @@ fn a_roll_out_that_fails_here_does_not_count_here() {
     assert!(!served.has_pending());
     assert_eq!(served.failed(), ["Rollout/slower"]);
     let mut again = Served::new(site(Some("robot-1")));
-    again.restore(remembered(&served), served.failed().to_vec(), Instant::now());
+    again.fail_rollout("Rollout/slower");
+    again.restore(served.floor(), remembered(&served), Instant::now());
     again.load(served.state().clone(), Source::Copy).unwrap();
-    assert!(flush(&mut again).is_empty());
+    flush(&mut again);
+    let after = again.standing_of(&place("slam/0@robot-1")).unwrap();
+    assert_eq!(after.hash, served.standing_of(&place("slam/0@robot-1")).unwrap().hash);
 }
 
 #[test]

@@ -252,38 +252,27 @@ fn a_new_instance_that_says_nothing_is_tracked_without_a_notice() {
     assert!(served.standing_of(&place("slam/4")).is_some());
 }
 
-fn remembered(served: &Served) -> Vec<(Place, Told)> {
-    served
-        .told()
-        .map(|(place, told)| (place.clone(), told.clone()))
-        .collect()
+fn remembered(served: &Served) -> Vec<Place> {
+    served.told().map(|(place, _)| place.clone()).collect()
 }
 
 #[test]
-fn after_a_restart_only_what_differs_is_told() {
+fn after_a_restart_nothing_older_is_told_and_places_that_asked_are_known() {
     let mut before = served(Some("robot-1"));
     put(&mut before, 20, vec![slam(31, 20)]);
     flush(&mut before);
+    before.ask(&place("slam/9@robot-1"), Instant::now()).unwrap();
     let mut served = Served::new(site(Some("robot-1")));
-    served.restore(remembered(&before), [], Instant::now());
+    served.restore(before.floor(), remembered(&before), Instant::now());
     // The copy is older than what was told: nothing older is told, so the revision stays.
     served.load(state(10, documents()), Source::Copy).unwrap();
     let notices = flush(&mut served);
-    assert_eq!(notices.len(), 4);
-    assert!(
-        notices
-            .iter()
-            .all(|notice| notice.revision == 20 && notice.previous_hash.is_some())
-    );
-    assert_eq!(
-        notices[0].paths,
-        ["/log", "/rate_hz"],
-        "what was told is not known any more"
-    );
+    assert_eq!(notices.len(), 5);
+    assert!(notices.iter().all(|notice| notice.revision == 20));
     // Then the main service comes back.
     put(&mut served, 21, vec![slam(31, 20)]);
     let notices = flush(&mut served);
-    assert_eq!(notices.len(), 4);
+    assert_eq!(notices.len(), 5);
     assert!(
         notices
             .iter()
@@ -296,7 +285,7 @@ fn a_service_that_went_while_the_worker_was_down_is_told() {
     let mut before = served(Some("robot-1"));
     before.ask(&place("slam/9@robot-1"), Instant::now()).unwrap();
     let mut served = Served::new(site(Some("robot-1")));
-    served.restore(remembered(&before), [], Instant::now());
+    served.restore(before.floor(), remembered(&before), Instant::now());
     served
         .load(state(12, [document("Layer/edge", 1, json!({}))]), Source::Copy)
         .unwrap();
@@ -307,6 +296,30 @@ fn a_service_that_went_while_the_worker_was_down_is_told() {
             .iter()
             .all(|notice| notice.hash.is_none() && notice.revision == 12)
     );
+}
+
+#[test]
+fn an_announcement_is_of_all_places_and_of_the_newest_revision() {
+    let mut served = served(Some("robot-1"));
+    put(&mut served, 20, vec![slam(31, 20)]);
+    flush(&mut served);
+    put(
+        &mut served,
+        21,
+        vec![document("Service/nav", 21, json!({ "description": "x" }))],
+    );
+    flush(&mut served);
+    let notices = served.announce();
+    assert_eq!(
+        notices.len(),
+        served.told().filter(|(_, told)| told.hash.is_some()).count()
+    );
+    assert!(
+        notices
+            .iter()
+            .all(|notice| notice.revision == 21 && notice.previous_hash.is_none())
+    );
+    assert_eq!(served.standing_of(&notices[0].place).unwrap().revision, 21);
 }
 
 #[test]

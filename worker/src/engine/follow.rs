@@ -57,6 +57,10 @@ impl Engine {
                         self.note_catching_up();
                         self.note_texts(&change);
                         self.owe_notes();
+                        // Of another store, whose revisions began anew.
+                        if self.served.floor() > self.replica.state().revision() {
+                            self.renew_notes();
+                        }
                         self.keep(true);
                         self.flush_soon();
                     }

@@ -16,21 +16,17 @@ fn at(store_id: &str, revision: u64, documents: Vec<Document>) -> Loaded {
     }
 }
 
-/// As an earlier life told the service, or its instance, something of a revision.
-fn told(instance: Option<&str>, revision: u64, hash: &str) -> Notes {
-    let mut notes = Notes::default();
-    let place = blaze_domain::config::effective::At {
-        service: Some("slam".parse().unwrap()),
-        instance: instance.map(|name| name.parse().unwrap()),
-        layer: Some("edge".parse().unwrap()),
+fn with_place(instance: &str, loaded: Loaded) -> Loaded {
+    let place = Place {
+        service: "slam".parse().unwrap(),
+        instance: Some(instance.parse().unwrap()),
         node: Some("robot-1".parse().unwrap()),
     };
-    let told = crate::copy::Told {
-        revision,
-        hash: Some(hash.into()),
-    };
-    notes.tell(place, told);
-    notes
+    let notes = Arc::new(Notes {
+        places: vec![place],
+        ..Notes::default()
+    });
+    Loaded { notes, ..loaded }
 }
 
 impl World {
@@ -141,16 +137,12 @@ async fn notes_of_another_worker_count_with_its_documents_alone() {
     let mut w = world_from(Some(at("s", 2, documents(30))), true);
     w.slam().await;
     w.rest().await;
-    let with_notes = |revision, rate| Loaded {
-        notes: Arc::new(told(Some("0"), revision, "sha256:other")),
-        ..at("s", revision, documents(rate))
-    };
     // Not newer than what is served: what the other one told of it is its own affair.
-    w.finds_of(true, with_notes(2, 30)).await;
+    w.finds_of(true, with_place("1", at("s", 2, documents(30)))).await;
     assert_eq!(w.rest().await, []);
-    w.finds_of(true, with_notes(6, 30)).await;
+    w.finds_of(true, with_place("1", at("s", 6, documents(30)))).await;
     let (_, notice) = w.notice().await;
-    assert_eq!((&notice["instance"], &notice["revision"]), (&json!("0"), &json!(6)));
+    assert_eq!((&notice["instance"], &notice["revision"]), (&json!("1"), &json!(6)));
 }
 
 #[tokio::test(start_paused = true)]
@@ -176,27 +168,6 @@ async fn texts_of_secrets_that_are_found_are_told() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn whoever_may_have_heard_something_else_hears_how_it_is() {
-    let mut w = world_from(Some(at("s", 2, documents(30))), true);
-    w.slam().await;
-    w.rest().await;
-    // It was another one at 6, and is again what this worker knows.
-    let loaded = Loaded {
-        notes: Arc::new(told(Some("0"), 6, "sha256:other")),
-        ..at("s", 7, documents(30))
-    };
-    w.finds(loaded.clone()).await;
-    let (_, notice) = w.notice().await;
-    assert_eq!(
-        (&notice["instance"], &notice["revision"], &notice["config"]["rate_hz"]),
-        (&json!("0"), &json!(7), &json!(30))
-    );
-    w.rest().await;
-    w.finds(loaded).await;
-    assert_eq!(w.rest().await, [], "nothing is new");
-}
-
-#[tokio::test(start_paused = true)]
 async fn a_roll_out_that_failed_in_another_life_is_undone() {
     let mut documents = canary_documents();
     documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
@@ -204,9 +175,10 @@ async fn a_roll_out_that_failed_in_another_life_is_undone() {
     let mut w = world_from(Some(at("s", 2, documents.clone())), true);
     w.rest().await;
     assert_eq!(w.rate().await, 500);
-    let mut notes = Notes::default();
-    notes.fail("u-1");
-    let notes = Arc::new(notes);
+    let notes = Arc::new(Notes {
+        failed: vec!["u-1".to_owned()],
+        ..Notes::default()
+    });
     w.finds(Loaded {
         notes,
         ..at("s", 2, documents)

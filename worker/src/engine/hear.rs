@@ -89,9 +89,8 @@ impl Engine {
                 tracing::warn!(rollout = %failure.name, reason, "a roll-out has failed here and is undone");
                 self.counts.failed_rollouts += 1;
                 self.served.fail_rollout(&failure.uid);
-                self.has_undone = true;
-                Arc::make_mut(&mut self.notes).fail(&failure.uid);
                 // A new life must not try it again, whether it tells anybody of the former configuration or not.
+                self.renew_notes();
                 self.keep(true);
                 self.flush_soon();
                 self.acknowledge_soon();

@@ -1,18 +1,19 @@
-//! Whether this worker tells services anything, and what it tells when it begins to.
+//! Whether this worker notifies services, and what it does when it begins to.
 //!
 //! ```text
-//! leads, and is not behind what was told already ──▶ tells: notices and keys go out, the mark beside the lease moves on
-//! else                                           ──▶ what is to be told is kept (module `missed`)
+//! leads, and is not behind the mark beside the lease ──▶ notifies: keys, one notice for every place, then each change
+//! else                                               ──▶ follows: what changes is not kept, for the next leader notifies all
 //! ```
+//!
+//! Receivers drop a notice with the hash that they have, so a repeat costs a message and no call of a service.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::missed::{Left, Since};
-use super::{Engine, SETTLE, WAIT_FOR_OTHERS};
-use crate::core::Notice;
+use super::{Engine, SETTLE};
+use crate::core::{Place, Source};
 use crate::lease::Mark;
 use crate::serve::Told;
 
@@ -26,7 +27,7 @@ impl Engine {
     }
 
     /// This worker answers and notifies from now on, or does not any more. Of two terms one ends before the other begins,
-    /// also if nobody looked in between: others may have told something newer.
+    /// also if nobody looked in between: others may have notified something newer.
     pub(super) fn lead(&mut self, term: Option<u64>) {
         if self.leads == term {
             return;
@@ -39,15 +40,15 @@ impl Engine {
         self.led_at = Instant::now();
         self.begin_telling();
         if self.leads.is_some() && !self.tells {
-            tracing::info!("others have told more than is known here; services are told again once it is");
+            tracing::info!("services were notified of a later state than is known here; they are notified once it is");
         }
     }
 
-    /// Services were told so far, whoever did it.
+    /// Services were notified up to this state, by whomever.
     pub(super) fn note_told(&mut self, mark: Option<Mark>) {
         self.noted = mark;
         self.follow_rollouts();
-        self.settle_soon();
+        self.begin_telling();
     }
 
     /// The state that is shown, as far as it is one of a main service.
@@ -58,8 +59,9 @@ impl Engine {
         })
     }
 
-    /// Whether others have told more than is known here. What the main service calls the newest some time after this worker
-    /// began to lead is not behind, whatever the mark says; before, its word may be one from before the process was stopped.
+    /// Whether services were notified of more than is known here. What the main service calls the newest some time after
+    /// this worker began to lead is not behind, whatever the mark says; before, its word may be one from before the process
+    /// was stopped.
     fn is_behind(&self) -> bool {
         match (&self.noted, &self.shown) {
             (None, _) => false,
@@ -71,140 +73,93 @@ impl Engine {
         }
     }
 
-    /// Tells what others may have left, and from now on what changes; if it leads and knows enough.
+    /// Notifies from now on, if it leads and knows enough: keys first, for they may be those of an older state.
     pub(super) fn begin_telling(&mut self) {
-        if self.tells || self.leads.is_none() || self.is_behind() {
+        if !self.tells && self.leads.is_some() && !self.is_behind() {
+            self.tells = true;
+            self.keyed.clear();
+            let mut told: Vec<Told> = Vec::new();
+            // First what goes: an instance that moves has the same key there.
+            for notice in self.ends.repeat() {
+                // The service may be there again.
+                if self.served.look_up(&notice.place).is_none() {
+                    told.extend(self.of_notice(&notice).map(|told| Told { revision: 0, ..told }));
+                }
+            }
+            for place in &self.places() {
+                if let Some(standing) = self.served.standing_of(place) {
+                    told.extend(self.of_standing(place, &standing));
+                }
+            }
+            self.tell(told);
+            if self.served.is_ready() {
+                self.outputs.speaker.sweep_keys();
+            }
+            self.settle_soon();
+        }
+        if self.may_announce() {
+            // With the changes that are still to be shown.
+            self.flush_soon();
+        }
+    }
+
+    /// Whether every place is to be notified once: other workers, or another life, may have died before they did. A copy
+    /// may be older than what services were notified of, so it is announced only if a mark says that it is not.
+    pub(super) fn may_announce(&self) -> bool {
+        let is_newest = match self.served.source() {
+            Some(Source::Main | Source::File) => true,
+            Some(Source::Copy) => self.noted.is_some(),
+            None => false,
+        };
+        self.tells && !self.has_announced && is_newest && self.catching_up.is_none()
+    }
+
+    /// Notifies every place but those that hear of a change anyway.
+    pub(super) fn announce(&mut self, except: &BTreeSet<Place>) {
+        if !self.may_announce() || !self.served.is_ready() {
             return;
         }
-        self.tells = true;
-        self.keyed.clear();
-        self.confirm();
-        let (gone, left): (Vec<Notice>, Vec<Notice>) = self
-            .missed
-            .take()
-            .into_iter()
-            .filter_map(|left| self.as_it_is(left))
-            .partition(|notice| notice.hash.is_none());
-        for notice in &gone {
-            self.fade_anew(&notice.place);
-        }
-        let mut told: Vec<Told> = Vec::with_capacity(gone.len() + left.len());
-        // First what goes: an instance that moves has the same key there.
-        for notice in gone.iter().chain(&left) {
-            // Nobody knows since when they have not heard: no window of a roll-out opens before they have.
-            told.extend(self.of_notice(notice).map(|told| Told { revision: 0, ..told }));
-        }
-        for place in &self.places() {
-            if let Some(standing) = self.served.standing_of(place) {
-                // Keys may be those of an older state.
-                told.extend(self.of_standing(place, &standing));
-            }
-        }
-        self.outputs.speaker.tell(told);
-        if self.served.is_ready() {
-            self.outputs.speaker.sweep_keys();
-        }
-        self.settle_soon();
+        self.has_announced = true;
+        let notices = self.served.announce();
+        let notices = notices.iter().filter(|notice| !except.contains(&notice.place));
+        // Nobody knows since when they have not heard: no window of a roll-out opens before they have.
+        let told: Vec<Told> = notices
+            .filter_map(|notice| {
+                Some(Told {
+                    revision: 0,
+                    ..self.of_notice(notice)?
+                })
+            })
+            .collect();
+        self.tell(told);
     }
 
-    /// What a place is to hear by now; `None`: nothing, because it is not told of changes any more.
-    fn as_it_is(&self, left: Left) -> Option<Notice> {
-        let Left {
-            place,
-            difference,
-            gone,
-        } = left;
-        let Some(mut notice) = self.served.notice_of(&place, difference.previous_hash) else {
-            return gone;
-        };
-        if let Some(paths) = difference.paths {
-            notice.paths = paths.into_iter().collect();
-            notice.scopes = difference.scopes.into_iter().collect();
-        }
-        Some(notice)
-    }
-
-    /// What waits is for others to tell, and may be old by the time the broker takes it; if there are none, it is told later.
+    /// What waits may be old by the time the broker takes it; whoever leads next notifies every place.
     fn stop_telling(&mut self) {
         if !std::mem::replace(&mut self.tells, false) {
             return;
         }
-        let now = Instant::now();
-        let is_all = |mark: &Option<Mark>| {
-            mark.as_ref()
-                .zip(self.shown.as_ref())
-                .is_some_and(|(mark, shown)| mark.covers(shown))
-        };
-        let since = Since {
-            mark: self.shown.clone(),
-            // What waits although all of this state was marked as told came without a commit, or is told once more.
-            is_undone: is_all(&self.noted) || is_all(&self.outputs.told.borrow()),
-        };
-        let speaker = &self.outputs.speaker;
-        for place in self
-            .unnoted
-            .keys()
-            .filter(|place| speaker.is_waiting(&place.to_string()))
-        {
-            let before = self.notes.told(&place.at(&self.identity.site));
-            let before = before.and_then(|before| before.hash.as_deref()).map(str::to_owned);
-            self.missed.note_unknown(place, before, since.clone(), now);
-        }
-        for (place, notice) in std::mem::take(&mut self.farewells) {
-            if speaker.is_waiting(&place.to_string()) {
-                self.missed.note(&notice, since.clone(), now);
-            }
-        }
-        speaker.clear();
-        self.take_away_again();
+        self.has_announced = false;
+        self.outputs.speaker.clear();
+        self.ends.take_away_again();
         self.keyed.clear();
         self.outputs.told.send_replace(None);
-        self.settle_soon();
     }
 
-    /// Looks soon whether places have been told.
+    /// Looks soon whether the broker has taken what waits.
     pub(super) fn settle_soon(&mut self) {
-        let pace = if self.tells { SETTLE } else { WAIT_FOR_OTHERS };
-        self.settle_at.get_or_insert(Instant::now() + pace);
+        self.settle_at.get_or_insert(Instant::now() + SETTLE);
     }
 
-    fn confirm(&mut self) {
-        let now = Instant::now();
-        match (&self.noted, &self.shown) {
-            (Some(noted), shown) => {
-                self.missed.confirm(noted, now);
-                // Whoever told all of this state has told what followed from a file or another store before it.
-                if shown.as_ref().is_some_and(|shown| noted.covers(shown)) {
-                    self.missed.confirm_others(&noted.store_id, now);
-                }
-            }
-            // Of a mounted file nobody leaves a mark.
-            (None, None) => self.missed.confirm_others("", now),
-            (None, Some(_)) => {}
-        }
-    }
-
-    /// Looks what was told meanwhile: notes it for the next life, and leaves a mark for whoever leads next.
+    /// Looks what the broker has taken meanwhile, leaves a mark for whoever leads next, and has new places kept.
     pub(super) fn settle(&mut self) {
         self.settle_at = None;
-        if !self.tells {
-            self.confirm();
-        }
-        let speaker = &self.outputs.speaker;
-        let is_told = |place: &crate::core::Place| match self.tells {
-            true => !speaker.is_waiting(&place.to_string()),
-            false => !self.missed.contains(place),
-        };
-        let told: BTreeSet<_> = self.unnoted.keys().filter(|place| is_told(place)).cloned().collect();
-        self.farewells.retain(|place, _| speaker.is_waiting(&place.to_string()));
-        let is_all_told = speaker.untold().is_none();
-        self.note_all(told);
         if self.tells {
             self.leave_mark();
         }
         self.open_windows();
-        let is_done = is_all_told && self.unnoted.is_empty() && self.farewells.is_empty() && self.missed.len() == 0;
-        if !is_done {
+        self.keep_notes();
+        if self.tells && self.outputs.speaker.untold().is_some() {
             self.settle_soon();
         }
     }

@@ -12,12 +12,11 @@
 //! ```
 
 mod ask;
-mod fade;
+mod ends;
 mod follow;
 mod found;
 mod hear;
 mod lead;
-mod missed;
 mod own;
 mod ports;
 mod status;
@@ -37,10 +36,9 @@ use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
 use crate::copy::{Loaded, Notes, Position, Update, defaults, lacks_text};
-use crate::core::{Gate, Notice, Place, Replica, Served, Signs, Source};
+use crate::core::{Gate, Place, Replica, Served, Signs, Source};
 use crate::lease::Mark;
-use fade::Fades;
-use missed::Missed;
+use ends::Ends;
 
 pub use hear::Sign;
 pub use own::Own;
@@ -49,10 +47,8 @@ pub use status::Status;
 
 /// Within this time several changes may become one notice.
 const TOGETHER: Duration = Duration::from_millis(20);
-/// Between two looks whether the broker has taken what places are told.
+/// Between two looks whether the broker has taken what waits.
 const SETTLE: Duration = Duration::from_millis(200);
-/// The same for a worker that does not tell: between two looks whether others have.
-const WAIT_FOR_OTHERS: Duration = Duration::from_secs(1);
 /// What the worker has is said this long after it became so, and with it what came meanwhile.
 const ACK_AFTER: Duration = Duration::from_millis(50);
 /// While there is always something new it is said so often: the digest over everything is worked out each time.
@@ -70,7 +66,9 @@ pub struct Engine {
     outputs: Outputs,
     replica: Replica,
     served: Served,
+    /// As they are kept, and the version of the places in them.
     notes: Arc<Notes>,
+    notes_version: u64,
     /// What came could not be read, and would come again: everything is to be asked for.
     wants_all: bool,
     /// The text of a secret is not here.
@@ -91,11 +89,11 @@ pub struct Engine {
     leads: Option<u64>,
     /// Since when.
     led_at: Instant,
-    /// It leads and knows enough to tell services of it.
+    /// It leads and knows enough to notify services.
     tells: bool,
-    /// A roll-out was undone here, and the state without it is not shown yet.
-    has_undone: bool,
-    /// How far services were told, by whomever.
+    /// Every place was notified since it does.
+    has_announced: bool,
+    /// How far services were notified, by whomever.
     noted: Option<Mark>,
     /// The state that is shown.
     shown: Option<Mark>,
@@ -111,14 +109,8 @@ pub struct Engine {
     keyed: BTreeMap<String, Place>,
     /// Keys of an earlier life were looked for.
     has_swept: bool,
-    /// What places are being told, until the broker has taken it.
-    unnoted: BTreeMap<Place, (u64, Option<String>)>,
-    /// What the broker keeps of places that are not told of anything any more.
-    fades: Fades,
-    /// That services are deleted, until the broker has taken it.
-    farewells: BTreeMap<Place, Notice>,
-    /// What others tell, or nobody, as long as this worker does not know that it was told.
-    missed: Missed,
+    /// Places that are not notified any more.
+    ends: Ends,
     defaults_problem: Option<String>,
     /// The worker's own configuration.
     own: Option<Own>,
@@ -135,6 +127,7 @@ impl Engine {
             served: Served::new(identity.site.clone()),
             replica: Replica::new(layer.clone()),
             notes: Arc::default(),
+            notes_version: 0,
             wants_all: false,
             lacks_texts: false,
             owes_texts: false,
@@ -148,7 +141,7 @@ impl Engine {
             leads: None,
             led_at: now,
             tells: false,
-            has_undone: false,
+            has_announced: false,
             noted: None,
             shown: None,
             flushed: None,
@@ -159,10 +152,7 @@ impl Engine {
             acked: now.checked_sub(ACK_PACE).unwrap_or(now),
             keyed: BTreeMap::new(),
             has_swept: false,
-            unnoted: BTreeMap::new(),
-            fades: Fades::default(),
-            farewells: BTreeMap::new(),
-            missed: Missed::default(),
+            ends: Ends::default(),
             defaults_problem: None,
             own: None,
             counts: Counts::default(),
@@ -183,17 +173,13 @@ impl Engine {
             ..
         } = loaded.position;
         let state = self.state_of(revision, loaded.documents);
-        let told = tell::told_of(&loaded.notes);
-        let failed: Vec<String> = loaded.notes.failed().map(str::to_owned).collect();
-        self.served.restore(told, failed, now.into_std());
-        self.notes = loaded.notes;
+        self.take_notes(&loaded.notes);
         self.replica = Replica::from_copy(layer, Some(store_id), state.clone(), Some(as_of));
         // Nothing was loaded before it.
         if let Err(error) = self.served.load(state, Source::Copy) {
             tracing::error!(%error, "the copy is not used");
         }
         self.lacks_texts = lacks_texts(self.replica.state());
-        self.fade_from_notes();
         self.note_all_services();
         self.flush_at = Some(now);
         // The one of the copies that is behind the other catches up.
@@ -228,7 +214,7 @@ impl Engine {
                 () = sleep_until(flush_at.unwrap_or_else(Instant::now)), if flush_at.is_some() => self.flush(),
                 Some(query) = inputs.queries.recv() => self.answer_query(query),
                 Some(found) = inputs.found.recv() => self.on_found(found),
-                // Before the term that it is of: whoever takes over tells what others have not.
+                // Before the term that it is of: whoever takes over must not be behind it.
                 Ok(()) = inputs.noted.changed() => {
                     let mark = inputs.noted.borrow_and_update().clone();
                     self.note_told(mark);
@@ -240,7 +226,7 @@ impl Engine {
                 // What is due is done before what comes, of which there may always be more. Each of these is due again only later.
                 () = sleep_until(self.look_at) => {
                     self.look_at_signs();
-                    self.look_at_fading();
+                    self.look_at_ends();
                 }
                 () = sleep_until(settle_at.unwrap_or_else(Instant::now)), if settle_at.is_some() => self.settle(),
                 () = sleep_until(self.ack_at) => self.acknowledge(),
@@ -290,6 +276,32 @@ impl Engine {
             notes: Arc::clone(&self.notes),
             has_changed,
         });
+    }
+
+    /// Has places that came or went kept, and roll-outs that failed.
+    fn keep_notes(&mut self) {
+        if self.notes_version != self.served.places_version() {
+            self.renew_notes();
+            self.keep(true);
+        }
+        self.owe_notes();
+    }
+
+    fn renew_notes(&mut self) {
+        self.notes_version = self.served.places_version();
+        self.notes = Arc::new(Notes {
+            failed: self.served.failed().to_vec(),
+            places: self.places(),
+            floor: self.served.floor(),
+        });
+    }
+
+    /// Copies without what is still to come do not count as current.
+    fn owe_notes(&self) {
+        if let Some(copies) = &self.outputs.copies {
+            let is_owed = self.notes_version != self.served.places_version();
+            copies.owe(self.served.has_pending() || is_owed);
+        }
     }
 
     fn take_defaults(&mut self, status: &defaults::Status) {

@@ -109,6 +109,4 @@ pub struct Counts {
     pub left_out: u64,
     /// Roll-outs that failed here and were undone.
     pub failed_rollouts: u64,
-    /// Notices that are not told should this worker lead, because too many are kept for that.
-    pub missed: u64,
 }

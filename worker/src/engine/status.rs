@@ -24,8 +24,6 @@ pub struct Status {
     pub documents: usize,
     /// Canaries that are not judged, because there are too many.
     pub unwatched: usize,
-    /// Places that others tell, or nobody, as long as it is not known that they were told.
-    pub unconfirmed: usize,
     /// Why the mounted file is not used.
     pub defaults_problem: Option<String>,
     /// Why there is no stream.
@@ -69,7 +67,6 @@ impl Engine {
             json,
             counts: Counts {
                 left_out: self.signs.left_out(),
-                missed: self.missed.dropped(),
                 ..self.counts
             },
             is_ready: self.served.is_ready(),
@@ -77,7 +74,6 @@ impl Engine {
             revision,
             documents: self.replica.state().len(),
             unwatched: self.gate.unwatched(),
-            unconfirmed: self.missed.len(),
             defaults_problem: self.defaults_problem.clone(),
             reason: self.reason.clone(),
         }

@@ -1,56 +1,22 @@
 //! From a change to what services are told.
 
 use std::collections::BTreeSet;
-use std::sync::Arc;
 use std::time::Duration;
 
 use blaze_brokers::KeyedMessage;
-use blaze_domain::config::effective::At;
 use blaze_domain::config::secret;
-use blaze_domain::{DocumentName, InstanceName};
 use bytes::Bytes;
 use tokio::time::Instant;
 
-use super::fade::record_key;
-use super::missed::Since;
+use super::ends::record_key;
 use super::{Engine, TOGETHER, lacks_texts, now};
-use crate::copy::{Notes, Told as Noted, lacks_text};
+use crate::copy::lacks_text;
 use crate::core::messages::{self, Delivery, GetRequest};
-use crate::core::{Change, Flushed, Notice, Place, Site, Standing, Told as ServedTold};
+use crate::core::{Change, Flushed, Notice, Place, Standing};
 use crate::serve::{Told, changed};
 
 /// How long after the texts of secrets came everybody with secrets gets a whole answer: each asks within this time.
 const TEXTS: Duration = Duration::from_secs(180);
-
-/// What an earlier life told, from its notes.
-pub(super) fn told_of(notes: &Notes) -> Vec<(Place, ServedTold)> {
-    let told = |noted: &Noted| ServedTold {
-        revision: noted.revision,
-        hash: noted.hash.as_ref().map(ToString::to_string),
-    };
-    let all = notes
-        .all_told()
-        .filter_map(|(at, noted)| Some((place_of(at)?, told(noted))));
-    all.collect()
-}
-
-/// The place of a note.
-pub(super) fn place_of(at: &At) -> Option<Place> {
-    Some(Place {
-        service: at.service.clone()?,
-        instance: at.instance.as_ref().map(InstanceName::from),
-        node: at.node.clone(),
-    })
-}
-
-pub(super) fn at(place: &Place, site: &Site) -> At {
-    At {
-        service: Some(place.service.clone()),
-        instance: place.instance.as_ref().map(DocumentName::from),
-        layer: Some(site.layer.clone()),
-        node: place.node.clone(),
-    }
-}
 
 impl Engine {
     /// Has changes told: at once after a quiet while, else together with what comes until then. What was missed in an outage
@@ -73,56 +39,44 @@ impl Engine {
         } = self.served.flush(instant.into_std());
         self.counts.notices += notices.len() as u64;
         self.shown = self.mark();
-        let since = Since {
-            mark: self.shown.clone(),
-            is_undone: std::mem::take(&mut self.has_undone),
-        };
+        let is_first = self.served.is_ready() && !std::mem::replace(&mut self.has_swept, self.served.is_ready());
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
         // First what goes: an instance that moves has the same key there.
         for place in &untracked {
-            let noted = at(place, &self.identity.site);
-            if !self.fade(place, &noted) {
-                // Whether anything is still owed is seen when the rest settles.
-                self.unnoted.remove(place);
-                Arc::make_mut(&mut self.notes).forget(&noted);
-            }
-            self.missed.forget(place);
+            self.ends.add(place, None);
             told.extend(self.without_key(place));
         }
+        let (gone, mut changed): (Vec<Notice>, Vec<Notice>) =
+            notices.into_iter().partition(|notice| notice.hash.is_none());
+        for notice in &gone {
+            self.ends.add(&notice.place, Some(notice));
+        }
         self.serve_channels();
-        let is_gone = |notice: &&Notice| notice.hash.is_none();
-        for notice in notices
-            .iter()
-            .filter(is_gone)
-            .chain(notices.iter().filter(|notice| !is_gone(notice)))
-        {
-            match self.tells {
-                true => told.extend(self.of_notice(notice)),
-                false => self.missed.note(notice, since.clone(), instant),
-            }
-            if !untracked.contains(&notice.place) {
-                self.note(&notice.place, notice.revision, notice.hash.clone());
+        if is_first {
+            // Nobody knows what they were notified of before: see `announce`.
+            changed.clear();
+        }
+        if self.tells {
+            for notice in gone.iter().chain(&changed) {
+                told.extend(self.of_notice(notice));
             }
         }
-        let noticed: BTreeSet<&Place> = notices.iter().map(|notice| &notice.place).collect();
-        let is_first = self.served.is_ready() && !std::mem::replace(&mut self.has_swept, self.served.is_ready());
+        let noticed: BTreeSet<Place> = changed.into_iter().chain(gone).map(|notice| notice.place).collect();
         // What an earlier life wrote may be gone, or of another form.
         let all = if is_first { self.places() } else { tracked };
-        for place in &all {
-            if let Some(standing) = self.served.standing_of(place)
-                && !noticed.contains(place)
-            {
-                self.note(place, standing.revision, Some(standing.hash.clone()));
+        for place in all.iter().filter(|place| !noticed.contains(place)) {
+            if let Some(standing) = self.served.standing_of(place) {
                 told.extend(self.of_standing(place, &standing));
             }
         }
         self.tell(told);
+        self.announce(&noticed);
         self.tell_texts();
         if is_first && self.tells {
             self.outputs.speaker.sweep_keys();
         }
         self.tell_own();
-        self.owe_notes();
+        self.keep_notes();
         self.begin_telling();
         self.settle_soon();
         // After the notices: only what was told can go well or badly.
@@ -172,7 +126,7 @@ impl Engine {
     }
 
     /// Keys that nobody is told now are written when this worker begins to tell.
-    pub(super) fn tell(&mut self, told: Vec<Told>) {
+    pub(super) fn tell(&self, told: Vec<Told>) {
         if self.tells {
             self.outputs.speaker.tell(told);
         }
@@ -190,7 +144,6 @@ impl Engine {
             return;
         }
         if let Some(standing) = self.served.standing_of(&place) {
-            self.note(&place, standing.revision, Some(standing.hash.clone()));
             let told = self.of_standing(&place, &standing);
             self.tell(told.into_iter().collect());
         }
@@ -206,9 +159,6 @@ impl Engine {
             Some(standing) => self.key(&notice.place, &standing),
             None => self.key_to_go(&notice.place),
         };
-        if notice.hash.is_none() {
-            self.farewells.insert(notice.place.clone(), notice.clone());
-        }
         Some(Told {
             place: notice.place.to_string(),
             key,
@@ -267,43 +217,5 @@ impl Engine {
     /// Without the prefix of the server.
     fn key_name(&self, place: &Place) -> String {
         messages::config_key("", &place.service, place.instance.as_ref())
-    }
-
-    /// Has it noted what a place is told, once the broker has taken it: whoever dies before tells it again in the next life.
-    pub(super) fn note(&mut self, place: &Place, revision: u64, hash: Option<String>) {
-        let known = self.notes.told(&at(place, &self.identity.site));
-        let is_known =
-            known.is_some_and(|known| known.revision == revision && known.hash.as_deref() == hash.as_deref());
-        if is_known && !self.unnoted.contains_key(place) {
-            return;
-        }
-        self.unnoted.insert(place.clone(), (revision, hash));
-        self.settle_soon();
-        self.owe_notes();
-    }
-
-    /// Notes what places were told.
-    pub(super) fn note_all(&mut self, told: BTreeSet<Place>) {
-        let has_some = !told.is_empty();
-        for place in told {
-            if let Some((revision, hash)) = self.unnoted.remove(&place) {
-                let told = Noted {
-                    revision,
-                    hash: hash.map(Arc::from),
-                };
-                Arc::make_mut(&mut self.notes).tell(at(&place, &self.identity.site), told);
-            }
-        }
-        if has_some {
-            self.keep(true);
-        }
-        self.owe_notes();
-    }
-
-    /// Copies without the notes that are still to come do not count as current.
-    pub(super) fn owe_notes(&self) {
-        if let Some(copies) = &self.outputs.copies {
-            copies.owe(self.served.has_pending() || !self.unnoted.is_empty());
-        }
     }
 }

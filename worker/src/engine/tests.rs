@@ -1,7 +1,7 @@
 //! The engine between a main service, a broker and a lease that the test plays.
 
-#[path = "fade_tests.rs"]
-mod fade;
+#[path = "ends_tests.rs"]
+mod ends;
 #[path = "follow_tests.rs"]
 mod follow;
 #[path = "found_tests.rs"]
@@ -473,7 +473,6 @@ async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
 
 #[tokio::test(start_paused = true)]
 async fn a_new_life_serves_what_the_last_one_had_and_tells_only_what_differs() {
-    let mut notes = Notes::default();
     let (told, mut w) = {
         let mut w = world();
         w.opens(documents(30), 2).await;
@@ -482,18 +481,14 @@ async fn a_new_life_serves_what_the_last_one_had_and_tells_only_what_differs() {
     };
     w.rest().await;
     drop(w);
-    notes.tell(
-        blaze_domain::config::effective::At {
-            service: Some("slam".parse().unwrap()),
+    let notes = Notes {
+        places: vec![Place {
+            service: "slam".parse().unwrap(),
             instance: Some("0".parse().unwrap()),
-            layer: Some("edge".parse().unwrap()),
             node: Some("robot-1".parse().unwrap()),
-        },
-        crate::copy::Told {
-            revision: told["revision"].as_u64().unwrap(),
-            hash: told["hash"].as_str().map(Arc::from),
-        },
-    );
+        }],
+        ..Notes::default()
+    };
     let loaded = Loaded {
         position: Position {
             store_id: "s".to_owned(),

@@ -106,13 +106,6 @@ impl Speaker {
         self.shared.more.notify_one();
     }
 
-    /// Whether the broker has not yet taken the newest notice of a place.
-    #[must_use]
-    pub fn is_waiting(&self, place: &str) -> bool {
-        let state = self.shared.state.lock();
-        state.waiting.contains_key(place) || state.on_the_way.contains_key(place)
-    }
-
     /// The lowest revision of what the broker has not yet taken; `None`: it has taken all.
     #[must_use]
     pub fn untold(&self) -> Option<u64> {
@@ -224,7 +217,7 @@ impl Speaker {
             };
             match delivered {
                 Ok(()) => {
-                    self.shared.state.lock().on_the_way.clear();
+                    self.shared.state.lock().on_the_way = None;
                     (pause, most, trouble) = (PAUSE.0, BATCH, None);
                     if !changes.is_empty() {
                         keys_pause = KEYS_AGAIN.0;
@@ -258,7 +251,7 @@ impl Speaker {
                 Err(error) if error.is_refusal() && batch.len() <= 2 && batch.waiting.len() <= 1 => {
                     let place = batch.waiting.first().map(|(place, _)| place.as_str());
                     tracing::error!(%error, place, keys = ?batch.keys, "a service is not told of its configuration");
-                    self.shared.state.lock().on_the_way.clear();
+                    self.shared.state.lock().on_the_way = None;
                     self.shared.dropped.fetch_add(1, Ordering::Relaxed);
                 }
                 Err(OutletError::NotYet { channels, reason }) => {

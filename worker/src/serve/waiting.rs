@@ -37,8 +37,8 @@ pub(super) struct State {
     pub(super) keys_wait: bool,
     /// Keys of before are to be looked for: those of this worker that are not wanted are to go.
     pub(super) sweep: bool,
-    /// What is being told just now: the lowest revisions of its places.
-    pub(super) on_the_way: BTreeMap<String, u64>,
+    /// The lowest revision of what is being told just now.
+    pub(super) on_the_way: Option<u64>,
     /// How often everything was forgotten.
     pub(super) cleared: u64,
 }
@@ -134,15 +134,14 @@ impl State {
             bytes += self.wanted.get(&key).map_or(0, Bytes::len);
             batch.keys.insert(key);
         }
-        let places = batch.waiting.iter();
-        self.on_the_way = places.map(|(place, waiting)| (place.clone(), waiting.since)).collect();
+        self.on_the_way = batch.waiting.iter().map(|(_, waiting)| waiting.since).min();
         batch
     }
 
     /// The lowest revision that somebody may not have heard of.
     pub(super) fn untold(&self) -> Option<u64> {
         let waiting = self.waiting.values().map(|(_, waiting)| waiting.since);
-        waiting.chain(self.on_the_way.values().copied()).min()
+        waiting.chain(self.on_the_way).min()
     }
 
     /// The same of those whom the broker can tell: what is set aside may wait for ever.
@@ -150,7 +149,7 @@ impl State {
         let waiting = self.waiting.values();
         let possible = waiting.filter(|(at, _)| self.order.contains_key(at));
         let waiting = possible.map(|(_, waiting)| waiting.since);
-        waiting.chain(self.on_the_way.values().copied()).min()
+        waiting.chain(self.on_the_way).min()
     }
 
     /// Everything is forgotten, also what is on its way and comes back.
@@ -175,7 +174,7 @@ impl State {
 
     /// What could not be told goes back to the front; what has come meanwhile is newer.
     pub(super) fn put_back(&mut self, batch: Batch) {
-        self.on_the_way.clear();
+        self.on_the_way = None;
         if batch.cleared != self.cleared {
             return;
         }

@@ -7,7 +7,6 @@ use blaze_domain::config::spec::PROGRAMS;
 use parking_lot::Mutex;
 
 use super::*;
-use crate::copy::Told as Noted;
 use crate::core::PROTOCOL;
 
 /// Longer than anything stays.
@@ -104,40 +103,6 @@ async fn what_comes_back_meanwhile_is_not_taken_away() {
     w.says(commit(4, 3, vec![(Op::Create, nav)])).await;
     tokio::time::sleep(LONG).await;
     assert!(taken_away(&w.rest().await).is_empty());
-    assert_eq!(made.last(), ["nav", "slam"]);
-}
-
-#[tokio::test(start_paused = true)]
-async fn a_worker_that_is_restarted_takes_away_what_was_over_before() {
-    let mut notes = Notes::default();
-    let at = blaze_domain::config::effective::At {
-        service: Some("old".parse().unwrap()),
-        instance: Some("7".parse().unwrap()),
-        layer: Some("edge".parse().unwrap()),
-        node: Some("robot-1".parse().unwrap()),
-    };
-    notes.tell(
-        at,
-        Noted {
-            revision: 1,
-            hash: None,
-        },
-    );
-    let loaded = Loaded {
-        position: Position {
-            store_id: "s".to_owned(),
-            layer: "edge".parse().unwrap(),
-            revision: 2,
-            as_of: Timestamp::default(),
-        },
-        documents: documents(30).into_iter().map(Arc::new).collect(),
-        notes: Arc::new(notes),
-    };
-    let (mut w, made) = world(Some(loaded));
-    w.rest().await;
-    assert_eq!(made.last(), ["nav", "old", "slam"]);
-    tokio::time::sleep(LONG).await;
-    assert_eq!(taken_away(&w.rest().await), [("blaze/config/changed/old", "7")]);
     assert_eq!(made.last(), ["nav", "slam"]);
 }
 
