@@ -7,7 +7,7 @@
 //!
 //! A channel is a topic; a message is a record whose headers are the message's header, as text (module `record`). There is no
 //! consumer group: each client reads all partitions at positions of its own, also where the order of records decides who has a
-//! lease (module `log_lease`). Topics are made by the flow of the layer alone (module `flow_side`), and those of configurations by its worker
+//! lease (module `group_lease`). Topics are made by the flow of the layer alone (module `flow_side`), and those of configurations by its worker
 //! (module `worker_side`); what a service publishes before that waits.
 
 mod admin;
@@ -18,13 +18,13 @@ mod context;
 mod directory;
 mod flow_side;
 mod gate;
+mod group_lease;
 mod identity;
 #[cfg(test)]
 mod impostor;
 mod inner;
 mod keeper;
 mod keyed;
-mod log_lease;
 mod maker;
 mod names;
 mod producer;
@@ -57,7 +57,7 @@ use crate::port::{
     PublisherOptions, Role, SubscribeOptions, Subscription,
 };
 use crate::worker_side::WorkerSide;
-pub use log_lease::{LogHeld, LogLease, LogLeaseOptions};
+pub use group_lease::{GroupHeld, GroupLease, GroupLeaseOptions};
 
 use bell::Bell;
 use clock::BrokerClock;

@@ -200,41 +200,24 @@ impl Settings {
         config
     }
 
-    /// Reads the log of a lease to its end and on, and shows its position as that of a group.
-    pub(super) fn lease_reader(&self, group: &str) -> ClientConfig {
+    /// A member of the group whose partition is a lease.
+    pub(super) fn lease_member(&self, group: &str, session: Duration) -> ClientConfig {
+        let session_ms = session.as_millis().to_string();
         self.with(
-            &[
-                ("fetch.wait.max.ms", "500"),
-                ("fetch.min.bytes", "1"),
-                ("fetch.error.backoff.ms", "20"),
-            ],
+            &[],
             &[
                 ("group.id", group),
                 ("enable.auto.commit", "false"),
                 ("enable.auto.offset.store", "false"),
-                ("enable.partition.eof", "true"),
                 ("allow.auto.create.topics", "false"),
-                // Another log under the same name must never be taken for this one.
-                ("auto.offset.reset", "error"),
-                // Whoever closes waits so long for a group that nobody answers for.
-                ("session.timeout.ms", "1000"),
-                ("heartbeat.interval.ms", "300"),
-            ],
-        )
-    }
-
-    /// Writes to it. What the server does not take within `patience` is given up: later it would be of no use.
-    pub(super) fn lease_writer(&self, patience: Duration) -> ClientConfig {
-        let timeout = patience.as_millis().max(1).to_string();
-        self.with(
-            &[],
-            &[
-                ("acks", "all"),
-                ("allow.auto.create.topics", "false"),
-                ("compression.type", "none"),
-                ("linger.ms", "0"),
-                ("max.in.flight", "1"),
-                ("message.timeout.ms", &timeout),
+                ("auto.offset.reset", "latest"),
+                ("session.timeout.ms", &session_ms),
+                ("max.poll.interval.ms", &(session * 30).as_millis().to_string()),
+                // Members hear of each other's end with their heartbeats.
+                ("heartbeat.interval.ms", "500"),
+                // A member that joins or leaves takes the partition from nobody.
+                ("partition.assignment.strategy", "cooperative-sticky"),
+                ("topic.metadata.refresh.interval.ms", "5000"),
             ],
         )
     }
@@ -336,9 +319,8 @@ pub(super) mod tests {
             settings.reader_to_end(),
             settings.questions(),
             settings.admin(),
-            settings.lease_reader("g"),
-            settings.lease_writer(Duration::from_millis(100)),
-            settings.lease_writer(Duration::from_secs(60)),
+            settings.lease_member("g", Duration::from_secs(10)),
+            settings.lease_member("g", Duration::from_secs(600)),
         ] {
             config.create_native_config().unwrap();
         }

@@ -11,6 +11,8 @@ use super::stage::{PATIENCE, Stage, Worker};
 
 /// `worker.lease_ms`, unless set.
 const LEASE: Duration = Duration::from_secs(5);
+/// The same where Kafka decides: its session timeout, and time for the others to hear of it.
+const LEASE_ON_KAFKA: Duration = Duration::from_secs(12);
 /// What a look at the status may take.
 const LOOK: Duration = Duration::from_millis(250);
 /// How long after the signal whoever ends has given it up and the other one has looked.
@@ -50,9 +52,9 @@ async fn until_it_leads(worker: &Worker, since: Instant) -> Duration {
     since.elapsed()
 }
 
-/// The leader is killed, stopped, goes on, and is ended; each time the other one takes over within a lease or, where it
+/// The leader is killed, stopped, goes on, and is ended; each time the other one takes over within `lease` or, where it
 /// could say so, at once.
-async fn takeovers(name: &str, stage: &Stage, sections: &Value) {
+async fn takeovers(name: &str, stage: &Stage, sections: &Value, lease: Duration) {
     let (leader, other) = two(stage, sections).await;
     let since = Instant::now();
     leader.kill();
@@ -68,7 +70,7 @@ async fn takeovers(name: &str, stage: &Stage, sections: &Value) {
     let stopped = until_it_leads(&other, since).await;
     leader.signal(Signal::CONT);
     let since = Instant::now();
-    while since.elapsed() < LEASE {
+    while since.elapsed() < lease {
         if let Some(leads) = leader.leads().await {
             assert!(!leads, "it was stopped and has lost the lease: {}", leader.tail());
         }
@@ -81,7 +83,7 @@ async fn takeovers(name: &str, stage: &Stage, sections: &Value) {
     other.stop();
     let ended = until_it_leads(&leader, since).await;
     println!("{name}: taken over {killed:?} after a kill, {stopped:?} after a stop, {ended:?} after an end");
-    let (lost, given) = (LEASE + within(LOOK), within(GIVEN));
+    let (lost, given) = (lease + within(LOOK), within(GIVEN));
     assert!(killed <= lost, "after a kill {killed:?}, not {lost:?}");
     assert!(stopped <= lost, "after a stop {stopped:?}, not {lost:?}");
     assert!(ended <= given, "after an end {ended:?}, not {given:?}");
@@ -99,7 +101,7 @@ async fn stage() -> (Stage, blaze_tests::process::Process) {
 async fn with_redis_another_worker_takes_over_within_a_lease() {
     let (stage, _main) = stage().await;
     let sections = json!({ "cache": { "redis": { "url": stage.redis.url() } } });
-    takeovers("Redis", &stage, &sections).await;
+    takeovers("Redis", &stage, &sections, LEASE).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -107,15 +109,15 @@ async fn with_mongodb_another_worker_takes_over_within_a_lease() {
     let (stage, _main) = stage().await;
     let server = MongoServer::start(MongoOptions::default()).unwrap();
     let sections = json!({ "database": { "mongodb": { "uri": server.uri(), "database": "blaze" } } });
-    takeovers("MongoDB", &stage, &sections).await;
+    takeovers("MongoDB", &stage, &sections, LEASE).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn with_kafka_another_worker_takes_over_within_a_lease() {
+async fn with_kafka_another_worker_takes_over_within_its_session_timeout() {
     let (stage, _main) = stage().await;
     let server = KafkaServer::start(KafkaOptions::default()).unwrap();
     let sections = json!({ "brokers": { "layer": { "kafka": { "bootstrap": [server.bootstrap()] } } } });
-    takeovers("Kafka", &stage, &sections).await;
+    takeovers("Kafka", &stage, &sections, LEASE_ON_KAFKA).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

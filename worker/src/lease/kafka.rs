@@ -1,22 +1,22 @@
-//! The lease as the order of records in a topic of Kafka.
+//! The lease as the one partition of a topic of Kafka, which a member of a consumer group has.
 
 use std::time::Duration;
 
 use async_trait::async_trait;
 use blaze_brokers::OpenError;
-use blaze_brokers::kafka::{LogLease, LogLeaseOptions};
+use blaze_brokers::kafka::{GroupLease, GroupLeaseOptions};
 use blaze_domain::LayerName;
 use blaze_domain::node_file::KafkaBroker as Section;
 
 use super::{Held, Lease, Mark};
 
-/// The topic with the leases of all layers.
+/// The topic of the leases of all layers.
 const TOPIC: &str = "blaze/worker/lease";
 
-/// The lease of a layer, shown as the position of the group `blaze-worker-<layer>`.
+/// The lease of a layer: membership of the group `blaze-worker-<layer>`, with the mark beside the committed offset.
 pub struct KafkaLease {
-    layer: LayerName,
-    lease: LogLease,
+    group: String,
+    lease: GroupLease,
 }
 
 impl KafkaLease {
@@ -24,17 +24,16 @@ impl KafkaLease {
     ///
     /// # Errors
     /// [`OpenError`] for a section that can never work.
-    pub fn open(section: &Section, layer: &LayerName, owner: String, time: Duration) -> Result<Self, OpenError> {
-        let options = LogLeaseOptions {
+    pub fn open(section: &Section, layer: &LayerName, time: Duration) -> Result<Self, OpenError> {
+        let group = format!("blaze-worker-{layer}");
+        let options = GroupLeaseOptions {
             channel: TOPIC,
-            name: layer.to_string(),
-            group: format!("blaze-worker-{layer}"),
-            owner,
+            group: group.clone(),
             time,
         };
         Ok(Self {
-            layer: layer.clone(),
-            lease: LogLease::open(section, options)?,
+            group,
+            lease: GroupLease::open(section, options)?,
         })
     }
 }
@@ -56,6 +55,6 @@ impl Lease for KafkaLease {
     }
 
     fn describe(&self) -> String {
-        format!("Kafka, topic {TOPIC}, lease {}", self.layer)
+        format!("Kafka, group {}", self.group)
     }
 }

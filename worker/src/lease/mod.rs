@@ -6,8 +6,8 @@
 //!                               ─ ? ───▶ as before, until that time is over
 //! ```
 //!
-//! It lies in the layer's MongoDB ([`MongoLease`]), else in Redis ([`RedisLease`]), else the order of records in a topic of the
-//! layer's Kafka decides ([`KafkaLease`]). Beside it lies how far services were told ([`Mark`]): whoever takes over tells the rest.
+//! It lies in the layer's MongoDB ([`MongoLease`]), else in Redis ([`RedisLease`]), else it is membership of a
+//! consumer group on the layer's Kafka ([`KafkaLease`]). Beside it lies how far services were told ([`Mark`]): whoever takes over tells the rest.
 
 #[cfg(any(test, feature = "conformance"))]
 pub mod conformance;

@@ -32,7 +32,7 @@ pub fn open(
         (_, Some(keys), _) => Arc::new(RedisLease::new(Arc::clone(keys), layer, worker_id.to_owned())),
         (_, None, LayerBroker::Kafka(section)) => {
             // As long as it is held, see `keep`: the rest is for the others to hear of it.
-            kafka(section, layer, worker_id, settings.lease * 9 / 10).context("brokers.layer.kafka")?
+            kafka(section, layer, settings.lease * 9 / 10).context("brokers.layer.kafka")?
         }
         (_, None, LayerBroker::Dds(_) | LayerBroker::Memory) => return Ok(None),
     };
@@ -55,16 +55,11 @@ fn mongodb(_uri: &SecretText, _database: &str, _layer: &LayerName, _owner: &str)
 }
 
 #[cfg(feature = "kafka")]
-fn kafka(section: &KafkaBroker, layer: &LayerName, owner: &str, time: Duration) -> anyhow::Result<Arc<dyn Lease>> {
-    Ok(Arc::new(super::KafkaLease::open(
-        section,
-        layer,
-        owner.to_owned(),
-        time,
-    )?))
+fn kafka(section: &KafkaBroker, layer: &LayerName, time: Duration) -> anyhow::Result<Arc<dyn Lease>> {
+    Ok(Arc::new(super::KafkaLease::open(section, layer, time)?))
 }
 
 #[cfg(not(feature = "kafka"))]
-fn kafka(_section: &KafkaBroker, _layer: &LayerName, _owner: &str, _time: Duration) -> anyhow::Result<Arc<dyn Lease>> {
+fn kafka(_section: &KafkaBroker, _layer: &LayerName, _time: Duration) -> anyhow::Result<Arc<dyn Lease>> {
     anyhow::bail!("this program was built without Kafka (cargo feature `kafka`)")
 }

@@ -1,0 +1,364 @@
+//! A lease as membership of a consumer group: the member that has the one partition of a topic has the lease.
+//!
+//! ```text
+//! hold(note) ─► thread ─► assigned? no: what was committed last ─► not held
+//!                 │            └─ yes: commit the note ─► the coordinator takes it: held, from before the commit
+//!                 └─► polls on in between; leaves the group when nobody asks any more
+//! ```
+//!
+//! The coordinator takes a commit only from a member of the present generation, and counts it as a heartbeat. So after a
+//! commit the partition stays for the session timeout, which is longer than the lease is held; the assignor is
+//! cooperative and sticky, so a member that joins or leaves takes it from nobody. Where it is taken nevertheless, the
+//! client gives it back only when the lease that was told is over. The topic stays empty: the note is the metadata of the
+//! committed offset.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
+use std::time::{Duration, Instant};
+
+use blaze_domain::node_file::KafkaBroker as Section;
+use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
+use parking_lot::Mutex;
+use rdkafka::config::RDKafkaLogLevel;
+use rdkafka::consumer::{BaseConsumer, CommitMode, Consumer as _, ConsumerContext, Rebalance};
+use rdkafka::error::{KafkaError, KafkaResult, RDKafkaErrorCode};
+use rdkafka::{ClientContext, Offset, TopicPartitionList};
+use tokio::sync::oneshot;
+use tokio_util::sync::CancellationToken;
+
+use super::admin::{Admin, Purpose};
+use super::context::{self, LastError};
+use super::settings::Settings;
+use crate::open::OpenError;
+
+/// Between two looks at the group, while nobody asks.
+const TURN: Duration = Duration::from_millis(50);
+/// Between two tries to reach the broker.
+const AGAIN: Duration = Duration::from_millis(250);
+/// How long the coordinator waits for a member that says nothing, at least.
+const SESSION: Duration = Duration::from_secs(10);
+/// Bounds of the time that the broker has for an answer.
+const PATIENCE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
+/// Questions that wait for the thread.
+const QUEUE: usize = 4;
+/// The partition that is the lease.
+const PARTITION: i32 = 0;
+const GIVEN_UP: &str = "the lease was given up";
+
+/// What became of asking for the lease.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct GroupHeld {
+    /// Whether this member has it.
+    pub is_held: bool,
+    /// What the last holder that left a note has left.
+    pub note: Option<String>,
+}
+
+/// Which lease.
+#[derive(Debug, Clone)]
+pub struct GroupLeaseOptions {
+    /// The channel whose topic has the partition.
+    pub channel: &'static str,
+    /// The group.
+    pub group: String,
+    /// How long it is held after it was asked for.
+    pub time: Duration,
+}
+
+enum Question {
+    Hold {
+        note: Option<String>,
+        answer: oneshot::Sender<Result<GroupHeld, String>>,
+    },
+    Release(oneshot::Sender<()>),
+}
+
+/// A member that wants the lease. Dropped without [`GroupLease::release`], it leaves the group as well.
+pub struct GroupLease {
+    questions: SyncSender<Question>,
+    stop: CancellationToken,
+    /// Of the thread, which ends with `stop`.
+    _supervisor: Supervisor,
+}
+
+impl GroupLease {
+    /// Begins to connect, in the background; makes the topic if there is none. Must be called on a Tokio runtime.
+    ///
+    /// # Errors
+    /// [`OpenError`] as for a broker of this section.
+    pub fn open(section: &Section, options: GroupLeaseOptions) -> Result<Self, OpenError> {
+        let (settings, names) = super::read(section)?;
+        let (questions, asked) = sync_channel(QUEUE);
+        let (stop, supervisor) = (CancellationToken::new(), Supervisor::new("kafka-lease"));
+        let member = Member {
+            settings,
+            topic: names.reserved(options.channel),
+            patience: (options.time / 4).clamp(PATIENCE.0, PATIENCE.1),
+            options,
+            last_error: Arc::default(),
+            is_warned: false,
+            consumer: None,
+            asked: None,
+            is_held: false,
+            note: None,
+        };
+        let stopped = stop.clone();
+        supervisor
+            .spawn_thread("kafka-lease", TaskPolicy::MayEnd, move || member.run(&asked, &stopped))
+            .map_err(|error| OpenError::Setting {
+                key: "kafka".to_owned(),
+                reason: error.to_string(),
+            })?;
+        Ok(Self {
+            questions,
+            stop,
+            _supervisor: supervisor,
+        })
+    }
+
+    /// Asks whether this member has the lease, for its time from before the call. A member that had it at the last call, too,
+    /// leaves `note`; one that has got it since does not, and learns what the one before has left.
+    ///
+    /// # Errors
+    /// For people: nobody knows.
+    pub async fn hold(&self, note: Option<&str>) -> Result<GroupHeld, String> {
+        let (answer, answered) = oneshot::channel();
+        let question = Question::Hold {
+            note: note.map(str::to_owned),
+            answer,
+        };
+        self.questions.try_send(question).map_err(|error| match error {
+            TrySendError::Full(_) => "the broker has not answered the last questions yet".to_owned(),
+            TrySendError::Disconnected(_) => GIVEN_UP.to_owned(),
+        })?;
+        answered.await.unwrap_or_else(|_| Err(GIVEN_UP.to_owned()))
+    }
+
+    /// Leaves the group, so that another member has it at once; it is not asked for again.
+    pub async fn release(&self) {
+        let (answer, answered) = oneshot::channel();
+        if self.questions.try_send(Question::Release(answer)).is_ok() {
+            // If the thread has ended, the session runs out.
+            let _ = answered.await;
+        }
+        self.stop.cancel();
+    }
+}
+
+impl Drop for GroupLease {
+    fn drop(&mut self) {
+        self.stop.cancel();
+    }
+}
+
+/// What the client calls back with, on the thread that polls.
+struct Context {
+    last_error: Arc<LastError>,
+    /// Until then the lease was told to be held.
+    promised: Mutex<Option<Instant>>,
+}
+
+impl ClientContext for Context {
+    fn log(&self, level: RDKafkaLogLevel, facility: &str, line: &str) {
+        context::log(level, facility, line);
+    }
+
+    fn error(&self, error: KafkaError, reason: &str) {
+        self.last_error.note(format!("{error}: {reason}"));
+    }
+}
+
+impl ConsumerContext for Context {
+    fn pre_rebalance(&self, _consumer: &BaseConsumer<Self>, rebalance: &Rebalance<'_>) {
+        let Rebalance::Revoke(_) = rebalance else { return };
+        let promised = self.promised.lock().take();
+        // Until this returns, nobody else gets the partition.
+        if let Some(until) = promised {
+            std::thread::sleep(until.saturating_duration_since(Instant::now()));
+        }
+    }
+}
+
+/// What the thread owns.
+struct Member {
+    settings: Settings,
+    topic: Arc<str>,
+    options: GroupLeaseOptions,
+    patience: Duration,
+    last_error: Arc<LastError>,
+    /// It was said that somebody else must make the topic.
+    is_warned: bool,
+    consumer: Option<BaseConsumer<Context>>,
+    /// When the lease was last asked for.
+    asked: Option<Instant>,
+    /// Whether it was held at the last call.
+    is_held: bool,
+    /// The last note that is known.
+    note: Option<String>,
+}
+
+impl Member {
+    fn run(mut self, questions: &Receiver<Question>, stop: &CancellationToken) {
+        while !stop.is_cancelled() {
+            let question = questions.recv_timeout(if self.consumer.is_some() { TURN } else { AGAIN });
+            match question {
+                // Whoever asked has given up waiting, and asks again.
+                Ok(Question::Hold { answer, .. }) if answer.is_closed() => {}
+                Ok(Question::Hold { note, answer }) => {
+                    let held = self.hold(note);
+                    self.is_held = held.as_ref().is_ok_and(|held| held.is_held);
+                    // Whoever asked may have given up waiting.
+                    let _ = answer.send(held);
+                }
+                Ok(Question::Release(answer)) => {
+                    self.leave();
+                    // Whoever asked may have given up waiting.
+                    let _ = answer.send(());
+                    return;
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            self.poll();
+            // The client stays a member by itself, whatever becomes of the one who asks.
+            if self.asked.is_some_and(|asked| asked.elapsed() > self.options.time) {
+                self.leave();
+            }
+        }
+        self.leave();
+    }
+
+    /// Leaves the group; whoever asks joins it again.
+    fn leave(&mut self) {
+        if let Some(consumer) = self.consumer.take() {
+            *consumer.context().promised.lock() = None;
+            consumer.unsubscribe();
+        }
+        (self.asked, self.is_held) = (None, false);
+    }
+
+    fn join(&mut self) -> Result<(), String> {
+        self.make_topic()?;
+        let session = SESSION.max(self.options.time);
+        let context = Context {
+            last_error: Arc::clone(&self.last_error),
+            promised: Mutex::default(),
+        };
+        let away = |error: KafkaError| error.to_string();
+        let config = self.settings.lease_member(&self.options.group, session);
+        let consumer: BaseConsumer<Context> = config.create_with_context(context).map_err(away)?;
+        consumer.subscribe(&[&self.topic]).map_err(away)?;
+        self.consumer = Some(consumer);
+        Ok(())
+    }
+
+    /// Where it is there already, nobody need be able to make it.
+    fn make_topic(&mut self) -> Result<(), String> {
+        let away = |error: KafkaError| self.last_error.take().unwrap_or_else(|| error.to_string());
+        let admin = Admin::new(&self.settings, &self.last_error).map_err(away)?;
+        let refused = admin.make(&[(Arc::clone(&self.topic), Purpose::Terms)]).map_err(away)?;
+        for (topic, code) in refused {
+            match code {
+                // Somebody with more rights may have made it.
+                RDKafkaErrorCode::TopicAuthorizationFailed | RDKafkaErrorCode::ClusterAuthorizationFailed => {
+                    if !std::mem::replace(&mut self.is_warned, true) {
+                        tracing::warn!(%topic, %code, "the topic of the lease must be made by an administrator, as the documentation of the worker says");
+                    }
+                }
+                _ => return Err(format!("the topic {topic} could not be made: {code}")),
+            }
+        }
+        Ok(())
+    }
+
+    /// Has the client call back.
+    fn poll(&mut self) {
+        let Some(consumer) = &self.consumer else { return };
+        let mut is_gone = consumer.client().fatal_error().is_some();
+        while let Some(polled) = consumer.poll(Duration::ZERO) {
+            if let Err(error) = polled {
+                tracing::debug!(%error, topic = %self.topic, "the group of the lease");
+                is_gone |= is_topic_gone(&error);
+            }
+        }
+        if is_gone {
+            // Joined anew, it makes the topic.
+            self.leave();
+        }
+    }
+
+    fn hold(&mut self, note: Option<String>) -> Result<GroupHeld, String> {
+        let now = Instant::now();
+        self.asked = Some(now);
+        if self.consumer.is_none() {
+            self.join()?;
+        }
+        self.poll();
+        let Some(consumer) = self.consumer.take() else {
+            return Err("the group of the lease is joined anew".to_owned());
+        };
+        let held = self.ask(&consumer, note, now);
+        let is_gone = held.as_ref().is_err_and(is_topic_gone);
+        self.consumer = Some(consumer);
+        if is_gone {
+            self.leave();
+        }
+        held.map_err(|error| error.to_string())
+    }
+
+    fn ask(&mut self, consumer: &BaseConsumer<Context>, note: Option<String>, now: Instant) -> KafkaResult<GroupHeld> {
+        let is_own = || {
+            let is_assigned = consumer.assignment().is_ok_and(|assigned| assigned.count() > 0);
+            is_assigned && !consumer.assignment_lost()
+        };
+        let is_assigned = is_own();
+        // A member that has just got the partition leaves what the one before has left.
+        let note = match is_assigned && self.is_held {
+            true => note,
+            false => committed(consumer, &self.topic, self.patience)?,
+        };
+        self.note = note.or(self.note.take());
+        if is_assigned {
+            // The callback of a commit that does not wait is never called by this client. One that waits does so for at most
+            // the session timeout while the coordinator is away.
+            consumer.commit(&position(&self.topic, self.note.as_deref())?, CommitMode::Sync)?;
+        }
+        let is_held = is_assigned && is_own();
+        if is_held {
+            *consumer.context().promised.lock() = Some(now + self.options.time);
+        }
+        Ok(GroupHeld {
+            is_held,
+            note: self.note.clone(),
+        })
+    }
+}
+
+fn is_topic_gone(error: &KafkaError) -> bool {
+    matches!(
+        error.rdkafka_error_code(),
+        Some(
+            RDKafkaErrorCode::UnknownTopicOrPartition
+                | RDKafkaErrorCode::UnknownTopic
+                | RDKafkaErrorCode::UnknownPartition
+        )
+    )
+}
+
+/// The partition with a note.
+fn position(topic: &str, note: Option<&str>) -> KafkaResult<TopicPartitionList> {
+    let mut list = TopicPartitionList::new();
+    list.add_partition_offset(topic, PARTITION, Offset::Offset(0))?;
+    if let (Some(note), Some(mut partition)) = (note, list.find_partition(topic, PARTITION)) {
+        partition.set_metadata(note);
+    }
+    Ok(list)
+}
+
+/// The note that was committed last.
+fn committed(consumer: &BaseConsumer<Context>, topic: &str, patience: Duration) -> KafkaResult<Option<String>> {
+    let found = consumer.committed_offsets(position(topic, None)?, patience)?;
+    let note = found.find_partition(topic, PARTITION);
+    let note = note.map(|partition| partition.metadata().to_owned());
+    Ok(note.filter(|note| !note.is_empty()))
+}
