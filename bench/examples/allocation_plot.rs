@@ -1,12 +1,12 @@
-//! Draws `docs/bandwidth.svg`: the rates that topics get, over the limit.
+//! Draws `docs/design/bandwidth.svg`: the rates that topics get, over the limit.
 //!
-//! `cargo run --release --example allocation_plot > docs/bandwidth.svg`
+//! `cargo run --release --example allocation_plot > docs/design/bandwidth.svg`
 
 use std::fmt::Write as _;
 
 use blaze_flow::limit::allocate::{Lane, Sharing, Terms, Topic, allocate};
 
-/// The worked example of `docs/bandwidth.md`: name, payload in bytes, rate in Hz, colour.
+/// The worked example of `docs/design/bandwidth.md`: name, payload in bytes, rate in Hz, colour.
 const TOPICS: [(&str, u64, f64, &str); 3] = [
     ("camera/front", 921_600, 30.0, "#c0392b"),
     ("camera/rear", 500_000, 30.0, "#e08e0b"),

@@ -5,7 +5,7 @@
 //! link_qos pub address=127.0.0.1 domain=40 size=1296 megabytes=20 seconds=8 [reliable] [depth=4096] [interface=lo]
 //! ```
 //! Between hosts or network namespaces one side also takes `peer=<address>`. Latency needs one machine: the sender's
-//! time of day travels in each sample. docs/link-measurements.md holds the results.
+//! time of day travels in each sample. docs/design/link-measurements.md holds the results.
 
 use std::fs;
 use std::net::Ipv4Addr;

@@ -1,8 +1,8 @@
-//! The table of `docs/traps.md` names tests that are there and run.
+//! The table of `docs/design/traps.md` names tests that are there and run.
 
 use std::path::Path;
 
-const TABLE: &str = include_str!("../../../../docs/traps.md");
+const TABLE: &str = include_str!("../../../../docs/design/traps.md");
 
 /// `file::name` in the last column of each row.
 fn rows() -> Vec<(&'static str, Vec<(&'static str, &'static str)>)> {
