@@ -2,3 +2,8 @@
 
 pub mod broker;
 pub mod store;
+
+/// Whether the full counts are wanted (`scripts/test --long`).
+fn full() -> bool {
+    std::env::var_os("BLAZE_LONG").is_some()
+}

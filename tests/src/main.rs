@@ -21,9 +21,9 @@ enum Tool {
 fn main() -> ExitCode {
     let ended = match Tool::parse() {
         Tool::Wan(options) => wan::run(options),
-        Tool::Probe(options) => probe::run(options),
-        Tool::Service(options) => service::run(options),
-        Tool::DdsPeer(options) => dds_peer::run(options),
+        Tool::Probe(options) => probe::run(&options),
+        Tool::Service(options) => service::run(&options),
+        Tool::DdsPeer(options) => dds_peer::run(&options),
         Tool::LinkPeer(arguments) => link_peer::run(&arguments),
     };
     match ended {

@@ -99,7 +99,7 @@ impl Seen {
 }
 
 #[tokio::main]
-pub(crate) async fn run(options: Options) -> anyhow::Result<()> {
+pub(crate) async fn run(options: &Options) -> anyhow::Result<()> {
     let seen = Arc::<Mutex<Seen>>::default();
     let told = Arc::clone(&seen);
     thread::Builder::new().name("report".into()).spawn(move || {
@@ -109,8 +109,8 @@ pub(crate) async fn run(options: Options) -> anyhow::Result<()> {
         }
     })?;
     match options.kind {
-        Kind::Adapter => adapter(&options, &seen).await,
-        Kind::Plain => plain(&options, &seen),
+        Kind::Adapter => adapter(options, &seen).await,
+        Kind::Plain => plain(options, &seen),
     }
 }
 

@@ -47,7 +47,7 @@ pub(crate) struct Options {
 }
 
 #[tokio::main]
-pub(crate) async fn run(options: Options) -> anyhow::Result<()> {
+pub(crate) async fn run(options: &Options) -> anyhow::Result<()> {
     let _logs = logs::init("warn", LogFormat::Text)?;
     let section = section(&options.redis)?;
     let broker = Arc::new(RedisBroker::open(&section, &Role::Service)?);

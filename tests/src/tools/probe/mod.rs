@@ -114,13 +114,13 @@ impl FromStr for Topic {
 }
 
 #[tokio::main]
-pub(crate) async fn run(options: Options) -> anyhow::Result<()> {
+pub(crate) async fn run(options: &Options) -> anyhow::Result<()> {
     let _logs = logs::init("warn", LogFormat::Text)?;
-    let site = Site::start(&options).await?;
+    let site = Site::start(options).await?;
     eprintln!("ready node={} admin={}", site.node, site.admin);
     match options.role {
-        Role::Publish => source::publish(&site.service, &options).await?,
-        Role::Listen => ear::listen(&site.service, &options).await?,
+        Role::Publish => source::publish(&site.service, options).await?,
+        Role::Listen => ear::listen(&site.service, options).await?,
     }
     site.end().await;
     Ok(())

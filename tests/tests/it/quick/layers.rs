@@ -58,7 +58,24 @@ const ALLOWED: &[(&str, &[&str])] = &[
             "blaze-flow",
             "blaze-sdk",
             "blaze-auth",
+            "blaze-config",
             "blaze-worker",
+            "blaze",
+        ],
+    ),
+    (
+        "blaze-conformance",
+        &["blaze-domain", "blaze-proto", "blaze-brokers", "blaze-config"],
+    ),
+    (
+        "blaze-bench",
+        &[
+            "blaze-domain",
+            "blaze-proto",
+            "blaze-brokers",
+            "blaze-flow",
+            "blaze-auth",
+            "blaze-tests",
         ],
     ),
 ];
@@ -66,7 +83,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
 /// Crates that may use an outside crate which would otherwise creep in everywhere.
 const OUTSIDE: &[(&str, &[&str])] = &[
     // The tests have a plain DDS program, which knows nothing of BlazeAIoT.
-    ("rustdds", &["blaze-brokers", "blaze-tests"]),
+    ("rustdds", &["blaze-brokers", "blaze-tests", "blaze-bench"]),
     ("axum", &["blaze-runtime", "blaze-flow", "blaze-config", "blaze-worker"]),
     (
         "anyhow",
@@ -77,6 +94,7 @@ const OUTSIDE: &[(&str, &[&str])] = &[
             "blaze-worker",
             "blaze",
             "blaze-tests",
+            "blaze-bench",
         ],
     ),
     ("mongodb", &["blaze-config", "blaze-worker", "blaze-tests"]),
@@ -91,7 +109,9 @@ const OUTSIDE: &[(&str, &[&str])] = &[
             "blaze-worker",
             "blaze-sdk",
             "blaze",
+            "blaze-conformance",
             "blaze-tests",
+            "blaze-bench",
         ],
     ),
 ];

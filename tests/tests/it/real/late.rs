@@ -246,7 +246,13 @@ fn the_quality_of_the_first_does_not_stick() -> anyhow::Result<()> {
     advertise("first", "best_effort")?;
     request("reliable", 0)?;
     lane_is("more asked than offered flows as offered", false, 0)?;
-    assert_eq!(system.robot.why(TOPIC, Some("cloud"))?["verdict"], "degraded");
+    let verdict = || system.robot.why(TOPIC, Some("cloud")).map(|why| why["verdict"].clone());
+    wait::until(
+        "why says that less is offered",
+        SOON,
+        || verdict().is_ok_and(|verdict| verdict == "degraded"),
+        || format!("{:?}", verdict()),
+    )?;
     advertise("second", "reliable")?;
     lane_is("a second publisher offers more", true, 0)?;
     request("reliable", 300)?;

@@ -70,7 +70,7 @@ fn write_until_killed(uri: &str, count: usize) -> Ledger {
             "--ignored",
             "--exact",
             "--nocapture",
-            "killed::writes_until_it_is_killed",
+            "stores::killed::writes_until_it_is_killed",
         ])
         .env(VICTIM, uri)
         .stdin(Stdio::null())

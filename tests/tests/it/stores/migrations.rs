@@ -100,7 +100,12 @@ fn mark(document: &Document) -> Option<Document> {
 /// Migrates in a process of its own, which dies where it is told.
 fn migrate_and_die(database: &Database, at: &str) {
     let output = Command::new(std::env::current_exe().unwrap())
-        .args(["--ignored", "--exact", "--nocapture", "migrations::migrates_and_dies"])
+        .args([
+            "--ignored",
+            "--exact",
+            "--nocapture",
+            "stores::migrations::migrates_and_dies",
+        ])
         .env("BLAZE_TEST_MONGODB_URI", &database.uri)
         .env(VICTIM_DATABASE, &database.name)
         .env(VICTIM_DIES, at)
@@ -240,10 +245,7 @@ async fn a_program_that_is_too_old_refuses_to_start() {
 async fn a_database_of_schema_1_is_read_and_migrated() {
     let database = Database::new();
     // Collections and indexes as the migration makes them.
-    let folder = concat!(
-        env!("CARGO_MANIFEST_DIR"),
-        "/../control-plane/migrations/0001_first.mongodb"
-    );
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../migrations/0001_first.mongodb");
     let files = std::fs::read_dir(folder).unwrap();
     let files: BTreeSet<_> = files.map(|file| file.unwrap().path()).collect();
     for file in files {

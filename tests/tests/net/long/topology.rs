@@ -142,7 +142,12 @@ fn nothing_is_left_of_a_process_that_was_killed() -> anyhow::Result<()> {
     use std::io::{BufRead as _, BufReader};
 
     let mut child = Command::new(std::env::current_exe()?)
-        .args(["topology::a_network_that_waits", "--exact", "--ignored", "--nocapture"])
+        .args([
+            "long::topology::a_network_that_waits",
+            "--exact",
+            "--ignored",
+            "--nocapture",
+        ])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()?;

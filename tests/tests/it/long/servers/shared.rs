@@ -45,7 +45,7 @@ fn a_server_ends_with_a_test_that_aborts() {
             "--ignored",
             "--exact",
             "--nocapture",
-            "shared::aborts_while_its_server_runs",
+            "long::servers::shared::aborts_while_its_server_runs",
         ])
         .env(VICTIM, "1")
         .stdin(Stdio::null())

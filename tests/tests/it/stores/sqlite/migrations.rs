@@ -107,7 +107,12 @@ async fn fill(path: &Path) {
 /// Migrates in a process of its own, which dies where it is told.
 fn migrate_and_die(path: &Path, at: &str) {
     let output = Command::new(std::env::current_exe().unwrap())
-        .args(["--ignored", "--exact", "--nocapture", "migrations::migrates_and_dies"])
+        .args([
+            "--ignored",
+            "--exact",
+            "--nocapture",
+            "stores::sqlite::migrations::migrates_and_dies",
+        ])
         .env(VICTIM_FILE, path)
         .env(VICTIM_DIES, at)
         .stdin(Stdio::null())

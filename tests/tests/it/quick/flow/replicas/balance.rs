@@ -26,10 +26,8 @@ const STREAMS: [(usize, u32); 8] = [
     (2_048, 20),
 ];
 
-#[allow(clippy::disallowed_methods, reason = "which seeds a test runs is no configuration")]
-fn seeds() -> std::ops::Range<u64> {
-    let long = std::env::var_os("BLAZE_LONG").is_some();
-    0..if long { 40 } else { 4 }
+fn seeds() -> Vec<u64> {
+    crate::quick::flow::seeds(2, 40)
 }
 
 /// What became of the messages of all streams.

@@ -16,13 +16,8 @@ use std::time::Duration;
 use parts::End;
 use world::World;
 
-#[allow(clippy::disallowed_methods, reason = "which seeds a test runs is no configuration")]
-fn seeds() -> std::ops::Range<u64> {
-    let only = std::env::var("BLAZE_SEED")
-        .ok()
-        .and_then(|text| text.parse::<u64>().ok());
-    let long = std::env::var_os("BLAZE_LONG").is_some();
-    only.map_or(0..if long { 400 } else { 40 }, |seed| seed..seed + 1)
+fn seeds() -> Vec<u64> {
+    super::seeds(12, 400)
 }
 
 /// Both directions run while one replica after the other ends in that way and comes back.
