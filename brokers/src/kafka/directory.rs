@@ -1,5 +1,6 @@
 //! What the server says of itself and its topics.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -70,7 +71,7 @@ pub(super) struct Listing {
     /// Brokers of the cluster.
     pub(super) brokers: usize,
     /// Topics and their partitions; those that are asked for alone if not all were.
-    pub(super) topics: Vec<(String, usize)>,
+    pub(super) topics: HashMap<String, usize>,
 }
 
 type Client = BaseConsumer<ReadContext>;
@@ -122,8 +123,8 @@ impl Directory {
     pub(super) fn list(&self, topic: Option<&str>, timeout: Duration) -> Result<Listing, LookupError> {
         let client = self.client()?;
         let metadata = client.fetch_metadata(topic, timeout);
-        // Serves the client's log and errors.
-        client.poll(Duration::ZERO);
+        // Serves all there is of the client's log and errors: without a time it would serve one line alone.
+        client.poll(IDENTITY_TURN);
         let metadata = metadata?;
         let good = |topic: &&MetadataTopic| topic.error().is_none() && !topic.partitions().is_empty();
         let topics = metadata.topics().iter().filter(good);
