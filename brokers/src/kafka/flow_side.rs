@@ -101,7 +101,7 @@ impl FlowState {
         let name = &self.leases.name;
         let info = inner.directory.topic(name, LOAD)?;
         let marks = inner.directory.marks(name, info.partitions, deadline)?;
-        let mut reader = ReaderToEnd::open(&inner.shared.settings, &inner.shared.last_error, name, &marks)?;
+        let mut reader = ReaderToEnd::open(&inner.shared, name, &marks)?;
         let ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
         reader.read(&ends, deadline, &|| inner.is_closed(), |_, payload| {
             Some(Bytes::copy_from_slice(payload))

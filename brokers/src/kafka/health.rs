@@ -124,7 +124,7 @@ fn round(inner: &Inner, turn: usize, silent: &mut Silent) -> bool {
     let answered = listed.as_ref().is_ok_and(|listing| listing.brokers > 0);
     if silent.note(Client::Directory, Instant::now(), answered) {
         tracing::debug!("the client that asks is made anew");
-        if let Err(error) = inner.directory.remake(&inner.shared.settings, &inner.shared.last_error) {
+        if let Err(error) = inner.directory.remake() {
             inner.shared.last_error.note(error.to_string());
         }
     }

@@ -35,9 +35,9 @@ use crate::port::{Begin, BrokerError, BrokerStatus, Health, Received, SubscribeO
 pub(super) const MAX_CHANNELS: usize = 10_000;
 /// How long subscribing may take.
 const SUBSCRIBE: Duration = Duration::from_secs(5);
-/// How often a server is asked again that names ends which do not hold where a reader was told to begin …
+/// How often a server is asked again that names ends which do not hold where a reader is to begin.
 const DOUBTS: usize = 10;
-/// … after this time.
+/// The pause before each of these questions.
 const DOUBT: Duration = Duration::from_millis(200);
 /// How long reading what is kept for late joiners may take.
 const SUBSCRIBE_KEPT: Duration = Duration::from_secs(15);
@@ -89,8 +89,8 @@ pub(super) struct Inner {
     pub(super) admin: Mutex<Option<Arc<Admin>>>,
     pub(super) status: watch::Sender<BrokerStatus>,
     pub(super) was_up: AtomicBool,
-    /// Whether it was told that the server did not answer from the beginning.
-    pub(super) told: AtomicBool,
+    /// Whether it is in the log that the server did not answer from the beginning.
+    pub(super) logged_absence: AtomicBool,
     pub(super) closed: AtomicBool,
     pub(super) waker: ThreadWaker,
 }
@@ -171,7 +171,7 @@ impl Inner {
         if answers && !was_up {
             tracing::info!(detail, "Kafka answers");
             self.wake_writers();
-        } else if !answers && (was_up || !self.told.swap(true, Ordering::AcqRel)) {
+        } else if !answers && (was_up || !self.logged_absence.swap(true, Ordering::AcqRel)) {
             tracing::warn!(detail, "Kafka does not answer");
         }
         let taken = self.flow.as_ref().and_then(|flow| flow.stood_back.lock().clone());
@@ -268,7 +268,7 @@ impl Inner {
                 .map_err(|error| refused(&error))?;
             return Ok(subscription.starting_at(starts));
         }
-        let mut reader = ReaderToEnd::open(&self.shared.settings, &self.shared.last_error, &source.topic, &marks)?;
+        let mut reader = ReaderToEnd::open(&self.shared, &source.topic, &marks)?;
         loop {
             let starts = reader.read(&ends, deadline, &|| self.is_closed(), |message, payload| {
                 let key = message.key()?;
@@ -293,8 +293,8 @@ impl Inner {
         }
     }
 
-    /// Where a topic begins and ends. If that does not hold where a reader was told to begin, it is asked again for a while: a server that
-    /// stood still for a moment names other ends first, and whoever believes them leaves out what the reader is there for.
+    /// Where a topic begins and ends. If that does not hold where a reader is to begin, it is asked again for a while: a server that
+    /// stood still for a moment names other ends first, and a reader that believed them would leave out records.
     fn marks(
         &self,
         topic: &str,
@@ -317,7 +317,7 @@ impl Inner {
         }
     }
 
-    /// Where a reader begins: on the server, and where it was told to.
+    /// Offsets at which a reader begins: those that it asks for, as far as the server has them.
     fn starts(&self, topic: &str, marks: &[Marks], begin: &Begin) -> Result<Vec<i64>, BrokerError> {
         let wanted: Vec<Option<i64>> = match begin {
             Begin::Now => vec![None; marks.len()],

@@ -103,8 +103,7 @@ impl KafkaBroker {
             key: "kafka.properties".to_owned(),
             reason,
         };
-        let directory =
-            Directory::new(&shared.settings, &shared.last_error).map_err(|error| refused(error.to_string()))?;
+        let directory = Directory::new(&shared).map_err(|error| refused(error.to_string()))?;
         let topics = Topics::default();
         let (layer, flow, worker) = match role {
             Role::Service => (String::new(), None, None),
@@ -133,7 +132,7 @@ impl KafkaBroker {
             cluster: OnceLock::new(),
             status: watch::Sender::new(connecting),
             was_up: AtomicBool::new(false),
-            told: AtomicBool::new(false),
+            logged_absence: AtomicBool::new(false),
             closed: AtomicBool::new(false),
             waker: ThreadWaker::default(),
         });

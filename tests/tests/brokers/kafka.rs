@@ -3,8 +3,8 @@
 #![allow(clippy::panic, reason = "helpers of tests")]
 
 mod identities;
+mod offsets;
 mod outages;
-mod places;
 mod plain;
 mod rules;
 mod topics;
