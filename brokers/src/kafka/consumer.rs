@@ -191,10 +191,12 @@ impl Consumer {
             return Poll::Ready(());
         }
         for _ in 0..limit {
-            let Poll::Ready(next) = Pin::new(&mut *stream).poll_next(context) else {
+            let next = Pin::new(&mut *stream).poll_next(context);
+            // Also without a record: at the position of before there may be none of the topic that was made anew.
+            let anew = self.follow_identities(&mut state, client);
+            let Poll::Ready(next) = next else {
                 return Poll::Pending;
             };
-            let anew = self.follow_identities(&mut state, client);
             match next {
                 // It was read at a position of the topic that was before, and comes again.
                 Some(Ok(message)) if anew.iter().any(|topic| **topic == *message.topic()) => {}

@@ -13,8 +13,7 @@ use rdkafka::producer::{BaseProducer, BaseRecord, DefaultProducerContext, Produc
 
 use super::*;
 use crate::kafka::directory::Marks;
-use crate::kafka::settings::Settings;
-use crate::kafka::settings::tests::section_at;
+use crate::kafka::settings::tests::shared_at;
 use crate::port::{Content, Place, SubscribeOptions, Subscription, subscription};
 
 const TOPIC: &str = "fog.imu.data";
@@ -62,8 +61,7 @@ impl Bench {
             producer.send(record).map_err(|(error, _)| error).unwrap();
         }
         producer.flush(Duration::from_secs(10)).unwrap();
-        let settings = Settings::new(&section_at(&bootstrap, "{}")).unwrap();
-        let consumer = Consumer::new(false, "fog", &Shared::new(settings)).unwrap();
+        let consumer = Consumer::new(false, "fog", &shared_at(&bootstrap)).unwrap();
         let channel = ChannelName::from(&"imu/data".parse::<TopicName>().unwrap());
         Self {
             consumer,
