@@ -1,8 +1,8 @@
 //! The Kafka adapter against a real broker.
 
 mod identities;
+mod offsets;
 mod outages;
-mod places;
 mod plain;
 mod rules;
 mod topics;

@@ -4,26 +4,26 @@ use std::time::Duration;
 
 use parking_lot::{Condvar, Mutex};
 
-/// A thread waits for it; whoever has work for the thread rings it. A ring before the wait ends the wait at once.
+/// A thread waits for it. A wake-up before the wait ends the wait at once.
 #[derive(Debug, Default)]
-pub(super) struct Bell {
-    rung: Mutex<bool>,
+pub(super) struct ThreadWaker {
+    woken: Mutex<bool>,
     changed: Condvar,
 }
 
-impl Bell {
-    pub(super) fn ring(&self) {
-        *self.rung.lock() = true;
+impl ThreadWaker {
+    pub(super) fn wake(&self) {
+        *self.woken.lock() = true;
         self.changed.notify_one();
     }
 
-    /// Waits for a ring, at most for a time.
+    /// Waits for a wake-up, at most for a time.
     pub(super) fn wait(&self, timeout: Duration) {
-        let mut rung = self.rung.lock();
-        if !*rung {
-            self.changed.wait_for(&mut rung, timeout);
+        let mut woken = self.woken.lock();
+        if !*woken {
+            self.changed.wait_for(&mut woken, timeout);
         }
-        *rung = false;
+        *woken = false;
     }
 }
 

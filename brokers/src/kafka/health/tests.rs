@@ -1,7 +1,7 @@
 //! Clients that a server has forsaken.
 
 use crate::kafka::KafkaBroker;
-use crate::kafka::impostor::Impostor;
+use crate::kafka::fake_broker::FakeBroker;
 use crate::kafka::settings::tests::section_at;
 use crate::port::{Broker as _, Health, Role};
 
@@ -23,7 +23,7 @@ fn until(what: &str, mut holds: impl FnMut() -> bool) {
 /// library never finds back from there: without being made anew, each of the three clients would stay without an answer for ever.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_server_that_named_no_broker_for_a_moment_is_found_again() {
-    let server = Impostor::start();
+    let server = FakeBroker::start();
     let broker = KafkaBroker::open(&section_at(&server.bootstrap(), "{}"), &Role::Service).unwrap();
     let inner = &broker.inner;
     let health = || broker.status().borrow().health;
@@ -61,10 +61,10 @@ async fn a_server_that_named_no_broker_for_a_moment_is_found_again() {
 }
 
 #[test]
-fn who_gets_no_answer_for_a_while_is_made_anew_and_given_as_long_again() {
+fn a_client_without_an_answer_for_a_while_is_made_anew_and_given_as_long_again() {
     let start = Instant::now();
     let at = |seconds: u64| start + Duration::from_secs(seconds);
-    let mut silence = Silence::default();
+    let mut silent = Silent::default();
     let seen: Vec<bool> = [
         (0, false),
         (2, false),
@@ -75,7 +75,7 @@ fn who_gets_no_answer_for_a_while_is_made_anew_and_given_as_long_again() {
         (8, false),
         (10, false),
     ]
-    .map(|(seconds, answered)| silence.note(at(seconds), answered))
+    .map(|(seconds, answered)| silent.note(Client::Admin, at(seconds), answered))
     .to_vec();
     assert_eq!(seen, [false, false, true, false, true, false, false, false]);
 }
@@ -83,19 +83,20 @@ fn who_gets_no_answer_for_a_while_is_made_anew_and_given_as_long_again() {
 /// Seen with a server that was killed: its last answer went to the client that asks, and not to the one that writes; 3 s later it was
 /// back, the writer had not yet heard from it, and was made anew as if it had been left alone for those 3 s.
 #[test]
-fn what_is_waited_while_nobody_is_answered_does_not_count() {
+fn time_in_which_no_client_is_answered_does_not_count() {
     let start = Instant::now();
-    let lot = Lot::default();
-    let mut watch = Watch::default();
-    assert!(!watch.producers.entry(lot).or_default().note(start, false));
-    assert!(!watch.consumers.entry(false).or_default().note(start, false));
-    assert!(!watch.admin.note(start, false));
-    watch.looked = Some(start);
-    watch.nobody_is_answered();
-    assert_eq!(watch.looked, None, "they are looked at with the next answer");
+    let clients = [
+        Client::Producer(Lot::default()),
+        Client::Consumer { large: false },
+        Client::Admin,
+    ];
+    let mut silent = Silent::default();
+    let note = |silent: &mut Silent, at| clients.map(|client| silent.note(client, at, false));
+    assert_eq!(note(&mut silent, start), [false; 3]);
+    silent.looked = Some(start);
+    silent.nobody_is_answered();
+    assert_eq!(silent.looked, None, "they are looked at with the next answer");
     let back = start + FORSAKEN;
-    assert!(!watch.producers.entry(lot).or_default().note(back, false));
-    assert!(!watch.consumers.entry(false).or_default().note(back, false));
-    assert!(!watch.admin.note(back, false));
-    assert!(watch.producers.entry(lot).or_default().note(back + FORSAKEN, false));
+    assert_eq!(note(&mut silent, back), [false; 3]);
+    assert_eq!(note(&mut silent, back + FORSAKEN), [true; 3]);
 }

@@ -1,4 +1,4 @@
-//! Subscriptions that begin at a place of the topic.
+//! Subscriptions that begin at an offset of the topic.
 
 use blaze_brokers::{Begin, Broker, Place, SubscribeOptions};
 use blaze_domain::names::ChannelName;

@@ -23,12 +23,12 @@ struct State {
 }
 
 /// It listens until the process ends.
-pub(super) struct Impostor {
+pub(super) struct FakeBroker {
     port: u16,
     state: Arc<State>,
 }
 
-impl Impostor {
+impl FakeBroker {
     pub(super) fn start() -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let port = listener.local_addr().unwrap().port();
