@@ -94,66 +94,6 @@ fn publish(connection: &mut redis::Connection, channel: &str, payload: &[u8]) ->
 }
 
 #[test]
-fn a_topic_goes_from_node_to_node_over_the_layer() -> anyhow::Result<()> {
-    let robots = Robots::start()?;
-    let mut reader = RedisReader::new(&robots.redis, &robots.channel(1, "blaze/bare/imu/data"))?;
-    robots.bridge(&json!({"reliability":"reliable"}))?;
-    let mut connection = robots.connect()?;
-    let channel = robots.channel(0, TOPIC);
-    // Until both ends have met: what is published before is gone.
-    let met = RefCell::new(Vec::new());
-    wait::until(
-        "a first message arrives",
-        SOON,
-        || {
-            let _ = publish(&mut connection, &channel, b"first");
-            met.borrow_mut().extend(reader.next(MOMENT).ok().flatten());
-            !met.borrow().is_empty()
-        },
-        || robots.last_words(),
-    )?;
-    let mut found = Vec::new();
-    for number in 1..=MESSAGES {
-        publish(&mut connection, &channel, number.to_string().as_bytes())?;
-        std::thread::sleep(Duration::from_millis(2));
-    }
-    wait::until(
-        "the last message arrives",
-        SOON,
-        || {
-            while let Ok(Some(payload)) = reader.next(MOMENT) {
-                found.push(String::from_utf8_lossy(&payload).into_owned());
-            }
-            found.last() == Some(&MESSAGES.to_string())
-        },
-        || robots.last_words(),
-    )?;
-    found.retain(|payload| payload != "first");
-    let expected: Vec<String> = (1..=MESSAGES).map(|number| number.to_string()).collect();
-    assert_eq!(found, expected, "in order, each once");
-
-    let ids = |robot: &FlowProcess| robot.bridges_up();
-    assert_eq!(ids(&robots.robots[0]), [format!("{TOPIC}|node>layer|edge")]);
-    assert_eq!(ids(&robots.robots[1]), [format!("{TOPIC}|layer>node|edge|bare")]);
-    let bridge = &robots.robots[1].bridges()[0];
-    assert_eq!(
-        (text(&bridge["from"]["broker"]), text(&bridge["to"]["broker"])),
-        ("dds".into(), "redis".into())
-    );
-    assert!(count(&bridge["out"], "messages") >= MESSAGES, "{bridge}");
-    for (robot, to) in [(&robots.robots[0], "edge/robot-2"), (&robots.robots[1], "edge/robot-2")] {
-        let why = robot.why(TOPIC, Some(to))?;
-        assert!(
-            ["flowing", "degraded"].contains(&why["verdict"].as_str().unwrap_or_default()),
-            "{why}"
-        );
-    }
-    let nobody = robots.robots[0].why("nobody/knows", Some("edge/robot-2"))?;
-    assert_eq!(nobody["verdict"], "not_flowing", "{nobody}");
-    Ok(())
-}
-
-#[test]
 fn a_plain_dds_program_reads_what_a_robot_publishes() -> anyhow::Result<()> {
     let robots = Robots::start()?;
     robots.bridge(&json!({}))?;
@@ -239,4 +179,68 @@ fn the_command_line_publishes_and_echoes_on_the_layer() -> anyhow::Result<()> {
     let code = publisher.terminate(SOON)?;
     assert_eq!(code, Some(0), "{}", publisher.tail());
     Ok(())
+}
+
+mod quick {
+    use super::*;
+
+    #[test]
+    fn a_topic_goes_from_node_to_node_over_the_layer() -> anyhow::Result<()> {
+        let robots = Robots::start()?;
+        let mut reader = RedisReader::new(&robots.redis, &robots.channel(1, "blaze/bare/imu/data"))?;
+        robots.bridge(&json!({"reliability":"reliable"}))?;
+        let mut connection = robots.connect()?;
+        let channel = robots.channel(0, TOPIC);
+        // Until both ends have met: what is published before is gone.
+        let met = RefCell::new(Vec::new());
+        wait::until(
+            "a first message arrives",
+            SOON,
+            || {
+                let _ = publish(&mut connection, &channel, b"first");
+                met.borrow_mut().extend(reader.next(MOMENT).ok().flatten());
+                !met.borrow().is_empty()
+            },
+            || robots.last_words(),
+        )?;
+        let mut found = Vec::new();
+        for number in 1..=MESSAGES {
+            publish(&mut connection, &channel, number.to_string().as_bytes())?;
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        wait::until(
+            "the last message arrives",
+            SOON,
+            || {
+                while let Ok(Some(payload)) = reader.next(MOMENT) {
+                    found.push(String::from_utf8_lossy(&payload).into_owned());
+                }
+                found.last() == Some(&MESSAGES.to_string())
+            },
+            || robots.last_words(),
+        )?;
+        found.retain(|payload| payload != "first");
+        let expected: Vec<String> = (1..=MESSAGES).map(|number| number.to_string()).collect();
+        assert_eq!(found, expected, "in order, each once");
+
+        let ids = |robot: &FlowProcess| robot.bridges_up();
+        assert_eq!(ids(&robots.robots[0]), [format!("{TOPIC}|node>layer|edge")]);
+        assert_eq!(ids(&robots.robots[1]), [format!("{TOPIC}|layer>node|edge|bare")]);
+        let bridge = &robots.robots[1].bridges()[0];
+        assert_eq!(
+            (text(&bridge["from"]["broker"]), text(&bridge["to"]["broker"])),
+            ("dds".into(), "redis".into())
+        );
+        assert!(count(&bridge["out"], "messages") >= MESSAGES, "{bridge}");
+        for (robot, to) in [(&robots.robots[0], "edge/robot-2"), (&robots.robots[1], "edge/robot-2")] {
+            let why = robot.why(TOPIC, Some(to))?;
+            assert!(
+                ["flowing", "degraded"].contains(&why["verdict"].as_str().unwrap_or_default()),
+                "{why}"
+            );
+        }
+        let nobody = robots.robots[0].why("nobody/knows", Some("edge/robot-2"))?;
+        assert_eq!(nobody["verdict"], "not_flowing", "{nobody}");
+        Ok(())
+    }
 }
