@@ -12,7 +12,7 @@ use blaze_tests::plain::{KafkaReader, Record};
 use blaze_tests::servers::KafkaServer;
 use bytes::Bytes;
 
-use super::plain::{delete_topic, has_topic, make_topic, topic_setting};
+use super::plain::{delete_topic, has_topic, make_topic, topic_setting, topic_uuid};
 use super::{DEADLINE, Flow, Reader, eventually, health, open, reader, section, start_server, subscribe};
 
 const WITH_KEPT: SubscribeOptions = SubscribeOptions {
@@ -184,9 +184,11 @@ async fn a_topic_that_vanishes_is_made_again_and_one_that_cannot_be_made_holds_u
     let retention = topic_setting(&server, "blaze.config.changed.old", "retention.ms").await;
     assert_eq!(retention, "1000000", "its other settings stay");
     let mut slam = reader(&worker.broker, &channel("slam")).await;
+    let first = topic_uuid(&server, "blaze.config.changed.slam");
     delete_topic(&server, "blaze.config.changed.slam").await;
     eventually("it is made again", async || {
-        has_topic(&server.bootstrap(), "blaze.config.changed.slam")
+        let found = topic_uuid(&server, "blaze.config.changed.slam");
+        found != first && has_topic(&server.bootstrap(), "blaze.config.changed.slam")
     })
     .await;
     worker.write(&[said("slam", "0", "2")]).await;
