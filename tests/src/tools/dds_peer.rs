@@ -50,6 +50,7 @@ pub(crate) struct Options {
 /// `module blaze { module v1 { @final struct Frame { sequence<octet> data; }; }; };`
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Frame {
+    #[serde(with = "serde_bytes")]
     data: Vec<u8>,
 }
 
