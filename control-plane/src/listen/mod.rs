@@ -5,8 +5,7 @@
 //! ```
 //!
 //! `axum-server` accepts, serves and drains; hyper bounds heads and HTTP/2. This module adds what both leave open: the
-//! number of connections, silence before the first request, clients that do not read, and bodies that nobody reads. Heads
-//! up to [`ListenLimits::head_bytes`] reach the router, which answers those that are over the contract's limits itself.
+//! number of connections, silence before the first request, clients that do not read, and bodies that nobody reads.
 
 mod socket;
 #[cfg(test)]
@@ -38,6 +37,13 @@ pub use tls::{Tls, install_crypto_provider};
 /// Lines of a head of HTTP/1.1; one with more is answered 431 by the library, without a body. What has fewer lines and too
 /// many bytes reaches the router.
 const MAX_HEADER_LINES: usize = 1024;
+/// Bytes of a head beyond which the library answers 431. Twice what the contract allows, so that the refusal of the router
+/// can have its form.
+const MAX_HEAD_BYTES: u32 = 64 * 1024;
+/// Requests at once on one connection of HTTP/2.
+const MAX_STREAMS: u32 = 1000;
+/// Bytes of answers that wait in one stream of HTTP/2.
+const STREAM_BUFFER_BYTES: usize = 128 * 1024;
 
 /// What is spoken on a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,14 +63,8 @@ pub struct ListenLimits {
     pub handshake_timeout: Duration,
     /// For the head of a request, and from the acceptance to the first request.
     pub head_timeout: Duration,
-    /// Head of a request, in bytes, beyond which the connection answers 431 itself and closes; at least 8192.
-    pub head_bytes: usize,
     /// A client that takes no byte for this long loses its connection.
     pub write_stall: Duration,
-    /// Requests at once on one connection of HTTP/2.
-    pub streams: u32,
-    /// Bytes of answers that wait in one stream of HTTP/2.
-    pub stream_buffer_bytes: usize,
     /// HTTP/2: between a sign of life and a PING.
     pub keep_alive_interval: Duration,
     /// HTTP/2: for the answer to a PING.
@@ -83,11 +83,7 @@ impl Default for ListenLimits {
             connections: 10_000,
             handshake_timeout: Duration::from_secs(10),
             head_timeout: Duration::from_secs(30),
-            // Twice what the contract allows, so that the refusal can have its form.
-            head_bytes: 64 * 1024,
             write_stall: Duration::from_secs(60),
-            streams: 1000,
-            stream_buffer_bytes: 128 * 1024,
             keep_alive_interval: Duration::from_secs(20),
             keep_alive_timeout: Duration::from_secs(10),
             // Twice the largest body.
@@ -199,16 +195,16 @@ impl Listener {
             .timer(TokioTimer::new())
             .header_read_timeout(limits.head_timeout)
             .max_headers(MAX_HEADER_LINES)
-            .max_buf_size(limits.head_bytes.max(8192));
+            .max_buf_size(MAX_HEAD_BYTES as usize);
         // A head that does not end holds up the answer to a PING: the keep-alive is its limit of time.
         builder
             .http2()
             .timer(TokioTimer::new())
             .keep_alive_interval(limits.keep_alive_interval)
             .keep_alive_timeout(limits.keep_alive_timeout)
-            .max_concurrent_streams(limits.streams)
-            .max_send_buf_size(limits.stream_buffer_bytes)
-            .max_header_list_size(u32::try_from(limits.head_bytes).unwrap_or(u32::MAX));
+            .max_concurrent_streams(MAX_STREAMS)
+            .max_send_buf_size(STREAM_BUFFER_BYTES)
+            .max_header_list_size(MAX_HEAD_BYTES);
         match protocols {
             Protocols::Both => server,
             Protocols::Http2 => server.http2_only(),

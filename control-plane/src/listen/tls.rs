@@ -24,13 +24,14 @@ pub fn install_crypto_provider() {
 }
 
 /// TLS of all ports. Clones share it.
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 pub struct Tls {
     files: Arc<Files>,
     both: RustlsConfig,
     http2: RustlsConfig,
 }
 
+#[derive(Debug)]
 struct Files {
     certificate: PathBuf,
     key: PathBuf,
@@ -89,16 +90,6 @@ impl Tls {
             Protocols::Both => self.both,
             Protocols::Http2 => self.http2,
         }
-    }
-}
-
-impl std::fmt::Debug for Tls {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let files = &self.files;
-        f.debug_struct("Tls")
-            .field("certificate", &files.certificate)
-            .field("client_authorities", &files.client_authorities)
-            .finish_non_exhaustive()
     }
 }
 
