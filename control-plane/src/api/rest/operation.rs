@@ -193,7 +193,7 @@ async fn answer(
     negotiate::check(request.headers(), route.action)?;
     rest.service.authorize(&caller.claims, route.right)?;
     let (parts, body) = request.into_parts();
-    let body = rest.options.limits.metered(&caller.claims.subject, body);
+    let body = rest.options.limits.metered(body);
     let read = body::read(route.payload, &parts.headers, body);
     let body = timeout_at(visit.deadline, read).await.map_err(|_| too_late(false))??;
     let call = Call {
