@@ -8,6 +8,7 @@ use axum::response::Response;
 use blaze_domain::config::{Applied, Code, Key, Kind, Problem};
 use blaze_domain::{DocumentName, ServiceName};
 use bytes::Bytes;
+use serde::de::DeserializeOwned;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 use tokio::time::timeout_at;
@@ -17,7 +18,7 @@ use super::frame::{Visit, note};
 use super::gate::{Known, unknown};
 use super::query::Query;
 use super::routes::{Action, Route, Verb};
-use super::{Rest, documents, effective, headers, history, many, negotiate, reply, system, tokens, watch};
+use super::{Rest, documents, effective, headers, history, many, negotiate, reply, requests, system, tokens, watch};
 use crate::auth::Right;
 use crate::core::{Caller, ConfigService, Idempotency, ReadOptions};
 
@@ -111,6 +112,11 @@ impl Call {
             Some((media, bytes)) => (*media, bytes),
             None => (Media::Json, &NONE),
         }
+    }
+
+    /// A small body.
+    pub(super) fn read<T: DeserializeOwned>(&self) -> Result<T, Problem> {
+        requests::read(&self.json()?)
     }
 
     /// The body as strict JSON.
