@@ -1,9 +1,10 @@
 //! Keeps one connection: connects, lets it be served, watches it, and connects again when it is lost.
 //!
-//! The `ConnectionManager` of the library (1.8) is not used. Its resubscription is one SUBSCRIBE whose refusal is ignored,
-//! so that one forbidden channel silently costs all others; the pipeline for it counts one answer, and the other
-//! confirmations become answers of the next commands. It never connects again after a refused login, tells nobody that it
-//! is connected again, and puts an unbounded queue before the push sender.
+//! The `ConnectionManager` of the library (1.8.1) is not used:
+//! - It subscribes again with one SUBSCRIBE and ignores a refusal: one channel that the access list forbids meanwhile
+//!   silently costs all others.
+//! - After a refused login it never connects again, even when the password is right later.
+//! - It does not tell that it is connected again, nor why it is not yet, and puts an unbounded queue before the push sender.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
