@@ -349,7 +349,7 @@ async fn slow_heads_and_silence_end_the_connection() {
     let mut sender = http2_client(served.connect().await, &served.supervisor).await;
     let closed = async {
         while sender.ready().await.is_ok() && !sender.is_closed() {
-            tokio::time::sleep(SHORT).await
+            tokio::time::sleep(SHORT).await;
         }
     };
     tokio::time::timeout(SOON, closed).await.unwrap();

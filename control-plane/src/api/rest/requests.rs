@@ -147,8 +147,8 @@ mod tests {
 
     use super::*;
 
-    fn pointer<T: DeserializeOwned + std::fmt::Debug>(body: Value) -> String {
-        read::<T>(&body).unwrap_err().errors.remove(0).pointer
+    fn pointer<T: DeserializeOwned + std::fmt::Debug>(body: &Value) -> String {
+        read::<T>(body).unwrap_err().errors.remove(0).pointer
     }
 
     #[test]
@@ -165,10 +165,10 @@ mod tests {
             (json!([1, true]), ""),
             (json!(null), ""),
         ] {
-            assert_eq!(pointer::<RevertRequest>(body.clone()), place, "{body}");
+            assert_eq!(pointer::<RevertRequest>(&body), place, "{body}");
         }
         let long = "x".repeat(MAX_REASON + 1);
-        assert_eq!(pointer::<AbortRequest>(json!({ "reason": long })), "/reason");
+        assert_eq!(pointer::<AbortRequest>(&json!({ "reason": long })), "/reason");
     }
 
     #[test]
