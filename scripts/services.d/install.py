@@ -103,6 +103,7 @@ def cargo_tool(name: str) -> None:
     [pin] = pins(name)
     target = HOME / "cargo" / f"target-{name}"
     environment = {**os.environ, "CARGO_TARGET_DIR": str(target)}
+    environment.pop("RUSTC_WORKSPACE_WRAPPER", None)  # lints are for our own code
     root = HOME / "cargo"
     run("cargo", "install", "--quiet", "--locked", "--debug", "--root", root, pin.package, "--version", pin.version,
         "--force", env=environment)

@@ -142,9 +142,8 @@ mod tests {
         let compiled = Schemas::default().compiled(&schema).unwrap();
         let texts = json!(vec!["ab".repeat(1000); 2000]);
         let begun = Instant::now();
-        let out = within(begun + Duration::from_millis(50), || {
-            compiled.validator(true).is_valid(&texts)
-        });
+        // It has passed: how fast this machine matches must not decide.
+        let out = within(begun, || compiled.validator(true).is_valid(&texts));
         assert_eq!(out, None);
         assert!(begun.elapsed() < Duration::from_secs(5), "{:?}", begun.elapsed());
         // The next one has its own.
