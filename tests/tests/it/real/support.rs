@@ -8,7 +8,7 @@ pub(crate) use blaze_tests::plain::{RedisReader, connect};
 use blaze_tests::servers::unique_name;
 
 /// Where something must happen, on a busy machine.
-pub(crate) const SOON: Duration = Duration::from_secs(20);
+pub(crate) const SOON: Duration = Duration::from_secs(40);
 
 /// A robot on Redis and a cloud on Kafka, joined over DDS on loopback.
 pub(crate) struct RobotAndCloud {
