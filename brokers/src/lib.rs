@@ -2,8 +2,6 @@
 //!
 //! [`Broker`] is what BlazeFlow and the SDK know of a message system; [`memory`] serves services and flows of one process.
 
-#[cfg(feature = "conformance")]
-pub mod conformance;
 pub mod dds;
 #[cfg(feature = "kafka")]
 pub mod kafka;

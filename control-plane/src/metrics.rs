@@ -40,6 +40,8 @@ pub struct ApiMetrics {
     skipped: IntCounter,
     watchers: IntGauge,
     lag: GaugeVec,
+    connections: IntCounterVec,
+    open_connections: IntGaugeVec,
 }
 
 impl std::fmt::Debug for ApiMetrics {
@@ -48,13 +50,51 @@ impl std::fmt::Debug for ApiMetrics {
     }
 }
 
-/// One open watch; closed when dropped.
-#[derive(Debug)]
-pub struct OpenWatch(IntGauge);
+/// What becomes of a connection: taken, or over the limit of connections; the TLS handshake failed or took too long; no
+/// first request came in time; the client took no byte for long.
+const CONNECTION_RESULTS: [&str; 6] = [
+    "accepted",
+    "refused",
+    "handshake_failed",
+    "handshake_timeout",
+    "timeout",
+    "stalled",
+];
 
-impl Drop for OpenWatch {
+/// One of what a gauge counts; counted no more when dropped.
+#[derive(Debug)]
+pub struct OpenGauge(IntGauge);
+
+impl OpenGauge {
+    fn new(gauge: &IntGauge) -> Self {
+        gauge.inc();
+        Self(gauge.clone())
+    }
+}
+
+impl Drop for OpenGauge {
     fn drop(&mut self) {
         self.0.dec();
+    }
+}
+
+/// Connections of one port.
+#[derive(Debug, Clone)]
+pub struct ConnectionMetrics {
+    listener: &'static str,
+    total: IntCounterVec,
+    open: IntGauge,
+}
+
+impl ConnectionMetrics {
+    /// Counts a connection by what became of it.
+    pub(crate) fn count(&self, result: &'static str) {
+        self.total.with_label_values(&[self.listener, result]).inc();
+    }
+
+    /// Counts a connection as open until what it gives is dropped.
+    pub(crate) fn open(&self) -> OpenGauge {
+        OpenGauge::new(&self.open)
     }
 }
 
@@ -97,7 +137,11 @@ impl ApiMetrics {
             "blaze_config_worker_lag_revisions",
             "Revisions that a connected worker is behind.",
         );
+        let connections = Opts::new("blaze_config_connections_total", "Connections by what became of them.");
+        let open_connections = Opts::new("blaze_config_connections", "Connections that are open.");
         Ok(Self {
+            connections: register(&registry, IntCounterVec::new(connections, &["listener", "result"])?)?,
+            open_connections: register(&registry, IntGaugeVec::new(open_connections, &["listener"])?)?,
             requests: register(&registry, IntCounterVec::new(requests, &["api", "operation", "code"])?)?,
             durations: register(
                 &registry,
@@ -164,9 +208,21 @@ impl ApiMetrics {
 
     /// Counts a watch as open until what it gives is dropped.
     #[must_use]
-    pub fn watcher(&self) -> OpenWatch {
-        self.watchers.inc();
-        OpenWatch(self.watchers.clone())
+    pub fn watcher(&self) -> OpenGauge {
+        OpenGauge::new(&self.watchers)
+    }
+
+    /// The connections of a port, all at zero.
+    #[must_use]
+    pub fn connections(&self, listener: &'static str) -> ConnectionMetrics {
+        for result in CONNECTION_RESULTS {
+            self.connections.with_label_values(&[listener, result]);
+        }
+        ConnectionMetrics {
+            listener,
+            total: self.connections.clone(),
+            open: self.open_connections.with_label_values(&[listener]),
+        }
     }
 
     /// How far the connected workers are behind, by layer and node; those that are not named have gone.
@@ -221,7 +277,9 @@ mod tests {
             metrics.state(412, 7, 10, 5);
         }
         metrics.worker_lags([("edge", "robot-1", 3)]);
-        let open = metrics.watcher();
+        let port = metrics.connections("grpc");
+        port.count("stalled");
+        let open = (metrics.watcher(), port.open());
         let text = metrics.text();
         for line in [
             "blaze_config_requests_total{api=\"rest\",code=\"ok\",operation=\"get_node\"} 1",
@@ -235,6 +293,9 @@ mod tests {
             "blaze_config_audit_skipped_total 5",
             "blaze_config_revision 412",
             "blaze_config_watchers 1",
+            "blaze_config_connections_total{listener=\"grpc\",result=\"stalled\"} 1",
+            "blaze_config_connections_total{listener=\"grpc\",result=\"refused\"} 0",
+            "blaze_config_connections{listener=\"grpc\"} 1",
             "blaze_config_worker_lag_revisions{layer=\"edge\",node=\"robot-1\"} 3",
         ] {
             assert!(text.lines().any(|found| found == line), "{line} is not in\n{text}");

@@ -21,9 +21,7 @@ use crate::api::limits::ApiLimits;
 use crate::api::rest::{self, RestOptions};
 use crate::auth::Revocations;
 use crate::core::{ConfigService, CoreOptions};
-use crate::listen::{
-    ListenCounters, ListenLimits, Listener, Protocols, Serving, install_crypto_provider, metrics_text,
-};
+use crate::listen::{ListenLimits, Listener, Protocols, Serving, install_crypto_provider};
 use crate::metrics::ApiMetrics;
 use crate::process::{Keys, SHUTDOWN, Setup, all_of};
 use crate::store::{FullStore, Store};
@@ -54,7 +52,6 @@ struct Built {
     store: Arc<dyn FullStore>,
     rest: Serving,
     grpc: Serving,
-    counters: [Arc<ListenCounters>; 2],
 }
 
 impl RunningMain {
@@ -149,7 +146,6 @@ async fn admin(
 ) -> std::io::Result<SocketAddr> {
     let metrics = Arc::clone(metrics);
     let text = move || {
-        let mut text = String::new();
         if let Some(built) = built.borrow().as_ref() {
             let core = &built.service;
             metrics.state(
@@ -163,9 +159,8 @@ async fn admin(
                 let node = node.as_ref().map_or("", |node| node.as_str());
                 (layer.as_str(), node, *lag)
             }));
-            text.push_str(&metrics_text(&built.counters));
         }
-        metrics.text() + &text
+        metrics.text()
     };
     let address = setup.section.admin.listen;
     let server = AdminServer::bind(address, axum::Router::new(), readiness.clone(), Arc::new(text)).await?;
@@ -256,9 +251,8 @@ async fn build(
     let rest_port = Listener::bind("rest", rest_port, tls.clone(), Protocols::Both, listen.clone()).await?;
     let grpc_port = Listener::bind("grpc", section.grpc.listen, tls, Protocols::Http2, listen).await?;
     Ok(Built {
-        counters: [rest_port.counters(), grpc_port.counters()],
-        rest: rest_port.serve(supervisor, rest),
-        grpc: grpc_port.serve(supervisor, grpc),
+        rest: rest_port.serve(supervisor, rest, metrics),
+        grpc: grpc_port.serve(supervisor, grpc, metrics),
         service,
         store,
     })

@@ -99,10 +99,11 @@ def system_packages(*packages: str) -> None:
     run("apt-get", "-qq", "install", "-y", "--no-install-recommends", *packages, env=environment)
 
 
-def cargo_deny() -> None:
-    [pin] = pins("deny")
-    target = HOME / "cargo" / "target"
+def cargo_tool(name: str) -> None:
+    [pin] = pins(name)
+    target = HOME / "cargo" / f"target-{name}"
     environment = {**os.environ, "CARGO_TARGET_DIR": str(target)}
+    environment.pop("RUSTC_WORKSPACE_WRAPPER", None)  # lints are for our own code
     root = HOME / "cargo"
     run("cargo", "install", "--quiet", "--locked", "--debug", "--root", root, pin.package, "--version", pin.version,
         "--force", env=environment)
@@ -348,7 +349,8 @@ def extract(wheel: Path, programs: dict[str, Path]) -> None:
 
 COMPONENTS = {
     "network": Component(network_tools, tools=("ip", "nft")),
-    "deny": Component(cargo_deny, files=(HOME / "cargo" / "bin" / "cargo-deny",)),
+    "deny": Component(lambda: cargo_tool("deny"), files=(HOME / "cargo" / "bin" / "cargo-deny",)),
+    "nextest": Component(lambda: cargo_tool("nextest"), files=(HOME / "cargo" / "bin" / "cargo-nextest",)),
     "redis": Component(redis, files=(BIN / "redis-server", BIN / "redis-cli", HOME / "deb" / "root")),
     "valkey": Component(valkey, files=(BIN / "valkey-server",)),
     "etcd": Component(etcd, files=(BIN / "etcd",)),

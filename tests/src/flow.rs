@@ -1,7 +1,8 @@
 //! `blaze-flow` as a process of its own, on real brokers.
 
 use std::fmt::Write as _;
-use std::net::Ipv4Addr;
+use std::fs::File;
+use std::net::{Ipv4Addr, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -378,14 +379,27 @@ fn run(file: &Path, host: Option<&Host>) -> anyhow::Result<Process> {
 /// # Errors
 /// When there is none between 40 and 99.
 pub fn free_domain() -> anyhow::Result<u16> {
-    use std::net::UdpSocket;
-    use std::sync::atomic::{AtomicU16, Ordering};
-    static NEXT: AtomicU16 = AtomicU16::new(0);
-    let first = (std::process::id() % 60) as u16 + NEXT.fetch_add(1, Ordering::Relaxed);
-    let mut domains = (0..60).map(|step| 40 + (first + step) % 60);
+    /// Locked files, one for each domain of this process: tests in other processes look for domains at the same time.
+    static HELD: parking_lot::Mutex<Vec<File>> = parking_lot::Mutex::new(Vec::new());
+    let folder = std::env::temp_dir().join("blaze-test-domains");
+    std::fs::create_dir_all(&folder)?;
+    let hold = |domain: u16| -> anyhow::Result<bool> {
+        let file = File::create(folder.join(domain.to_string()))?;
+        let is_ours = file.try_lock().is_ok();
+        if is_ours {
+            HELD.lock().push(file);
+        }
+        Ok(is_ours)
+    };
     // SPDP and user traffic of the first three participants.
-    let free = |domain: &u16| {
+    let is_quiet = |domain: u16| {
         (10..16).all(|offset| UdpSocket::bind((Ipv4Addr::LOCALHOST, 7_400 + 250 * domain + offset)).is_ok())
     };
-    domains.find(free).context("no free DDS domain between 40 and 99")
+    let first = (std::process::id() % 60) as u16;
+    for domain in (0..60).map(|step| 40 + (first + step) % 60) {
+        if hold(domain)? && is_quiet(domain) {
+            return Ok(domain);
+        }
+    }
+    anyhow::bail!("no free DDS domain between 40 and 99")
 }

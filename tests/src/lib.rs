@@ -10,13 +10,11 @@ pub mod ledger;
 pub mod machine;
 mod memory;
 pub mod network;
-#[cfg(feature = "kafka")]
 pub mod plain;
 pub mod process;
 pub mod proxy;
 pub mod scenario;
 pub mod servers;
-#[cfg(feature = "kafka")]
 pub mod stream;
 pub mod wait;
 pub mod wan;

@@ -122,6 +122,14 @@ impl Process {
         Self::launch(name, arguments, namespace, &[], None)
     }
 
+    /// Starts one of the tests' own programs, a subcommand of `blaze-testbed`, in a namespace if one is named.
+    ///
+    /// # Errors
+    /// When it is not built or does not start.
+    pub fn tool(name: &str, arguments: &[&str], namespace: Option<&str>) -> anyhow::Result<Self> {
+        Self::start("blaze-testbed", &[&[name], arguments].concat(), namespace)
+    }
+
     /// Starts a program of the workspace with variables of the environment besides those of the test.
     ///
     /// # Errors

@@ -1,5 +1,6 @@
 //! Makes topics.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -11,9 +12,9 @@ use rdkafka::admin::{
 use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
 
-use super::bell::block_on;
 use super::context::{self, LastError};
 use super::settings::Settings;
+use super::waker::block_on;
 
 /// How long the server has for an answer. While it takes, nobody looks whether it still lives.
 const TIMEOUT: Duration = Duration::from_millis(1500);
@@ -114,7 +115,7 @@ impl Admin {
     }
 
     /// The largest batches that the server takes of topics, in bytes; of those that it tells.
-    pub(super) fn largest_batches(&self, topics: &[Arc<str>]) -> Result<Vec<(Arc<str>, usize)>, KafkaError> {
+    pub(super) fn largest_batches(&self, topics: &[Arc<str>]) -> Result<HashMap<Arc<str>, usize>, KafkaError> {
         let resources: Vec<ResourceSpecifier<'_>> = topics.iter().map(|name| ResourceSpecifier::Topic(name)).collect();
         let found = block_on(self.0.describe_configs(&resources, &Self::options()))?;
         let limit = |config: ConfigResource| {

@@ -4,46 +4,65 @@
 //! server ─► librdkafka (bounded queue) ─► thread: position, identity, header ─► rings of the topic's readers
 //! ```
 //!
-//! The position of each partition is ours: librdkafka is told where to begin and never decides by itself. A reader gets
-//! what lies at or behind the end that it saw when it subscribed. A topic that was made anew has another identity, which
+//! The position of each partition is ours: librdkafka gets it with the assignment and never decides by itself. A reader
+//! gets records at or behind the end that it saw when it subscribed. A topic that was made anew has another identity, which
 //! this client learns before it gets a record of it: it is then read from its beginning, for all its readers.
+//!
+//! Records are polled and handed out under the lock under which assignments change, so no record of an earlier position
+//! comes after a change.
 
-mod positions;
 #[cfg(test)]
 mod tests;
-mod thread;
 mod topic;
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
 use blaze_domain::names::ChannelName;
-use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
-use parking_lot::{Mutex, MutexGuard};
-use rdkafka::consumer::{BaseConsumer, Consumer as _};
-use tokio_util::sync::CancellationToken;
+use blaze_runtime::supervisor::TaskPolicy;
+use futures::Stream as _;
+use parking_lot::Mutex;
+use rdkafka::consumer::{Consumer as _, MessageStream, StreamConsumer};
+use rdkafka::error::{KafkaError, RDKafkaErrorCode};
+use rdkafka::message::{BorrowedMessage, Message as _};
+use rdkafka::util::AsyncRuntime;
+use tokio::sync::Notify;
 
-use super::clock::BrokerClock;
-use super::context::{LastError, ReadContext};
+use super::context::ReadContext;
 use super::directory::{Marks, TopicInfo};
 use super::identity::Identities;
-use super::settings::Settings;
+use super::inner::Shared;
+use super::receive::receive;
+use super::waker::block_on;
 use crate::port::{Received, SubscriptionSender};
-use topic::{Partition, TopicState};
+use topic::{Reader, TopicState};
 
-/// How long the thread may sleep: closing waits for that.
-const POLL: Duration = Duration::from_millis(100);
-
-/// How long a client that was replaced is waited for until nobody uses it any more, and how often that is looked at.
+/// Records that are handed out before others may use the state.
+const BATCH: usize = 256;
+/// How long a replaced client is waited for until nobody uses it, and the pause between two looks.
 const LEAVE: Duration = Duration::from_secs(2);
 const LEAVE_TURN: Duration = Duration::from_millis(5);
-
 /// How long a reader waits to learn of its topic.
 const LEARN: Duration = Duration::from_secs(1);
 
-type Client = BaseConsumer<ReadContext>;
+type Client = StreamConsumer<ReadContext, NoTimers>;
+
+/// A stream consumer wakes itself up for the sake of its group; these are in none.
+struct NoTimers;
+
+impl AsyncRuntime for NoTimers {
+    type Delay = futures::future::Pending<()>;
+
+    fn spawn<T: Future<Output = ()> + Send + 'static>(_: T) {}
+
+    fn delay_for(_: Duration) -> Self::Delay {
+        futures::future::pending()
+    }
+}
 
 /// A topic that is to be read.
 #[derive(Debug, Clone)]
@@ -75,121 +94,210 @@ pub(super) enum Join<'a> {
     AfterKept(&'a mut dyn FnMut() -> Vec<Received>),
 }
 
+/// A topic that has readers, and whether it is to be looked at soon.
+pub(super) struct Known {
+    pub(super) topic: Arc<str>,
+    /// The server does not have it yet.
+    pub(super) is_awaited: bool,
+    /// It is not read now, and may be.
+    pub(super) is_idle: bool,
+}
+
 #[derive(Default)]
 struct State {
+    /// `None` after the end.
+    client: Option<Arc<Client>>,
     topics: HashMap<Arc<str>, TopicState>,
-    /// Topics that were made to be read from elsewhere since the thread last looked: what it polled meanwhile may be a record
-    /// of before.
-    moved: HashSet<Arc<str>>,
     /// Number of identity changes that were looked at.
     identities_seen: u64,
-    closed: bool,
 }
 
 /// One client that reads.
 pub(super) struct Consumer {
     large: bool,
     layer: String,
-    client: Mutex<Option<Arc<Client>>>,
+    shared: Arc<Shared>,
     identities: Arc<Identities>,
     state: Mutex<State>,
-    clock: Arc<Mutex<BrokerClock>>,
-    last_error: Arc<LastError>,
-    /// A position was not on the server: someone has to look.
+    /// The client is another one.
+    replaced: Notify,
+    /// A position was not on the server, so all positions are to be compared.
     lost_position: AtomicBool,
 }
 
 impl Consumer {
     /// Makes the client and its thread.
-    pub(super) fn start(
-        large: bool,
-        layer: &str,
-        settings: &Settings,
-        clock: &Arc<Mutex<BrokerClock>>,
-        last_error: &Arc<LastError>,
-        supervisor: &Supervisor,
-        stop: &CancellationToken,
-    ) -> Result<Arc<Self>, String> {
-        let consumer = Arc::new(Self::new(large, layer, settings, clock, last_error)?);
+    pub(super) fn start(large: bool, layer: &str, shared: &Arc<Shared>) -> Result<Arc<Self>, String> {
+        let consumer = Arc::new(Self::new(large, layer, shared)?);
         let name = if large { "kafka-read-l" } else { "kafka-read" };
-        let run = {
-            let (consumer, stop) = (Arc::clone(&consumer), stop.clone());
-            move || consumer.run(&stop)
+        let reading = Arc::clone(&consumer);
+        let run = move || {
+            block_on(reading.shared.stop.run_until_cancelled(reading.run()));
+            // The client ends here, on the thread that may wait for it.
+            reading.close();
         };
-        supervisor
-            .spawn_thread(name, TaskPolicy::MayEnd, run)
-            .map_err(|error| error.to_string())?;
+        let started = shared.supervisor.spawn_thread(name, TaskPolicy::MayEnd, run);
+        started.map_err(|error| error.to_string())?;
         Ok(consumer)
     }
 
     /// Makes the client alone.
-    fn new(
-        large: bool,
-        layer: &str,
-        settings: &Settings,
-        clock: &Arc<Mutex<BrokerClock>>,
-        last_error: &Arc<LastError>,
-    ) -> Result<Self, String> {
-        let identities = Arc::default();
-        let client = Self::connect(large, settings, &identities, last_error)?;
-        Ok(Self {
+    fn new(large: bool, layer: &str, shared: &Arc<Shared>) -> Result<Self, String> {
+        let consumer = Self {
             large,
             layer: layer.to_owned(),
-            client: Mutex::new(Some(client)),
-            identities,
+            shared: Arc::clone(shared),
+            identities: Arc::default(),
             state: Mutex::default(),
-            clock: Arc::clone(clock),
-            last_error: Arc::clone(last_error),
+            replaced: Notify::new(),
             lost_position: AtomicBool::new(false),
-        })
+        };
+        consumer.state.lock().client = Some(consumer.connect()?);
+        Ok(consumer)
     }
 
-    fn connect(
-        large: bool,
-        settings: &Settings,
-        identities: &Arc<Identities>,
-        last_error: &Arc<LastError>,
-    ) -> Result<Arc<Client>, String> {
-        let context = ReadContext::new(identities, last_error);
-        let made = settings.consumer(large).create_with_context(context);
+    fn connect(&self) -> Result<Arc<Client>, String> {
+        let context = ReadContext::new(&self.identities, &self.shared.last_error);
+        let made = self.shared.settings.consumer(self.large).create_with_context(context);
         made.map(Arc::new).map_err(|error| error.to_string())
     }
 
-    /// What is read, and the client that reads it: both at once, because another client may come at any moment, and what is asked of
-    /// the one before it is never read. `None` when it was closed.
-    fn reading(&self) -> Option<(MutexGuard<'_, State>, Arc<Client>)> {
-        let state = self.state.lock();
-        let client = self.client.lock().clone()?;
-        Some((state, client))
+    fn client(&self) -> Option<Arc<Client>> {
+        self.state.lock().client.clone()
+    }
+
+    /// Hands out records until there is no client any more.
+    async fn run(&self) {
+        while let Some(client) = self.client() {
+            let mut stream = client.stream();
+            let read = std::future::poll_fn(|context| self.hand_out(&client, &mut stream, context, BATCH));
+            tokio::select! {
+                () = read => {}
+                () = self.replaced.notified() => {}
+            }
+        }
+    }
+
+    /// Hands out what a client has, up to a limit; then others have a turn. Ready when it is not the client any more.
+    fn hand_out(
+        &self,
+        client: &Arc<Client>,
+        stream: &mut MessageStream<'_, ReadContext>,
+        context: &mut Context<'_>,
+        limit: usize,
+    ) -> Poll<()> {
+        let mut state = self.state.lock();
+        if !state.client.as_ref().is_some_and(|now| Arc::ptr_eq(now, client)) {
+            return Poll::Ready(());
+        }
+        for _ in 0..limit {
+            let next = Pin::new(&mut *stream).poll_next(context);
+            // Also without a record: at the position of before there may be none of the topic that was made anew.
+            let anew = self.follow_identities(&mut state, client);
+            let Poll::Ready(next) = next else {
+                return Poll::Pending;
+            };
+            match next {
+                // It was read at a position of the topic that was before, and comes again.
+                Some(Ok(message)) if anew.iter().any(|topic| **topic == *message.topic()) => {}
+                Some(Ok(message)) => self.deliver(&mut state, client, &message),
+                Some(Err(error)) => self.note_error(&error),
+                None => return Poll::Ready(()),
+            }
+        }
+        context.waker().wake_by_ref();
+        Poll::Pending
+    }
+
+    fn note_error(&self, error: &KafkaError) {
+        if matches!(
+            error.rdkafka_error_code(),
+            Some(RDKafkaErrorCode::AutoOffsetReset | RDKafkaErrorCode::OffsetOutOfRange)
+        ) {
+            self.look_again();
+        }
+        self.shared.last_error.note(error.to_string());
+        tracing::debug!(%error, "reading");
+    }
+
+    /// Topics that were made anew are read from their beginning. Returns which.
+    fn follow_identities(&self, state: &mut State, client: &Client) -> Vec<Arc<str>> {
+        let changes = self.identities.changes();
+        if changes == state.identities_seen {
+            return Vec::new();
+        }
+        state.identities_seen = changes;
+        let mut anew = Vec::new();
+        for (name, topic) in &mut state.topics {
+            let Some(uuid) = self.identities.of(name) else { continue };
+            match &topic.uuid {
+                Some(before) if *before == uuid => {}
+                None => topic.identify(Some(uuid), &self.layer),
+                Some(before) => {
+                    tracing::info!(topic = %name, ?before, now = ?uuid, "the topic was made anew");
+                    topic.made_anew(uuid, &self.layer);
+                    if topic.assigned {
+                        topic.reassign(client);
+                    }
+                    anew.push(Arc::clone(name));
+                }
+            }
+        }
+        anew
+    }
+
+    fn deliver(&self, state: &mut State, client: &Client, message: &BorrowedMessage<'_>) {
+        let Some(topic) = state.topics.get_mut(message.topic()) else {
+            return;
+        };
+        let Ok(number) = usize::try_from(message.partition()) else {
+            return;
+        };
+        let Some(partition) = topic.partitions.get_mut(number) else {
+            return;
+        };
+        let offset = message.offset();
+        if offset < partition.next {
+            return;
+        }
+        partition.next = offset + 1;
+        let identity = partition.bare_writer.zip(u64::try_from(offset + 1).ok());
+        // A tombstone takes away; there is nothing to deliver.
+        let Some(payload) = message.payload() else { return };
+        let wanted = |reader: &Reader| reader.starts.get(number).is_none_or(|start| offset >= *start);
+        if topic.readers.iter().any(wanted) {
+            let received = receive(&topic.source.channel, message, payload, identity, &self.shared.clock);
+            topic
+                .readers
+                .retain(|reader| !wanted(reader) || reader.sender.send(received.clone()));
+        }
+        if topic.readers.is_empty() {
+            topic.unassign(client);
+            state.topics.remove(message.topic());
+        }
     }
 
     /// Whether the client gets an answer of the server. Waits for it.
     pub(super) fn is_answered(&self, topic: &str, timeout: Duration) -> bool {
-        let client = self.client.lock().clone();
-        client.is_none_or(|client| client.fetch_metadata(Some(topic), timeout).is_ok())
+        self.client()
+            .is_none_or(|client| client.fetch_metadata(Some(topic), timeout).is_ok())
     }
 
     /// Begins anew with a client that knows nothing; it reads on where the old one stood. Blocks while that one ends.
-    pub(super) fn remake(&self, settings: &Settings) -> Result<(), String> {
-        let made = Self::connect(self.large, settings, &self.identities, &self.last_error)?;
-        let mut state = self.state.lock();
-        let State { topics, moved, .. } = &mut *state;
+    pub(super) fn remake(&self) -> Result<(), String> {
+        let made = self.connect()?;
         let old = {
-            let mut client = self.client.lock();
-            // Who was closed stays closed.
-            let Some(client) = client.as_mut() else { return Ok(()) };
-            std::mem::replace(client, Arc::clone(&made))
-        };
-        for (name, topic) in topics.iter_mut().filter(|(_, topic)| topic.assigned) {
-            if let Err(error) = topic.assign(&made) {
-                // It is asked for again when it is seen to stand still.
-                tracing::warn!(topic = %name, %error, "the topic cannot be read");
+            let mut state = self.state.lock();
+            let State { client, topics, .. } = &mut *state;
+            // Once closed it stays closed.
+            let Some(client) = client else { return Ok(()) };
+            for topic in topics.values_mut().filter(|topic| topic.assigned) {
+                topic.assign(&made);
             }
-            moved.insert(Arc::clone(name));
-        }
-        drop(state);
-        // The thread that reads is with the old one for a moment yet. If it were the last to leave it, it would read nothing while that
-        // one ends.
+            std::mem::replace(client, made)
+        };
+        self.replaced.notify_one();
+        // The thread that reads has the old one for a moment yet. If it were the last, it would read nothing while that one ends.
         let until = Instant::now() + LEAVE;
         while Arc::strong_count(&old) > 1 && Instant::now() < until {
             std::thread::sleep(LEAVE_TURN);
@@ -208,122 +316,104 @@ impl Consumer {
         join: Join<'_>,
     ) -> Result<(), Refused> {
         self.learn(&source.topic);
-        let Some((mut state, client)) = self.reading() else {
-            return Err(Refused::Closed);
-        };
+        let mut state = self.state.lock();
         let State {
-            topics, moved, closed, ..
-        } = &mut *state;
-        if *closed {
+            client: Some(client),
+            topics,
+            ..
+        } = &mut *state
+        else {
             return Err(Refused::Closed);
-        }
-        let mut note_move = || moved.insert(Arc::clone(&source.topic));
-        if let Some(topic) = topics.get_mut(&source.topic) {
-            if topic.awaited {
-                topic.came(info, &self.layer, &client);
-                note_move();
-            } else if let (Some(known), Some(found)) = (&topic.uuid, &info.uuid)
-                && known != found
-            {
-                topic.made_anew(found.clone(), &self.layer);
-                topic.grow(info.partitions, &self.layer);
-                topic.reassign(&client);
-                note_move();
-            } else if matches!(join, Join::AfterKept(_))
-                && topic.partitions.iter().zip(&starts).any(|(at, start)| at.next > *start)
-            {
-                return Err(Refused::Behind(topic.partitions.iter().map(|at| at.next).collect()));
-            }
-            if matches!(join, Join::Rewinding) && topic.rewind(&starts, &client) {
-                note_move();
-            }
-            topic.take_in(sender, starts, join);
-            return Ok(());
-        }
-        let mut topic = TopicState {
-            source: source.clone(),
-            uuid: None,
-            partitions: starts
-                .iter()
-                .map(|start| Partition {
-                    next: *start,
-                    bare_writer: None,
-                    doubted_since: None,
-                })
-                .collect(),
-            readers: Vec::new(),
-            assigned: false,
-            stood_back: false,
-            awaited: false,
-            behind: None,
         };
-        topic.identify(info.uuid.clone(), &self.layer);
-        topic
-            .assign(&client)
-            .map_err(|error| Refused::Failed(error.to_string()))?;
-        topic.take_in(sender, starts, join);
-        // It may have been read until a moment ago.
-        note_move();
-        topics.insert(Arc::clone(&source.topic), topic);
+        let known = topics.contains_key(&source.topic);
+        let topic = topics
+            .entry(Arc::clone(&source.topic))
+            .or_insert_with(|| TopicState::new(source));
+        if !known {
+            topic.begin_at(&starts, info, &self.layer);
+            if !topic.assign(client) {
+                topics.remove(&source.topic);
+                return Err(Refused::Failed("the client does not take the topic".to_owned()));
+            }
+        } else if topic.is_awaited() {
+            topic.begin_at(&[], info, &self.layer);
+            topic.assign(client);
+        } else if let (Some(known), Some(found)) = (&topic.uuid, &info.uuid)
+            && known != found
+        {
+            topic.made_anew(found.clone(), &self.layer);
+            topic.grow(info.partitions, &self.layer);
+            topic.reassign(client);
+        } else if matches!(join, Join::AfterKept(_)) && topic.is_beyond(&starts) {
+            return Err(Refused::Behind(topic.positions()));
+        }
+        match join {
+            Join::Following => {}
+            Join::Rewinding => topic.rewind(&starts, client),
+            Join::AfterKept(kept) => {
+                sender.send_kept(kept());
+            }
+        }
+        topic.readers.push(Reader { sender, starts });
         Ok(())
     }
 
     /// Takes a reader in of a topic that is not there yet.
     pub(super) fn add_awaiting(&self, source: &Source, sender: SubscriptionSender) -> Result<(), Refused> {
         let mut state = self.state.lock();
-        if state.closed {
+        if state.client.is_none() {
             return Err(Refused::Closed);
         }
         tracing::debug!(topic = %source.topic, "the topic is not there yet; it is read as soon as it is");
-        let topic = state
-            .topics
-            .entry(Arc::clone(&source.topic))
-            .or_insert_with(|| TopicState {
-                source: source.clone(),
-                uuid: None,
-                partitions: Vec::new(),
-                readers: Vec::new(),
-                assigned: false,
-                stood_back: false,
-                awaited: true,
-                behind: None,
-            });
-        topic.take_in(sender, Vec::new(), Join::Following);
+        let topic = state.topics.entry(Arc::clone(&source.topic));
+        let topic = topic.or_insert_with(|| TopicState::new(source));
+        let starts = Vec::new();
+        topic.readers.push(Reader { sender, starts });
         Ok(())
-    }
-
-    /// Whether a topic is waited for.
-    pub(super) fn is_awaited(&self, topic: &str) -> bool {
-        self.state.lock().topics.get(topic).is_some_and(|topic| topic.awaited)
-    }
-
-    /// Whether any topic is waited for.
-    pub(super) fn awaits_any(&self) -> bool {
-        self.state.lock().topics.values().any(|topic| topic.awaited)
     }
 
     /// Lets the client ask for a topic that is new to it: by itself it does so once a second.
     fn learn(&self, topic: &str) {
-        if self.state.lock().topics.contains_key(topic) {
-            return;
-        }
-        let Some(client) = self.client.lock().clone() else {
-            return;
+        let client = {
+            let state = self.state.lock();
+            let new = !state.topics.contains_key(topic);
+            state.client.clone().filter(|_| new)
         };
         // Without an answer it asks again by itself.
-        if let Err(error) = client.fetch_metadata(Some(topic), LEARN) {
+        if let Some(Err(error)) = client.map(|client| client.fetch_metadata(Some(topic), LEARN)) {
             tracing::debug!(topic, %error, "the reader has not learnt of its topic");
         }
     }
 
-    /// The topics that are read or are to be read.
-    pub(super) fn topics(&self) -> Vec<Arc<str>> {
-        self.state.lock().topics.keys().cloned().collect()
+    /// How many topics are read or are to be read.
+    pub(super) fn count(&self) -> usize {
+        self.state.lock().topics.len()
     }
 
-    /// Whether a topic is to be read and is not.
-    pub(super) fn is_idle(&self, topic: &str) -> bool {
-        self.state.lock().topics.get(topic).is_some_and(|topic| !topic.assigned)
+    /// The topics that are read or are to be read, without those whose readers have gone.
+    pub(super) fn topics(&self) -> Vec<Known> {
+        let mut state = self.state.lock();
+        let State { client, topics, .. } = &mut *state;
+        topics.retain(|_, topic| {
+            topic.readers.retain(|reader| !reader.sender.is_closed());
+            if let (Some(client), true) = (&client, topic.readers.is_empty()) {
+                topic.unassign(client);
+            }
+            !topic.readers.is_empty()
+        });
+        topics
+            .iter()
+            .map(|(name, topic)| Known {
+                topic: Arc::clone(name),
+                is_awaited: topic.is_awaited(),
+                is_idle: !topic.assigned && self.shared.gate.lets(topic.source.stays_open),
+            })
+            .collect()
+    }
+
+    /// Whether any topic is waited for.
+    pub(super) fn awaits_any(&self) -> bool {
+        self.state.lock().topics.values().any(TopicState::is_awaited)
     }
 
     /// Whether a position was not on the server, since the last call.
@@ -331,91 +421,57 @@ impl Consumer {
         self.lost_position.swap(false, Ordering::AcqRel)
     }
 
-    /// What could not be looked into is to be looked into again.
+    /// All positions are to be compared with those of the server.
     pub(super) fn look_again(&self) {
         self.lost_position.store(true, Ordering::Release);
     }
 
-    /// Forgets readers that have gone, and topics without any.
-    pub(super) fn sweep(&self) {
-        let Some((mut state, client)) = self.reading() else {
-            return;
-        };
-        let mut empty = Vec::new();
-        for (name, topic) in &mut state.topics {
-            topic.readers.retain(|reader| !reader.sender.is_closed());
-            if topic.readers.is_empty() {
-                empty.push(Arc::clone(name));
-            }
-        }
-        for name in empty {
-            forget(&mut state, &client, &name);
-        }
-    }
-
     /// Stops reading, but for what stays open.
     pub(super) fn stand_back(&self) {
-        let Some((mut state, client)) = self.reading() else {
-            return;
-        };
-        for topic in state.topics.values_mut().filter(|topic| !topic.source.stays_open) {
-            topic.unassign(&client);
+        let mut state = self.state.lock();
+        let State { client, topics, .. } = &mut *state;
+        let Some(client) = client else { return };
+        for topic in topics.values_mut().filter(|topic| !topic.source.stays_open) {
+            topic.unassign(client);
             topic.stood_back = true;
         }
     }
 
-    /// Reads a topic again. One that this flow stood back from is read from its end, because what was written meanwhile was another's;
-    /// one that the client did not take when it was to be read on, from where it stood.
-    /// `lets` is asked under the lock that [`Consumer::stand_back`] takes: who stands back meanwhile reads nothing.
-    pub(super) fn resume(&self, topic: &str, info: &TopicInfo, marks: &[Marks], lets: impl FnOnce() -> bool) {
-        let Some((mut state, client)) = self.reading() else {
+    /// Brings the reading of a topic into line with what the server says of it: begins, reads new partitions, asks again for
+    /// what stands still. `lost_position`: looks whether the server has what is to be read next.
+    pub(super) fn follow(&self, now: Instant, name: &str, (info, marks): (&TopicInfo, &[Marks]), lost_position: bool) {
+        let mut state = self.state.lock();
+        let State { client, topics, .. } = &mut *state;
+        let (Some(client), Some(topic)) = (client, topics.get_mut(name)) else {
             return;
         };
-        if !lets() {
-            return;
-        }
-        let State { topics, moved, .. } = &mut *state;
-        let Some(topic) = topics.get_mut(topic) else {
-            return;
-        };
-        if topic.assigned {
-            return;
-        }
-        moved.insert(Arc::clone(&topic.source.topic));
-        if topic.awaited {
-            topic.came(info, &self.layer, &client);
-            return;
-        }
-        topic.identify(info.uuid.clone(), &self.layer);
-        topic.grow(info.partitions, &self.layer);
-        if std::mem::take(&mut topic.stood_back) {
-            for (partition, mark) in topic.partitions.iter_mut().zip(marks) {
-                partition.next = mark.high;
+        if !topic.assigned {
+            // Asked under the lock that standing back takes: nothing is read after it.
+            if self.shared.gate.lets(topic.source.stays_open) {
+                topic.begin(info, marks, &self.layer);
+                topic.assign(client);
             }
-            for reader in &mut topic.readers {
-                reader.starts = marks.iter().map(|mark| mark.high).collect();
-            }
+            return;
         }
-        if let Err(error) = topic.assign(&client) {
-            tracing::debug!(topic = %topic.source.topic, %error, "could not be read again yet");
+        if topic.uuid != info.uuid {
+            return;
+        }
+        if info.partitions > topic.partitions.len() {
+            topic.grow(info.partitions, &self.layer);
+            topic.reassign(client);
+        }
+        if !lost_position {
+            topic.watch(marks, now, client);
+        } else if topic.compare(marks, now, client) {
+            self.look_again();
         }
     }
 
-    /// Ends all readers.
-    pub(super) fn close(&self) {
-        let topics = {
-            let mut state = self.state.lock();
-            state.closed = true;
-            std::mem::take(&mut state.topics)
-        };
-        for reader in topics.values().flat_map(|topic| &topic.readers) {
+    /// Ends all readers, then the client.
+    fn close(&self) {
+        let state = std::mem::take(&mut *self.state.lock());
+        for reader in state.topics.values().flat_map(|topic| &topic.readers) {
             reader.sender.close();
         }
-    }
-}
-
-fn forget(state: &mut State, client: &Client, topic: &str) {
-    if let Some(mut topic) = state.topics.remove(topic) {
-        topic.unassign(client);
     }
 }

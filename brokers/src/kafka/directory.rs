@@ -1,5 +1,6 @@
 //! What the server says of itself and its topics.
 
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -9,9 +10,9 @@ use rdkafka::error::{KafkaError, RDKafkaErrorCode};
 use rdkafka::metadata::{Metadata, MetadataTopic};
 use rdkafka::{Offset, TopicPartitionList};
 
-use super::context::{LastError, ReadContext};
+use super::context::ReadContext;
 use super::identity::{Identities, TopicUuid};
-use super::settings::Settings;
+use super::inner::Shared;
 
 /// How long the log is read for an identity that is not there yet.
 const IDENTITY_TURN: Duration = Duration::from_millis(1);
@@ -70,13 +71,14 @@ pub(super) struct Listing {
     /// Brokers of the cluster.
     pub(super) brokers: usize,
     /// Topics and their partitions; those that are asked for alone if not all were.
-    pub(super) topics: Vec<(String, usize)>,
+    pub(super) topics: HashMap<String, usize>,
 }
 
 type Client = BaseConsumer<ReadContext>;
 
 /// A client that only asks, so that its answers never wait behind records.
 pub(super) struct Directory {
+    shared: Arc<Shared>,
     client: Mutex<Option<Arc<Client>>>,
     identities: Arc<Identities>,
     /// One look-up at a time: the log that holds the identity is read by one.
@@ -84,32 +86,32 @@ pub(super) struct Directory {
 }
 
 impl Directory {
-    pub(super) fn new(settings: &Settings, last_error: &Arc<LastError>) -> Result<Self, KafkaError> {
-        let identities = Arc::default();
-        let client = Self::connect(settings, &identities, last_error)?;
-        Ok(Self {
-            client: Mutex::new(Some(client)),
-            identities,
+    pub(super) fn new(shared: &Arc<Shared>) -> Result<Self, KafkaError> {
+        let directory = Self {
+            shared: Arc::clone(shared),
+            client: Mutex::default(),
+            identities: Arc::default(),
             turn: Mutex::default(),
-        })
+        };
+        *directory.client.lock() = Some(directory.connect()?);
+        Ok(directory)
     }
 
-    fn connect(
-        settings: &Settings,
-        identities: &Arc<Identities>,
-        last_error: &Arc<LastError>,
-    ) -> Result<Arc<Client>, KafkaError> {
-        let context = ReadContext::new(identities, last_error);
-        settings.questions().create_with_context(context).map(Arc::new)
+    fn connect(&self) -> Result<Arc<Client>, KafkaError> {
+        let context = ReadContext::new(&self.identities, &self.shared.last_error);
+        let made = self.shared.settings.questions().create_with_context(context);
+        made.map(Arc::new)
     }
 
     /// Begins anew with a client that knows nothing. Blocks while the old one ends.
-    pub(super) fn remake(&self, settings: &Settings, last_error: &Arc<LastError>) -> Result<(), KafkaError> {
-        let made = Self::connect(settings, &self.identities, last_error)?;
-        let mut client = self.client.lock();
-        // Who was closed stays closed.
-        let old = client.as_mut().map(|client| std::mem::replace(client, made));
-        drop(client);
+    pub(super) fn remake(&self) -> Result<(), KafkaError> {
+        let made = self.connect()?;
+        // Once closed it stays closed.
+        let old = self
+            .client
+            .lock()
+            .as_mut()
+            .map(|client| std::mem::replace(client, made));
         drop(old);
         Ok(())
     }
@@ -122,8 +124,8 @@ impl Directory {
     pub(super) fn list(&self, topic: Option<&str>, timeout: Duration) -> Result<Listing, LookupError> {
         let client = self.client()?;
         let metadata = client.fetch_metadata(topic, timeout);
-        // Serves the client's log and errors.
-        client.poll(Duration::ZERO);
+        // Serves all there is of the client's log and errors: without a time it would serve one line alone.
+        client.poll(IDENTITY_TURN);
         let metadata = metadata?;
         let good = |topic: &&MetadataTopic| topic.error().is_none() && !topic.partitions().is_empty();
         let topics = metadata.topics().iter().filter(good);

@@ -15,10 +15,10 @@ use super::directory::Listing;
 use super::identity::TopicUuid;
 use super::inner::Inner;
 use super::keyed::KeyedWriter;
-use super::maker::{Made, Maker, Prepared};
 use super::names::RESERVED;
 use super::read_to_end::ReaderToEnd;
 use super::record;
+use super::topic_creator::TopicCreator;
 use super::topics::Topic;
 use crate::port::{BrokerError, FlowSide};
 
@@ -29,11 +29,18 @@ const MAX_LEASES: usize = 65_536;
 /// Places of a writer that are taken away at most.
 const MAX_DEPTH: u32 = 10_000;
 
+/// The topic of leases as the server had it when it was last listed.
+#[derive(Default)]
+struct Seen {
+    is_there: bool,
+    uuid: Option<TopicUuid>,
+}
+
 /// The flow's part of a broker.
 pub(super) struct FlowState {
-    maker: Maker,
+    pub(super) creator: TopicCreator,
     leases: Arc<Topic>,
-    leases_identity: Mutex<Option<TopicUuid>>,
+    leases_seen: Mutex<Seen>,
     mirror: Mutex<HashMap<String, Bytes>>,
     pub(super) keyed: KeyedWriter,
     pub(super) stood_back: Mutex<Option<String>>,
@@ -46,36 +53,31 @@ impl FlowState {
         let needed = std::iter::once((Arc::clone(&leases.name), Purpose::LastValues))
             .chain(reserved.map(|name| (name, Purpose::Messages)));
         Self {
-            maker: Maker::new(needed.collect()),
+            creator: TopicCreator::new(needed),
             leases,
-            leases_identity: Mutex::default(),
+            leases_seen: Mutex::default(),
             mirror: Mutex::default(),
             keyed: KeyedWriter::default(),
             stood_back: Mutex::default(),
         }
     }
 
-    /// Makes what is missing, as [`Maker::make`].
-    pub(super) fn keep_topics(&self, inner: &Inner, listing: &Listing) -> Result<Made, String> {
-        let (made, asked) = self.maker.make(inner, listing)?;
-        if asked.contains(&self.leases.name) {
-            self.write_all_leases();
-        }
-        if made != Made::Needed {
-            self.follow_leases_topic(inner);
-        }
-        Ok(made)
-    }
-
-    /// If someone else made the topic of leases anew, it is empty.
-    fn follow_leases_topic(&self, inner: &Inner) {
+    /// Writes all leases again if their topic was made anew, for then it is empty.
+    pub(super) fn follow_leases_topic(&self, inner: &Inner, listing: &Listing) {
         let name = &self.leases.name;
-        let found = inner.directory.known_identity(name);
-        let Some(found) = found.or_else(|| inner.directory.topic(name, Duration::from_secs(1)).ok()?.uuid) else {
-            return;
-        };
-        let before = self.leases_identity.lock().replace(found.clone());
-        if before.is_some_and(|before| before != found) {
+        let is_there = listing.topics.contains_key(&**name);
+        let known = || inner.directory.known_identity(name);
+        let ask = || inner.directory.topic(name, Duration::from_secs(1)).ok()?.uuid;
+        let uuid = if is_there { known().or_else(ask) } else { None };
+        let before = std::mem::replace(
+            &mut *self.leases_seen.lock(),
+            Seen {
+                is_there,
+                uuid: uuid.clone(),
+            },
+        );
+        let is_another = matches!((before.uuid, uuid), (Some(before), Some(now)) if before != now);
+        if is_there && (!before.is_there || is_another) {
             self.write_all_leases();
         }
     }
@@ -99,7 +101,7 @@ impl FlowState {
         let name = &self.leases.name;
         let info = inner.directory.topic(name, LOAD)?;
         let marks = inner.directory.marks(name, info.partitions, deadline)?;
-        let mut reader = ReaderToEnd::open(&inner.settings, &inner.last_error, name, &marks)?;
+        let mut reader = ReaderToEnd::open(&inner.shared, name, &marks)?;
         let ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
         reader.read(&ends, deadline, &|| inner.is_closed(), |_, payload| {
             Some(Bytes::copy_from_slice(payload))
@@ -133,16 +135,16 @@ impl FlowSide for KafkaFlowSide {
         } else {
             Purpose::Messages
         };
-        self.state.maker.prepare(&self.inner, channel, purpose, depth)
+        self.state.creator.prepare(&self.inner, channel, purpose, depth)
     }
 
     fn take_collisions(&self) -> Vec<(ChannelName, String)> {
-        self.state.maker.take_collisions()
+        self.state.creator.take_collisions()
     }
 
     fn release(&self, channel: &ChannelName) {
         if let Ok(name) = self.inner.names.topic(channel) {
-            self.state.maker.release(&name);
+            self.state.creator.release(&name);
         }
     }
 
@@ -172,10 +174,11 @@ impl FlowSide for KafkaFlowSide {
         let Ok(name) = self.inner.names.topic(channel) else {
             return;
         };
-        let known = |prepared: &Prepared| (Arc::clone(&prepared.topic), prepared.depth);
-        let Some((topic, depth)) = self.state.maker.with(&name, known) else {
-            return;
-        };
+        let known = self
+            .state
+            .creator
+            .with(&name, |prepared| (prepared.topic.clone(), prepared.depth));
+        let Some((Some(topic), depth)) = known else { return };
         // A topic that is not there keeps nothing.
         let Some(partitions) = topic.partitions() else { return };
         let partition = Some(record::partition_of(writer, partitions));

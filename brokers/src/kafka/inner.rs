@@ -1,8 +1,8 @@
 //! What threads, tasks and publishers of one broker share.
 
 use std::collections::HashMap;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use blaze_domain::names::ChannelName;
@@ -13,7 +13,6 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use super::admin::Admin;
-use super::bell::Bell;
 use super::clock::BrokerClock;
 use super::consumer::{Consumer, Join, Refused, Source};
 use super::context::LastError;
@@ -26,7 +25,9 @@ use super::read_to_end::ReaderToEnd;
 use super::receive::receive;
 use super::record;
 use super::settings::{Lot, Settings};
+use super::topic_creator::TopicCreator;
 use super::topics::Topics;
+use super::waker::ThreadWaker;
 use super::worker_side::WorkerState;
 use crate::port::{Begin, BrokerError, BrokerStatus, Health, Received, SubscribeOptions, Subscription, subscription};
 
@@ -34,9 +35,9 @@ use crate::port::{Begin, BrokerError, BrokerStatus, Health, Received, SubscribeO
 pub(super) const MAX_CHANNELS: usize = 10_000;
 /// How long subscribing may take.
 const SUBSCRIBE: Duration = Duration::from_secs(5);
-/// How often a server is asked again that names ends which do not hold where a reader was told to begin …
+/// How often a server is asked again that names ends which do not hold where a reader is to begin.
 const DOUBTS: usize = 10;
-/// … after this time.
+/// The pause before each of these questions.
 const DOUBT: Duration = Duration::from_millis(200);
 /// How long reading what is kept for late joiners may take.
 const SUBSCRIBE_KEPT: Duration = Duration::from_secs(15);
@@ -48,23 +49,32 @@ pub(super) struct Clients {
     pub(super) consumers: HashMap<bool, Arc<Consumer>>,
 }
 
-/// Known after the first answer.
-#[derive(Default)]
-pub(super) struct Once(Mutex<Option<String>>);
+/// What all clients of one broker use.
+pub(super) struct Shared {
+    pub(super) settings: Settings,
+    pub(super) gate: Gate,
+    pub(super) clock: Mutex<BrokerClock>,
+    pub(super) last_error: Arc<LastError>,
+    pub(super) supervisor: Supervisor,
+    pub(super) stop: CancellationToken,
+}
 
-impl Once {
-    pub(super) fn get_or_init_with(&self, make: impl FnOnce() -> Option<String>) -> Option<String> {
-        let mut known = self.0.lock();
-        if known.is_none() {
-            *known = make();
-        }
-        known.clone()
+impl Shared {
+    pub(super) fn new(settings: Settings) -> Arc<Self> {
+        Arc::new(Self {
+            settings,
+            gate: Gate::default(),
+            clock: Mutex::new(BrokerClock::new(Instant::now())),
+            last_error: Arc::default(),
+            supervisor: Supervisor::new("kafka"),
+            stop: CancellationToken::new(),
+        })
     }
 }
 
 /// What threads, tasks and publishers share.
 pub(super) struct Inner {
-    pub(super) settings: Settings,
+    pub(super) shared: Arc<Shared>,
     pub(super) names: Names,
     /// Layer of the flow; empty for a service.
     pub(super) layer: String,
@@ -72,27 +82,28 @@ pub(super) struct Inner {
     pub(super) probe: Arc<str>,
     pub(super) directory: Directory,
     pub(super) topics: Topics,
-    pub(super) gate: Arc<Gate>,
-    pub(super) clock: Arc<Mutex<BrokerClock>>,
-    pub(super) last_error: Arc<LastError>,
     pub(super) clients: Mutex<Clients>,
     pub(super) flow: Option<Arc<FlowState>>,
     pub(super) worker: Option<Arc<WorkerState>>,
-    pub(super) cluster: Once,
+    pub(super) cluster: OnceLock<String>,
     pub(super) admin: Mutex<Option<Arc<Admin>>>,
     pub(super) status: watch::Sender<BrokerStatus>,
     pub(super) was_up: AtomicBool,
-    /// Whether it was told that the server did not answer from the beginning.
-    pub(super) told: AtomicBool,
+    /// Whether it is in the log that the server did not answer from the beginning.
+    pub(super) logged_absence: AtomicBool,
     pub(super) closed: AtomicBool,
-    pub(super) bell: Bell,
-    pub(super) supervisor: Supervisor,
-    pub(super) stop: CancellationToken,
+    pub(super) waker: ThreadWaker,
 }
 
 impl Inner {
     pub(super) fn is_closed(&self) -> bool {
         self.closed.load(Ordering::Acquire)
+    }
+
+    /// Creates topics, where this client does: it must know all that there are.
+    pub(super) fn creator(&self) -> Option<&TopicCreator> {
+        let flow = self.flow.as_ref().map(|flow| &flow.creator);
+        flow.or_else(|| self.worker.as_ref().map(|worker| &worker.creator))
     }
 
     /// The client that makes topics and asks for their settings, made at first use.
@@ -101,7 +112,7 @@ impl Inner {
         if let Some(admin) = &*admin {
             return Ok(Arc::clone(admin));
         }
-        let made = Admin::new(&self.settings, &self.last_error).map_err(|error| error.to_string())?;
+        let made = Admin::new(&self.shared.settings, &self.shared.last_error).map_err(|error| error.to_string())?;
         Ok(Arc::clone(admin.insert(Arc::new(made))))
     }
 
@@ -127,16 +138,7 @@ impl Inner {
         if let Some(producer) = clients.producers.get(&lot) {
             return Ok(Arc::clone(producer));
         }
-        let producer = Producer::start(
-            lot,
-            &self.settings,
-            &self.gate,
-            &self.clock,
-            &self.last_error,
-            &self.supervisor,
-            &self.stop,
-        )
-        .map_err(BrokerError::Away)?;
+        let producer = Producer::start(lot, &self.shared).map_err(BrokerError::Away)?;
         clients.producers.insert(lot, Arc::clone(&producer));
         Ok(producer)
     }
@@ -149,16 +151,7 @@ impl Inner {
         if let Some(consumer) = clients.consumers.get(&large) {
             return Ok(Arc::clone(consumer));
         }
-        let consumer = Consumer::start(
-            large,
-            &self.layer,
-            &self.settings,
-            &self.clock,
-            &self.last_error,
-            &self.supervisor,
-            &self.stop,
-        )
-        .map_err(BrokerError::Away)?;
+        let consumer = Consumer::start(large, &self.layer, &self.shared).map_err(BrokerError::Away)?;
         clients.consumers.insert(large, Arc::clone(&consumer));
         Ok(consumer)
     }
@@ -178,7 +171,7 @@ impl Inner {
         if answers && !was_up {
             tracing::info!(detail, "Kafka answers");
             self.wake_writers();
-        } else if !answers && (was_up || !self.told.swap(true, Ordering::AcqRel)) {
+        } else if !answers && (was_up || !self.logged_absence.swap(true, Ordering::AcqRel)) {
             tracing::warn!(detail, "Kafka does not answer");
         }
         let taken = self.flow.as_ref().and_then(|flow| flow.stood_back.lock().clone());
@@ -212,7 +205,7 @@ impl Inner {
 
     /// Another flow was first, or has gone.
     pub(super) fn stand_back(&self, back: bool) {
-        self.gate.set_stood_back(back);
+        self.shared.gate.set_stood_back(back);
         if back {
             for consumer in self.consumers() {
                 consumer.stand_back();
@@ -226,7 +219,7 @@ impl Inner {
         if back && matches!(status.health, Health::Up | Health::InUse) {
             self.set_server(true, status.detail);
         }
-        self.bell.ring();
+        self.waker.wake();
         self.wake_writers();
     }
 
@@ -246,7 +239,7 @@ impl Inner {
         let wait = if options.with_kept { SUBSCRIBE_KEPT } else { SUBSCRIBE };
         let deadline = Instant::now() + wait;
         let consumer = self.consumer(options.large)?;
-        if consumer.topics().len() >= MAX_CHANNELS {
+        if consumer.count() >= MAX_CHANNELS {
             return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
         }
         let info = match self.directory.topic(&source.topic, SUBSCRIBE) {
@@ -256,7 +249,7 @@ impl Inner {
                 consumer
                     .add_awaiting(&source, sender)
                     .map_err(|error| refused(&error))?;
-                self.bell.ring();
+                self.waker.wake();
                 return Ok(subscription.starting_at(vec![0]));
             }
             Err(error) => return Err(error.into()),
@@ -275,13 +268,13 @@ impl Inner {
                 .map_err(|error| refused(&error))?;
             return Ok(subscription.starting_at(starts));
         }
-        let mut reader = ReaderToEnd::open(&self.settings, &self.last_error, &source.topic, &marks)?;
+        let mut reader = ReaderToEnd::open(&self.shared, &source.topic, &marks)?;
         loop {
             let starts = reader.read(&ends, deadline, &|| self.is_closed(), |message, payload| {
                 let key = message.key()?;
                 // On channels of BlazeAIoT's own, whatever has a key is the last word about it.
                 let is_kept = channel.is_reserved() || record::is_kept(key);
-                is_kept.then(|| receive(channel, message, payload, None, &self.clock))
+                is_kept.then(|| receive(channel, message, payload, None, &self.shared.clock))
             })?;
             let mut kept = || -> Vec<Received> {
                 reader
@@ -300,8 +293,8 @@ impl Inner {
         }
     }
 
-    /// Where a topic begins and ends. If that does not hold where a reader was told to begin, it is asked again for a while: a server that
-    /// stood still for a moment names other ends first, and whoever believes them leaves out what the reader is there for.
+    /// Where a topic begins and ends. If that does not hold where a reader is to begin, it is asked again for a while: a server that
+    /// stood still for a moment names other ends first, and a reader that believed them would leave out records.
     fn marks(
         &self,
         topic: &str,
@@ -324,7 +317,7 @@ impl Inner {
         }
     }
 
-    /// Where a reader begins: on the server, and where it was told to.
+    /// Offsets at which a reader begins: those that it asks for, as far as the server has them.
     fn starts(&self, topic: &str, marks: &[Marks], begin: &Begin) -> Result<Vec<i64>, BrokerError> {
         let wanted: Vec<Option<i64>> = match begin {
             Begin::Now => vec![None; marks.len()],
@@ -371,11 +364,8 @@ impl Inner {
 
     /// Ends readers, threads and tasks, without waiting for them.
     pub(super) fn end(&self) {
-        self.stop.cancel();
-        self.bell.ring();
-        for consumer in self.consumers() {
-            consumer.close();
-        }
+        self.shared.stop.cancel();
+        self.waker.wake();
         for producer in self.producers() {
             producer.end();
         }

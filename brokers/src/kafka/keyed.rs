@@ -8,9 +8,9 @@ use std::time::Duration;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, oneshot};
-use tokio_util::sync::CancellationToken;
 
 use super::gate::Gate;
+use super::inner::Shared;
 use super::producer::Producer;
 use super::topics::Topic;
 use crate::outbox::Fate;
@@ -71,11 +71,12 @@ impl KeyedWriter {
     }
 
     /// Writes what waits until the end.
-    pub(super) async fn run(&self, producer: &Producer, gate: &Gate, stop: &CancellationToken) {
+    pub(super) async fn run(&self, producer: &Producer, shared: &Shared) {
+        let stop = &shared.stop;
         loop {
             let all_written = tokio::select! {
                 () = stop.cancelled() => return,
-                all_written = self.write_some(producer, gate) => all_written,
+                all_written = self.write_some(producer, &shared.gate) => all_written,
             };
             let waits = !self.is_drained();
             tokio::select! {
@@ -169,7 +170,8 @@ mod tests {
         gate.set_up(true);
         let (here, _) = topics.of(&Arc::from("here"), false);
         let (absent, _) = topics.of(&Arc::from("absent"), false);
-        topics.note("here", 1);
+        let note = |name: &str| topics.note(&HashMap::from([(name.to_owned(), 1)]), false);
+        note("here");
         for (topic, key, value) in [
             (&absent, "x", Some("0")),
             (&here, "a", Some("1")),
@@ -193,7 +195,7 @@ mod tests {
         for (key, entry) in batch {
             writer.waiting.lock().put(key, entry, false);
         }
-        topics.note("absent", 1);
+        note("absent");
         let batch = shown(writer.waiting.lock().take(&gate));
         assert_eq!(
             batch,

@@ -2,41 +2,41 @@
 //!
 //! ```text
 //! publisher ─► outbox ─► Producer (one per kind) ─► server ─► Consumer (small, large) ─► rings of subscriptions
-//!                  Directory: metadata, offsets ◄── keeper thread: lives it? topics, positions ──► status
+//!                  Directory: metadata, offsets ◄── health thread: answers, topics, positions ──► status
 //! ```
 //!
 //! A channel is a topic; a message is a record whose headers are the message's header, as text (module `record`). There is no
 //! consumer group: each client reads all partitions at positions of its own, also where the order of records decides who has a
 //! lease (module `group_lease`). Topics are made by the flow of the layer alone (module `flow_side`), and those of configurations by its worker
-//! (module `worker_side`); what a service publishes before that waits.
+//! (module `worker_side`); messages that a service publishes before that wait.
 
 mod admin;
-mod bell;
 mod clock;
 mod consumer;
 mod context;
 mod directory;
+#[cfg(test)]
+mod fake_broker;
 mod flow_side;
 mod gate;
 mod group_lease;
+mod health;
 mod identity;
-#[cfg(test)]
-mod impostor;
 mod inner;
-mod keeper;
 mod keyed;
-mod maker;
 mod names;
 mod producer;
 mod read_to_end;
 mod receive;
 mod record;
 mod settings;
+mod topic_creator;
 mod topics;
+mod waker;
 mod worker_side;
 
-use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
@@ -44,11 +44,10 @@ use blaze_domain::MAX_PAYLOAD_BYTES;
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::KafkaBroker as Section;
 use blaze_proto::Frame;
-use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
+use blaze_runtime::supervisor::TaskPolicy;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::watch;
-use tokio_util::sync::CancellationToken;
 
 use crate::open::OpenError;
 use crate::outbox::{Body, Lane};
@@ -59,17 +58,14 @@ use crate::port::{
 use crate::worker_side::WorkerSide;
 pub use group_lease::{GroupHeld, GroupLease, GroupLeaseOptions};
 
-use bell::Bell;
-use clock::BrokerClock;
-use context::LastError;
 use directory::Directory;
 use flow_side::{FlowState, KafkaFlowSide};
-use gate::Gate;
-use inner::{Inner, Once};
+use inner::{Inner, Shared};
 use names::Names;
 use producer::{Keying, Target};
 use settings::{Lot, Settings};
 use topics::Topics;
+use waker::ThreadWaker;
 use worker_side::{KafkaWorkerSide, WorkerState};
 
 /// How long closing waits for what was taken while the server is known not to answer.
@@ -102,12 +98,12 @@ impl KafkaBroker {
     /// built in.
     pub fn open(section: &Section, role: &Role) -> Result<Self, OpenError> {
         let (settings, names) = read(section)?;
-        let last_error = Arc::<LastError>::default();
+        let shared = Shared::new(settings);
         let refused = |reason: String| OpenError::Setting {
             key: "kafka.properties".to_owned(),
             reason,
         };
-        let directory = Directory::new(&settings, &last_error).map_err(|error| refused(error.to_string()))?;
+        let directory = Directory::new(&shared).map_err(|error| refused(error.to_string()))?;
         let topics = Topics::default();
         let (layer, flow, worker) = match role {
             Role::Service => (String::new(), None, None),
@@ -124,26 +120,21 @@ impl KafkaBroker {
         };
         let inner = Arc::new(Inner {
             probe: names.reserved(ChannelName::control().as_str()),
-            settings,
+            shared,
             names,
             layer,
             directory,
             topics,
-            gate: Arc::default(),
-            clock: Arc::new(Mutex::new(BrokerClock::new(Instant::now()))),
-            last_error,
             clients: Mutex::default(),
             flow,
             worker,
             admin: Mutex::default(),
-            cluster: Once::default(),
+            cluster: OnceLock::new(),
             status: watch::Sender::new(connecting),
             was_up: AtomicBool::new(false),
-            told: AtomicBool::new(false),
+            logged_absence: AtomicBool::new(false),
             closed: AtomicBool::new(false),
-            bell: Bell::default(),
-            supervisor: Supervisor::new("kafka"),
-            stop: CancellationToken::new(),
+            waker: ThreadWaker::default(),
         });
         let broker = Self { inner };
         broker.start().map_err(refused)?;
@@ -152,10 +143,10 @@ impl KafkaBroker {
 
     fn start(&self) -> Result<(), String> {
         let inner = &self.inner;
-        let keeper = Arc::clone(inner);
-        inner
-            .supervisor
-            .spawn_thread("kafka-keeper", TaskPolicy::MayEnd, move || keeper::run(&keeper))
+        let watched = Arc::clone(inner);
+        let supervisor = &inner.shared.supervisor;
+        supervisor
+            .spawn_thread("kafka-health", TaskPolicy::MayEnd, move || health::run(&watched))
             .map_err(|error| error.to_string())?;
         // A new producer needs up to a second for its number: what is surely used gets it beforehand.
         let small = |reliable| {
@@ -168,9 +159,9 @@ impl KafkaBroker {
         let Some(flow) = inner.flow.clone() else { return Ok(()) };
         small(false)?;
         let producer = small(true)?;
-        let (gate, stop) = (Arc::clone(&inner.gate), inner.stop.clone());
-        inner.supervisor.spawn("kafka-leases", TaskPolicy::MayEnd, async move {
-            flow.keyed.run(&producer, &gate, &stop).await;
+        let shared = Arc::clone(&inner.shared);
+        supervisor.spawn("kafka-leases", TaskPolicy::MayEnd, async move {
+            flow.keyed.run(&producer, &shared).await;
         });
         Ok(())
     }
@@ -211,7 +202,7 @@ impl Broker for KafkaBroker {
         })?;
         let (topic, new) = inner.topics.of(&name, names::stays_open(channel));
         if new {
-            inner.bell.ring();
+            inner.waker.wake();
         }
         let keying = if *channel == ChannelName::shared_reply() {
             Keying::AnswerId
@@ -221,7 +212,7 @@ impl Broker for KafkaBroker {
         let stays_open = topic.stays_open;
         Ok(Arc::new(KafkaPublisher {
             lane: producer.lane(Target { topic, keying }),
-            gate: Arc::clone(&inner.gate),
+            shared: Arc::clone(&inner.shared),
             stays_open,
         }))
     }
@@ -260,13 +251,13 @@ impl Broker for KafkaBroker {
     async fn close(&self) {
         let inner = &self.inner;
         inner.begin_close();
-        let answers = inner.gate.is_open();
+        let answers = inner.shared.gate.is_open();
         let until = Instant::now() + if answers { DRAIN_ANSWERED } else { DRAIN };
-        while !inner.is_drained() && Instant::now() < until && !inner.stop.is_cancelled() {
+        while !inner.is_drained() && Instant::now() < until && !inner.shared.stop.is_cancelled() {
             tokio::time::sleep(DRAIN_TURN).await;
         }
         inner.end();
-        let report = inner.supervisor.shutdown(END).await;
+        let report = inner.shared.supervisor.shutdown(END).await;
         if !report.is_clean() {
             tracing::warn!(?report, "closing Kafka left something behind");
         }
@@ -275,7 +266,7 @@ impl Broker for KafkaBroker {
 
 struct KafkaPublisher {
     lane: Lane<Target>,
-    gate: Arc<Gate>,
+    shared: Arc<Shared>,
     stays_open: bool,
 }
 
@@ -284,7 +275,7 @@ impl KafkaPublisher {
         if payload > MAX_PAYLOAD_BYTES {
             return PublishOutcome::TooLarge;
         }
-        if !self.gate.lets(self.stays_open) {
+        if !self.shared.gate.lets(self.stays_open) {
             return PublishOutcome::Dropped;
         }
         self.lane.push(body, deadline)

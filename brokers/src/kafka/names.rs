@@ -17,8 +17,8 @@ pub(super) const RESERVED: [&str; 4] = [
     "blaze/reply",
 ];
 
-/// Channels that a worker of BlazeConfig makes before it says that it is up. `blaze/reply` is a flow's as well: whoever comes
-/// first makes it, and both make the same.
+/// Channels that a worker of BlazeConfig makes before it says that it is up. `blaze/reply` is a flow's as well: the first
+/// makes it, and both make the same.
 pub(super) const OF_WORKER: [&str; 4] = ["blaze/config/get", "blaze/config/ack", "blaze/watchdog", "blaze/reply"];
 
 /// Where flows keep leases: a topic that is no channel.

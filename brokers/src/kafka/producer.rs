@@ -18,22 +18,19 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use blaze_domain::DropReason;
-use blaze_runtime::supervisor::{Supervisor, TaskPolicy};
+use blaze_runtime::supervisor::TaskPolicy;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use rdkafka::error::KafkaError;
 use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
 use tokio::sync::{Notify, oneshot};
-use tokio_util::sync::CancellationToken;
 
-use super::bell::Bell;
-use super::clock::BrokerClock;
-use super::context::LastError;
-use super::gate::Gate;
-use super::settings::{Lot, Settings};
+use super::inner::Shared;
+use super::settings::Lot;
 use super::topics::Topic;
+use super::waker::ThreadWaker;
 use crate::outbox::{Fate, Lane, Outbox, OutboxLimits, Waiting};
-use delivery::{Batch, Delivery, SharedContext, WriteContext};
+use delivery::{Delivery, Sent, SharedContext, WriteContext};
 use ready::Ready;
 pub(super) use ready::{Keying, Target};
 
@@ -72,75 +69,56 @@ type Client = BaseProducer<SharedContext>;
 /// One client that writes, and what waits for it.
 pub(super) struct Producer {
     lot: Lot,
-    settings: Settings,
     outbox: Arc<Outbox<Target>>,
     client: Mutex<Option<Arc<Client>>>,
     context: Arc<WriteContext>,
-    gate: Arc<Gate>,
     /// Messages are between the outbox and the client.
     handing_over: AtomicBool,
 }
 
 impl Producer {
     /// Makes the client, its task and its thread.
-    pub(super) fn start(
-        lot: Lot,
-        settings: &Settings,
-        gate: &Arc<Gate>,
-        clock: &Arc<Mutex<BrokerClock>>,
-        last_error: &Arc<LastError>,
-        supervisor: &Supervisor,
-        stop: &CancellationToken,
-    ) -> Result<Arc<Self>, String> {
-        let producer = Arc::new(Self::new(lot, settings, gate, clock, last_error)?);
-        let poller = {
-            let (producer, stop) = (Arc::clone(&producer), stop.clone());
-            move || producer.poll(&stop)
-        };
+    pub(super) fn start(lot: Lot, shared: &Arc<Shared>) -> Result<Arc<Self>, String> {
+        let producer = Arc::new(Self::new(lot, shared)?);
+        let (polled, fed) = (Arc::clone(&producer), Arc::clone(&producer));
+        let supervisor = &shared.supervisor;
         supervisor
-            .spawn_thread(lot.as_str(), TaskPolicy::MayEnd, poller)
+            .spawn_thread(lot.as_str(), TaskPolicy::MayEnd, move || polled.poll())
             .map_err(|error| error.to_string())?;
-        let (feeder, stop) = (Arc::clone(&producer), stop.clone());
-        supervisor.spawn(lot.as_str(), TaskPolicy::MayEnd, async move { feeder.feed(stop).await });
+        supervisor.spawn(lot.as_str(), TaskPolicy::MayEnd, async move { fed.feed().await });
         Ok(producer)
     }
 
-    fn new(
-        lot: Lot,
-        settings: &Settings,
-        gate: &Arc<Gate>,
-        clock: &Arc<Mutex<BrokerClock>>,
-        last_error: &Arc<LastError>,
-    ) -> Result<Self, String> {
+    fn new(lot: Lot, shared: &Arc<Shared>) -> Result<Self, String> {
         let producer = Self {
             lot,
-            settings: settings.clone(),
             outbox: Outbox::new(LIMITS),
             client: Mutex::new(None),
             context: Arc::new(WriteContext {
+                shared: Arc::clone(shared),
                 in_flight: AtomicUsize::new(0),
-                batches: AtomicUsize::new(0),
-                bell: Bell::default(),
+                waker: ThreadWaker::default(),
                 room: Notify::new(),
                 fatal: AtomicBool::new(false),
-                clock: Arc::clone(clock),
-                last_error: Arc::clone(last_error),
             }),
-            gate: Arc::clone(gate),
             handing_over: AtomicBool::new(false),
         };
         *producer.client.lock() = Some(producer.make_client().map_err(|error| error.to_string())?);
         Ok(producer)
     }
 
+    fn shared(&self) -> &Shared {
+        &self.context.shared
+    }
+
     /// Lets the client connect and get its number from the server. By itself it tries so twice a second, and each try asks
     /// a connection at random, whether that is up or not; but also with each answer that it gets.
-    fn warm_up(&self, stop: &CancellationToken) {
+    fn warm_up(&self) {
         let Some(client) = self.client.lock().clone() else {
             return;
         };
         for _ in 0..WARM_UPS {
-            if stop.is_cancelled() {
+            if self.shared().stop.is_cancelled() {
                 return;
             }
             if let Err(error) = client.client().fetch_metadata(None, WARM_UP) {
@@ -153,7 +131,8 @@ impl Producer {
 
     fn make_client(&self) -> Result<Arc<Client>, KafkaError> {
         let context = SharedContext(Arc::clone(&self.context));
-        self.settings
+        self.shared()
+            .settings
             .producer(self.lot)
             .create_with_context(context)
             .map(Arc::new)
@@ -168,7 +147,7 @@ impl Producer {
     /// Lets the poll thread begin anew with a client that knows nothing. What the old one holds is dropped and counted.
     pub(super) fn remake(&self) {
         self.context.fatal.store(true, Ordering::Release);
-        self.context.bell.ring();
+        self.context.waker.wake();
     }
 
     /// A queue for a publisher.
@@ -194,7 +173,7 @@ impl Producer {
     /// Lets the poll thread look whether it is over.
     pub(super) fn end(&self) {
         self.clear();
-        self.context.bell.ring();
+        self.context.waker.wake();
     }
 
     /// Whether everything that was taken has been settled. Looked for in the order in which messages go.
@@ -204,7 +183,8 @@ impl Producer {
             && self.context.in_flight.load(Ordering::Acquire) == 0
     }
 
-    async fn feed(&self, stop: CancellationToken) {
+    async fn feed(&self) {
+        let stop = &self.shared().stop;
         let mut taken = Vec::with_capacity(BATCH);
         let mut scratch = String::new();
         // Made once: one that begins anew with each message would never end where there are many.
@@ -232,7 +212,7 @@ impl Producer {
     }
 
     fn hand_over_what_fits(&self, taken: &mut Vec<Waiting<Target>>, scratch: &mut String) {
-        while self.gate.is_open() {
+        while self.shared().gate.is_open() {
             let in_flight = self.context.in_flight.load(Ordering::Acquire);
             if in_flight >= CROWD {
                 return;
@@ -244,7 +224,7 @@ impl Producer {
             let mut limited: Vec<Arc<str>> = Vec::new();
             let allowance = |to: &Target| {
                 let topic = &to.topic;
-                let open = topic.partitions().is_some() && self.gate.lets(topic.stays_open);
+                let open = topic.partitions().is_some() && self.shared().gate.lets(topic.stays_open);
                 let allowed = topic.allowance().filter(|_| open)?;
                 if allowed != usize::MAX {
                     if limited.contains(&topic.name) {
@@ -260,38 +240,27 @@ impl Producer {
             if taken.is_empty() {
                 return;
             }
-            let batch = Batch::begin(&self.context);
             // All at once, as librdkafka begins to send what it has with the first.
-            let ready: Vec<Ready> = taken
-                .drain(..)
-                .map(|waiting| Ready::new(waiting, &batch, scratch))
-                .collect();
-            drop(batch);
+            let ready: Vec<Ready> = taken.drain(..).map(|waiting| Ready::new(waiting, scratch)).collect();
             for ready in ready {
-                self.send(&client, ready);
+                let topic = Arc::clone(&ready.delivery.topic);
+                let mut record = BaseRecord::with_opaque_to(&topic.name, ready.delivery).payload(&ready.payload[..]);
+                record.key = ready.key.as_deref();
+                record.partition = ready.partition;
+                record.headers = ready.headers;
+                self.send(&client, record);
             }
         }
     }
 
-    fn send(&self, client: &Client, ready: Ready) {
-        let (topic, bytes) = (ready.topic, ready.bytes);
-        let mut record =
-            BaseRecord::<str, [u8], _>::with_opaque_to(&topic.name, ready.delivery).payload(&ready.payload);
-        record.key = ready.key.as_deref();
-        record.partition = ready.partition;
-        record.headers = ready.headers;
-        self.context.in_flight.fetch_add(bytes, Ordering::AcqRel);
-        topic.note_in_flight(true);
-        if let Err((error, record)) = client.send(record)
-            && let Delivery::Message { receipt, .. } = *record.delivery_opaque
-        {
-            receipt.settle(self.context.failed(&error, &topic));
-            topic.note_in_flight(false);
-            self.context.in_flight.fetch_sub(bytes, Ordering::AcqRel);
+    fn send(&self, client: &Client, record: BaseRecord<'_, str, [u8], Box<Delivery>>) {
+        self.context.begin(&record.delivery_opaque);
+        if let Err((error, record)) = client.send(record) {
+            self.context.settle(*record.delivery_opaque, Some(&error));
         }
     }
 
-    /// Writes the value of a key, or takes it away; `done` is told what became of it.
+    /// Writes the value of a key, or takes it away; `done` gets what became of it.
     pub(super) fn send_keyed(
         &self,
         topic: &Arc<Topic>,
@@ -303,33 +272,29 @@ impl Producer {
         let Some(client) = self.client.lock().clone() else {
             return;
         };
-        let delivery = Box::new(Delivery::Keyed {
-            done,
+        let delivery = Box::new(Delivery {
+            receipt: Sent::Keyed(done),
             topic: Arc::clone(topic),
+            bytes: key.len() + value.map_or(0, Bytes::len) + 1,
             sent: Instant::now(),
-            batch: Batch::begin(&self.context),
         });
-        let mut record = BaseRecord::<str, [u8], _>::with_opaque_to(&topic.name, delivery).key(key);
+        let mut record = BaseRecord::with_opaque_to(&topic.name, delivery).key(key);
         record.partition = partition;
         record.payload = value.map(|value| &value[..]);
-        if let Err((error, record)) = client.send(record)
-            && let Delivery::Keyed { done, .. } = *record.delivery_opaque
-        {
-            // Nobody waits any more when the broker is closed.
-            let _ = done.send(self.context.failed(&error, topic));
-        }
+        self.send(&client, record);
     }
 
     /// Runs the callbacks until the end, and makes the client anew after a fatal error.
-    fn poll(&self, stop: &CancellationToken) {
-        self.warm_up(stop);
+    fn poll(&self) {
+        let stop = &self.shared().stop;
+        self.warm_up();
         while !stop.is_cancelled() {
             let client = self.client.lock().clone();
             if let Some(client) = &client {
-                if self.context.batches.load(Ordering::Acquire) > 0 {
+                if self.context.in_flight.load(Ordering::Acquire) > 0 {
                     client.poll(POLL);
                 } else {
-                    self.context.bell.wait(IDLE);
+                    self.context.waker.wait(IDLE);
                     client.poll(Duration::ZERO);
                 }
                 let fatal = client.client().fatal_error();
@@ -349,7 +314,7 @@ impl Producer {
             match self.make_client() {
                 Ok(client) => *self.client.lock() = Some(client),
                 Err(error) => {
-                    self.context.last_error.note(error.to_string());
+                    self.shared().last_error.note(error.to_string());
                     std::thread::sleep(REMAKE);
                 }
             }

@@ -9,9 +9,9 @@ use rdkafka::error::KafkaError;
 use rdkafka::message::{BorrowedMessage, Message as _};
 use rdkafka::{Offset, TopicPartitionList};
 
-use super::context::{LastError, ReadContext};
+use super::context::ReadContext;
 use super::directory::{LookupError, Marks};
-use super::settings::Settings;
+use super::inner::Shared;
 
 /// Keys that are kept at most; what is beyond is counted and left out.
 const MAX_KEYS: usize = 65_536;
@@ -32,15 +32,9 @@ pub(super) struct ReaderToEnd<T> {
 
 impl<T> ReaderToEnd<T> {
     /// Begins at the beginning of each partition.
-    pub(super) fn open(
-        settings: &Settings,
-        last_error: &Arc<LastError>,
-        topic: &str,
-        marks: &[Marks],
-    ) -> Result<Self, LookupError> {
-        let client: BaseConsumer<ReadContext> = settings
-            .reader_to_end()
-            .create_with_context(ReadContext::new(&Arc::default(), last_error))?;
+    pub(super) fn open(shared: &Shared, topic: &str, marks: &[Marks]) -> Result<Self, LookupError> {
+        let context = ReadContext::new(&Arc::default(), &shared.last_error);
+        let client: BaseConsumer<ReadContext> = shared.settings.reader_to_end().create_with_context(context)?;
         let mut list = TopicPartitionList::new();
         for (partition, mark) in (0..).zip(marks) {
             list.add_partition_offset(topic, partition, Offset::Offset(mark.low))?;

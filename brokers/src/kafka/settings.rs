@@ -278,9 +278,12 @@ fn check_property(key: &str, value: &str) -> Result<(), OpenError> {
 
 #[cfg(test)]
 pub(super) mod tests {
+    use std::sync::Arc;
+
     use blaze_domain::node_file::{LayerBroker, NodeFile};
 
     use super::*;
+    use crate::kafka::inner::Shared;
 
     fn section(properties: &str) -> Section {
         section_at("127.0.0.1:9092", properties)
@@ -301,6 +304,13 @@ pub(super) mod tests {
             Some(LayerBroker::Kafka(kafka)) => kafka,
             other => panic!("{other:?}"),
         }
+    }
+
+    /// What the clients of a server at this address share; without a runtime that runs tasks.
+    pub(in crate::kafka) fn shared_at(bootstrap: &str) -> Arc<Shared> {
+        let runtime = tokio::runtime::Runtime::new().unwrap();
+        let _entered = runtime.enter();
+        Shared::new(Settings::new(&section_at(bootstrap, "{}")).unwrap())
     }
 
     fn refused(properties: &str) -> OpenError {

@@ -39,12 +39,18 @@ impl Topic {
     /// The server's limit counts the whole batch that the client library makes of what it has. Where that could be too large,
     /// only what fits is handed over, and more when it is acknowledged: a message is refused for its own size alone.
     pub(super) fn allowance(&self) -> Option<usize> {
-        let limit = self.largest_batch.load(Ordering::Acquire);
-        if limit == 0 || limit >= ROOMY {
+        if !self.is_limited() {
             return Some(usize::MAX);
         }
+        let limit = self.largest_batch.load(Ordering::Acquire);
         // On the wire a small message with its headers has up to twice what the outbox counts.
         (self.in_flight.load(Ordering::Acquire) == 0).then_some(limit / 2)
+    }
+
+    /// Whether the server takes less than what batches may become.
+    pub(super) fn is_limited(&self) -> bool {
+        let limit = self.largest_batch.load(Ordering::Acquire);
+        limit != 0 && limit < ROOMY
     }
 
     /// Messages are handed over, or no longer with the client library.
@@ -59,7 +65,7 @@ impl Topic {
     /// The server refused a message for its size. Where that was thought to be impossible, messages go one by one until the
     /// server has told its limit.
     pub(super) fn doubt_limit(&self) {
-        if self.allowance() == Some(usize::MAX) {
+        if !self.is_limited() {
             self.largest_batch.store(1, Ordering::Release);
         }
         self.asks_limit.store(true, Ordering::Release);
@@ -126,9 +132,12 @@ impl Topics {
     }
 
     /// Up to `limit` topics whose largest batch the server is to be asked for, of those that it has.
-    pub(super) fn without_limit(&self, is_there: impl Fn(&Topic) -> bool, limit: usize) -> Vec<Arc<str>> {
+    pub(super) fn without_limit(&self, found: &HashMap<String, usize>, limit: usize) -> Vec<Arc<str>> {
+        let unknown = |topic: &Arc<Topic>| {
+            let is_there = topic.partitions().is_some() || found.contains_key(&*topic.name);
+            topic.asks_limit.load(Ordering::Acquire) && is_there
+        };
         let by_name = self.by_name.lock();
-        let unknown = |topic: &Arc<Topic>| topic.asks_limit.load(Ordering::Acquire) && is_there(topic);
         let topics = by_name.values().filter_map(Weak::upgrade).filter(unknown);
         topics.map(|topic| Arc::clone(&topic.name)).take(limit).collect()
     }
@@ -143,24 +152,19 @@ impl Topics {
         }
     }
 
-    /// The server has a topic with so many partitions, or none of that name. Returns whether it came.
-    pub(super) fn note(&self, name: &str, partitions: usize) -> bool {
-        let Some(topic) = self.by_name.lock().get(name).and_then(Weak::upgrade) else {
-            return false;
-        };
-        let partitions = i32::try_from(partitions).unwrap_or(i32::MAX);
-        if partitions == ABSENT {
-            topic.forget_limit();
-        }
-        topic.partitions.swap(partitions, Ordering::AcqRel) == ABSENT && partitions != ABSENT
-    }
-
-    /// The server has these topics and no others. Returns whether one came.
-    pub(super) fn note_all(&self, listed: &HashMap<&str, usize>) -> bool {
-        let names: Vec<Arc<str>> = self.by_name.lock().keys().cloned().collect();
+    /// The server has these topics, with so many partitions; and no others, if these are `all`. Returns whether one came.
+    pub(super) fn note(&self, found: &HashMap<String, usize>, all: bool) -> bool {
         let mut came = false;
-        for name in names {
-            came |= self.note(&name, listed.get(&*name).copied().unwrap_or(0));
+        for (name, topic) in &*self.by_name.lock() {
+            let Some(topic) = topic.upgrade() else { continue };
+            match found.get(&**name) {
+                Some(partitions) => {
+                    let partitions = i32::try_from(*partitions).unwrap_or(i32::MAX);
+                    came |= topic.partitions.swap(partitions, Ordering::AcqRel) == ABSENT;
+                }
+                None if all => topic.vanished(),
+                None => {}
+            }
         }
         came
     }
@@ -170,6 +174,13 @@ impl Topics {
 mod tests {
     use super::*;
 
+    fn found(topics: &[(&str, usize)]) -> HashMap<String, usize> {
+        topics
+            .iter()
+            .map(|(name, partitions)| ((*name).to_owned(), *partitions))
+            .collect()
+    }
+
     #[test]
     fn topics_come_and_go() {
         let topics = Topics::default();
@@ -178,13 +189,14 @@ mod tests {
         assert!(new && topic.partitions().is_none());
         assert!(!topics.of(&name, false).1);
         assert_eq!(topics.absent(16), [Arc::clone(&name)]);
-        assert!(topics.note("a", 2));
-        assert!(!topics.note("a", 3), "it was there already");
+        assert!(topics.note(&found(&[("a", 2)]), false));
+        assert!(!topics.note(&found(&[("a", 3)]), false), "it was there already");
         assert_eq!(topic.partitions(), Some(3));
         assert!(topics.absent(16).is_empty());
-        assert!(!topics.note_all(&HashMap::new()));
+        assert!(!topics.note(&found(&[]), false) && topic.partitions().is_some());
+        assert!(!topics.note(&found(&[]), true));
         assert_eq!(topic.partitions(), None);
-        assert!(topics.note_all(&HashMap::from([("a", 1)])));
+        assert!(topics.note(&found(&[("a", 1)]), true));
         drop(topic);
         assert!(topics.of(&name, false).1, "it was forgotten with its last publisher");
     }
@@ -194,9 +206,9 @@ mod tests {
         let topics = Topics::default();
         let (topic, _) = topics.of(&Arc::from("a"), false);
         assert_eq!(topic.allowance(), Some(usize::MAX), "not known");
-        assert_eq!(topics.without_limit(|_| true, 8).len(), 1);
+        assert_eq!(topics.without_limit(&found(&[("a", 1)]), 8).len(), 1);
         topics.note_limit("a", Some(10_000));
-        assert!(topics.without_limit(|_| true, 8).is_empty());
+        assert!(topics.without_limit(&found(&[("a", 1)]), 8).is_empty());
         assert_eq!(topic.allowance(), Some(5_000));
         topic.note_in_flight(true);
         assert_eq!(topic.allowance(), None);
@@ -204,16 +216,16 @@ mod tests {
         assert_eq!(topic.allowance(), Some(5_000));
         topic.doubt_limit();
         assert_eq!(topic.allowance(), Some(5_000), "a message was too large by itself");
-        assert_eq!(topics.without_limit(|_| true, 8).len(), 1);
+        assert_eq!(topics.without_limit(&found(&[("a", 1)]), 8).len(), 1);
         topics.note_limit("a", Some(17_825_792));
         assert_eq!(topic.allowance(), Some(usize::MAX));
         topic.doubt_limit();
         assert_eq!(topic.allowance(), Some(0), "one by one");
-        topics.note("a", 0);
+        topics.note(&found(&[]), true);
         assert_eq!(topic.allowance(), Some(usize::MAX), "made anew it has another");
         topics.note_limit("a", None);
         assert!(
-            topics.without_limit(|_| true, 8).is_empty(),
+            topics.without_limit(&found(&[("a", 1)]), 8).is_empty(),
             "not asked again and again"
         );
     }

@@ -14,10 +14,10 @@ use tokio::sync::oneshot;
 
 use super::admin::Purpose;
 use super::inner::{Inner, MAX_CHANNELS};
-use super::maker::{Maker, is_final};
 use super::names::{Names, OF_WORKER};
 use super::producer::Producer;
 use super::settings::Lot;
+use super::topic_creator::{TopicCreator, is_final};
 use super::topics::Topic;
 use crate::outbox::Fate;
 use crate::port::BrokerError;
@@ -25,7 +25,7 @@ use crate::worker_side::{KeyedMessage, WorkerSide, WriteError};
 
 /// The worker's part of a broker.
 pub(super) struct WorkerState {
-    pub(super) maker: Maker,
+    pub(super) creator: TopicCreator,
 }
 
 impl WorkerState {
@@ -34,7 +34,7 @@ impl WorkerState {
             .iter()
             .map(|channel| (names.reserved(channel), Purpose::Messages));
         Self {
-            maker: Maker::new(needed.collect()),
+            creator: TopicCreator::new(needed),
         }
     }
 }
@@ -61,9 +61,13 @@ impl KafkaWorkerSide {
                 reason,
             })
         };
-        match self.state.maker.with(&name, |prepared| Arc::clone(&prepared.topic)) {
-            Some(topic) if topic.partitions().is_some() => Ok(Some(topic)),
-            Some(_) => match self.state.maker.refusal(&name) {
+        let known = self
+            .state
+            .creator
+            .with(&name, |prepared| Some((prepared.topic.clone()?, prepared.refusal())));
+        match known.flatten() {
+            Some((topic, _)) if topic.partitions().is_some() => Ok(Some(topic)),
+            Some((_, refusal)) => match refusal {
                 Some(code) if is_final(code) => refuse(format!("the server does not make its topic {name}: {code}")),
                 Some(code) => wait(format!("the server cannot make its topic {name} now: {code}")),
                 None => wait(format!("topic {name} is being made")),
@@ -92,16 +96,16 @@ fn too_large(message: &KeyedMessage) -> WriteError {
 #[async_trait]
 impl WorkerSide for KafkaWorkerSide {
     fn prepare(&self, channel: &ChannelName) -> Result<(), BrokerError> {
-        let maker = &self.state.maker;
-        if maker.count() >= MAX_CHANNELS {
+        let creator = &self.state.creator;
+        if creator.count() >= MAX_CHANNELS {
             return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
         }
-        maker.prepare(&self.inner, channel, Purpose::Notices, 1)
+        creator.prepare(&self.inner, channel, Purpose::Notices, 1)
     }
 
     fn release(&self, channel: &ChannelName) {
         if let Ok(name) = self.inner.names.topic(channel) {
-            self.state.maker.release(&name);
+            self.state.creator.release(&name);
         }
     }
 
@@ -109,7 +113,7 @@ impl WorkerSide for KafkaWorkerSide {
         if self.inner.is_closed() {
             return Err(BrokerError::Closed.into());
         }
-        if !self.inner.gate.is_open() {
+        if !self.inner.shared.gate.is_open() {
             return Err(BrokerError::Away(self.inner.status.borrow().detail.clone()).into());
         }
         let producer = self.producer()?;

@@ -17,7 +17,7 @@ use blaze_domain::node_file::RedisBroker as Section;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use redis::aio::MultiplexedConnection;
-use redis::{AsyncConnectionConfig, RedisError};
+use redis::{AsyncConnectionConfig, FromRedisValue, InfoDict, RedisError};
 
 use super::lock::Scripts;
 use super::settings::Settings;
@@ -265,24 +265,9 @@ impl RedisKeys {
     /// # Errors
     /// [`KeyError`].
     pub async fn values(&self, beginning: &str, most: usize) -> Result<Vec<(String, Bytes)>, KeyError> {
-        let prefix = self.settings.names.key("");
-        let pattern = format!("{}*", escaped(&self.settings.names.key(beginning)));
-        let keys = self.keys(&pattern, most).await?;
-        let mut out = Vec::with_capacity(keys.len());
-        for part in keys.chunks(VALUES) {
-            let mut pipe = redis::pipe();
-            for key in part {
-                pipe.get(key);
-            }
-            let found = self
-                .call(|mut connection| async move { pipe.query_async::<Vec<Option<Vec<u8>>>>(&mut connection).await })
-                .await?;
-            for (key, value) in part.iter().zip(found) {
-                let name = key.strip_prefix(&prefix).unwrap_or(key).to_owned();
-                out.extend(value.map(|value| (name, Bytes::from(value))));
-            }
-        }
-        Ok(out)
+        let found = self.each::<Option<Vec<u8>>>("GET", beginning, most, VALUES).await?;
+        let there = |(key, value): (String, Option<Vec<u8>>)| Some((key, Bytes::from(value?)));
+        Ok(found.into_iter().filter_map(there).collect())
     }
 
     /// All records whose key begins so, at most so many; keys are given without the prefix of the section.
@@ -290,20 +275,35 @@ impl RedisKeys {
     /// # Errors
     /// [`KeyError`].
     pub async fn records(&self, beginning: &str, most: usize) -> Result<Vec<(String, Record)>, KeyError> {
+        let mut found = self.each::<Record>("HGETALL", beginning, most, SCAN).await?;
+        found.retain(|(_, members)| !members.is_empty());
+        Ok(found)
+    }
+
+    /// What a command gives for each key that begins so, asked for so many keys at a time.
+    async fn each<T: FromRedisValue>(
+        &self,
+        command: &str,
+        beginning: &str,
+        most: usize,
+        at_a_time: usize,
+    ) -> Result<Vec<(String, T)>, KeyError> {
         let prefix = self.settings.names.key("");
         let pattern = format!("{}*", escaped(&self.settings.names.key(beginning)));
         let keys = self.keys(&pattern, most).await?;
         let mut out = Vec::with_capacity(keys.len());
-        for part in keys.chunks(SCAN) {
+        for part in keys.chunks(at_a_time) {
             let mut pipe = redis::pipe();
             for key in part {
-                pipe.cmd("HGETALL").arg(key);
+                pipe.cmd(command).arg(key);
             }
-            let found = self
-                .call(|mut connection| async move { pipe.query_async::<Vec<Record>>(&mut connection).await })
+            let found: Vec<T> = self
+                .call(|mut connection| async move { pipe.query_async(&mut connection).await })
                 .await?;
-            let named = part.iter().zip(found).filter(|(_, members)| !members.is_empty());
-            out.extend(named.map(|(key, members)| (key.strip_prefix(&prefix).unwrap_or(key).to_owned(), members)));
+            let names = part
+                .iter()
+                .map(|key| key.strip_prefix(&prefix).unwrap_or(key).to_owned());
+            out.extend(names.zip(found));
         }
         Ok(out)
     }
@@ -351,11 +351,10 @@ impl RedisKeys {
         let info = self
             .call(|mut connection| async move {
                 let mut info = redis::cmd("INFO");
-                info.arg("server").query_async::<String>(&mut connection).await
+                info.arg("server").query_async::<InfoDict>(&mut connection).await
             })
             .await?;
-        let run = info.lines().find_map(|line| line.strip_prefix("run_id:"));
-        Ok(run.map(|run| run.trim().to_owned()))
+        Ok(info.get("run_id"))
     }
 
     pub(super) async fn call<T, F>(&self, ask: impl FnOnce(MultiplexedConnection) -> F) -> Result<T, KeyError>
@@ -375,12 +374,8 @@ impl RedisKeys {
         let config = AsyncConnectionConfig::new()
             .set_connection_timeout(Some(CONNECT))
             .set_response_timeout(Some(CALL));
-        let made = self
-            .settings
-            .client
-            .get_multiplexed_async_connection_with_config(&config);
-        let made = tokio::time::timeout(CONNECT, made).await;
-        let made = made.unwrap_or_else(|_| Err(RedisError::from((redis::ErrorKind::Io, "no connection within 1 s"))));
+        let client = &self.settings.client;
+        let made = client.get_multiplexed_async_connection_with_config(&config).await;
         let connection = made.map_err(|error| self.failed(&error))?;
         *self.connection.lock() = Some(connection.clone());
         Ok(connection)

@@ -10,9 +10,9 @@ use parking_lot::Mutex;
 use redis::Cmd;
 use tokio::sync::Notify;
 
+use super::Shared;
 use super::publisher::hset_command;
 use super::state::Scope;
-use super::{Shared, server};
 use crate::port::BrokerError;
 
 /// Leases that are kept at most: a flow has 10,000, and some are on their way out.
@@ -47,8 +47,6 @@ pub(super) struct Ledger {
     /// Too much happened while the server was away.
     clear_first: bool,
     forgotten: VecDeque<(Arc<str>, WriterId)>,
-    refused: u64,
-    forgotten_dropped: u64,
     /// Changes that the server has not confirmed.
     under_way: bool,
 }
@@ -57,7 +55,6 @@ impl Ledger {
     /// Returns false where there are too many.
     fn put(&mut self, key: &str, value: Bytes) -> bool {
         if self.kept.len() >= MAX_LEASES && !self.kept.contains_key(key) {
-            self.refused += 1;
             return false;
         }
         self.kept.insert(key.to_owned(), value);
@@ -96,7 +93,6 @@ impl Ledger {
     fn forget(&mut self, hash: Arc<str>, writer: WriterId) {
         if self.forgotten.len() >= MAX_FORGOTTEN {
             self.forgotten.pop_front();
-            self.forgotten_dropped += 1;
         }
         self.forgotten.push_back((hash, writer));
     }
@@ -280,13 +276,13 @@ pub(super) async fn load(shared: &Shared, leases: &Leases) -> Result<Vec<(String
     let mut connection = shared.commands().await;
     let hash = shared.settings.names.leases();
     let command = command("HGETALL", &[&hash]);
-    let answer = tokio::time::timeout(LOAD, command.query_async::<redis::Value>(&mut connection)).await;
-    let value = match answer {
-        Ok(Ok(value)) => value,
+    let answer = tokio::time::timeout(LOAD, command.query_async::<Vec<(Vec<u8>, Vec<u8>)>>(&mut connection)).await;
+    let fields = match answer {
+        Ok(Ok(fields)) => fields,
         Ok(Err(error)) => return Err(BrokerError::Away(error.to_string())),
         Err(_) => return Err(BrokerError::Away("the leases were not read in time".to_owned())),
     };
-    let mut loaded: Vec<(String, Bytes)> = server::pairs(value)
+    let mut loaded: Vec<(String, Bytes)> = fields
         .into_iter()
         .filter_map(|(key, value)| Some((String::from_utf8(key).ok()?, Bytes::from(value))))
         .collect();
@@ -374,7 +370,7 @@ mod tests {
         for number in 0..=MAX_LEASES {
             ledger.put(&format!("key-{number}"), value("x"));
         }
-        assert_eq!((ledger.kept.len(), ledger.refused), (MAX_LEASES, 1));
+        assert_eq!(ledger.kept.len(), MAX_LEASES);
         for number in 0..MAX_PENDING {
             ledger.remove(&format!("gone-{number}"));
         }
@@ -383,6 +379,6 @@ mod tests {
         for number in 0..=MAX_FORGOTTEN {
             ledger.forget(Arc::from("h"), WriterId([u8::try_from(number % 200).unwrap(); 16]));
         }
-        assert_eq!((ledger.forgotten.len(), ledger.forgotten_dropped), (MAX_FORGOTTEN, 1));
+        assert_eq!(ledger.forgotten.len(), MAX_FORGOTTEN);
     }
 }

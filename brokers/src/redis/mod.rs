@@ -17,10 +17,10 @@ mod gate;
 mod kept;
 mod keys;
 mod leases;
+mod liveness;
 mod lock;
 mod owner;
 mod publisher;
-mod pulse;
 mod reader;
 mod server;
 mod settings;
@@ -60,12 +60,10 @@ use kept::Mirror;
 use leases::Leases;
 use owner::Owner;
 use publisher::{RedisPublisher, Target};
-use reader::Reader;
 use server::{BufferLimits, ServerFacts};
 use settings::Settings;
 use state::{Line, LineState, Scope, State};
 use subscriptions::Subscriptions;
-use writer::Writer;
 
 /// How long closing delivers what was taken.
 const DRAIN: Duration = Duration::from_secs(1);
@@ -128,8 +126,18 @@ impl Shared {
         &self.gates[usize::from(large)]
     }
 
-    fn subscriptions(&self, large: bool) -> &Arc<Subscriptions> {
-        &self.subscriptions[usize::from(large)]
+    /// Who reads on a connection, if it is one for reading.
+    fn subscriptions_of(&self, line: Line) -> Option<&Arc<Subscriptions>> {
+        line.reads().then(|| &self.subscriptions[usize::from(line.is_large())])
+    }
+
+    fn set_silent(&self, line: Line, silent: bool) {
+        if self.state.set_silent(line, silent)
+            && silent
+            && let Some(subscriptions) = self.subscriptions_of(line)
+        {
+            subscriptions.fail_waiting("the server does not answer");
+        }
     }
 
     fn put_connection(&self, line: Line, connection: Option<MultiplexedConnection>) {
@@ -241,18 +249,10 @@ impl RedisBroker {
         if self.started[line.index()].swap(true, Ordering::AcqRel) {
             return;
         }
-        self.shared
-            .state
-            .change(|conditions| conditions.set_line(line, LineState::Starting));
-        let shared = Arc::clone(&self.shared);
-        let (name, policy) = (format!("redis-{}", line.name()), TaskPolicy::MayEnd);
-        if line.reads() {
-            let service = Reader::new(Arc::clone(&shared), line);
-            self.supervisor.spawn(name, policy, connection::keep(shared, service));
-        } else {
-            let service = Writer::new(Arc::clone(&shared), line);
-            self.supervisor.spawn(name, policy, connection::keep(shared, service));
-        }
+        self.shared.state.set_line(line, LineState::Starting);
+        let kept = connection::keep(Arc::clone(&self.shared), line);
+        self.supervisor
+            .spawn(format!("redis-{}", line.name()), TaskPolicy::MayEnd, kept);
     }
 
     fn start_flow(&self) {
@@ -308,7 +308,7 @@ impl Broker for RedisBroker {
         self.start(line);
         let names = &self.shared.settings.names;
         let name = names.channel(channel);
-        let subscriptions = self.shared.subscriptions(options.large);
+        let subscriptions = &self.shared.subscriptions[usize::from(options.large)];
         // Dropped on the way out, the subscription is forgotten with the next sweep.
         let (sender, subscription) = crate::port::subscription(options);
         let added = subscriptions.add(&name, channel, sender, options)?;

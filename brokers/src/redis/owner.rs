@@ -144,7 +144,9 @@ impl Owner {
             () = tokio::time::sleep_until((renewed + GIVE_UP).into()) => {}
         }
         self.renewed = None;
-        self.set(Scope::Lost("the scope could not be renewed for 4 s".to_owned()));
+        self.shared
+            .state
+            .set_scope(Scope::Lost("the scope could not be renewed for 4 s".to_owned()));
         future.await
     }
 
@@ -157,18 +159,20 @@ impl Owner {
                 // An older answer says nothing of now; the next claim follows at once.
                 if sent.elapsed() < GIVE_UP {
                     self.renewed = Some(sent);
-                    self.set(Scope::Owned);
+                    self.shared.state.set_scope(Scope::Owned);
                     self.leases.wake();
                 }
             }
             Ok(Claim::Held(whom)) => {
                 self.renewed = None;
-                self.set(Scope::HeldBy(whom));
+                self.shared.state.set_scope(Scope::HeldBy(whom));
             }
             Err(error) if server::is_refusal(&error) => {
                 // Refused once is not yet refused for good: a server that loads its data says no for a moment.
                 if self.renewed.is_none() {
-                    self.set(Scope::Lost(format!("the scope cannot be claimed: {error}")));
+                    self.shared
+                        .state
+                        .set_scope(Scope::Lost(format!("the scope cannot be claimed: {error}")));
                 }
             }
             // The connection was lost, which its own task tells.
@@ -179,12 +183,6 @@ impl Owner {
     fn write_again(&self) {
         self.leases.ledger.lock().rewrite_all();
         self.shared.mirror.lock().rewrite_all();
-    }
-
-    fn set(&self, scope: Scope) {
-        if self.shared.state.read(|conditions| *conditions.scope() != scope) {
-            self.shared.state.change(|conditions| conditions.set_scope(scope));
-        }
     }
 }
 

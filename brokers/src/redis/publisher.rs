@@ -134,13 +134,6 @@ impl Batch {
         }
     }
 
-    /// Asks for a sign of life.
-    pub(super) fn ping() -> Self {
-        let mut batch = Self::with_capacity(1);
-        batch.pipeline.add_command(redis::cmd("PING"));
-        batch
-    }
-
     fn add(&mut self, command: Cmd, bytes: usize) {
         self.pipeline.add_command(command);
         self.bytes += bytes;

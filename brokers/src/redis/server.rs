@@ -1,7 +1,9 @@
 //! What the server says of itself, and how its answers are read.
 
+use std::collections::HashMap;
+
 use redis::aio::MultiplexedConnection;
-use redis::{RedisResult, Value};
+use redis::{InfoDict, RedisResult};
 
 /// A subscriber is cut off when this many bytes wait for it: room for a few of the largest messages is needed.
 const LEAST_HARD_LIMIT: u64 = 4 * 32 * 1024 * 1024;
@@ -18,21 +20,15 @@ pub(super) struct ServerFacts {
 }
 
 impl ServerFacts {
-    /// Reads the lines `name:value` of `INFO server`.
-    pub(super) fn parse(info: &str) -> Self {
-        let field = |name: &str| {
-            info.lines()
-                .find_map(|line| line.strip_prefix(name)?.strip_prefix(':'))
-                .map(|value| value.trim().to_owned())
-        };
-        let program = field("server_name").unwrap_or_else(|| "redis".to_owned());
-        let version = field(&format!("{program}_version")).or_else(|| field("redis_version"));
+    fn of(info: &InfoDict) -> Self {
+        let program = info.get("server_name").unwrap_or_else(|| "redis".to_owned());
+        let version: Option<String> = info.get(&format!("{program}_version"));
         Self {
-            version: match version {
+            version: match version.or_else(|| info.get("redis_version")) {
                 Some(version) => format!("{program} {version}"),
                 None => program,
             },
-            run_id: field("run_id"),
+            run_id: info.get("run_id"),
         }
     }
 }
@@ -72,8 +68,8 @@ impl BufferLimits {
 
 /// Asks the server who it is. Refused by its access list, the version stays unknown.
 pub(super) async fn facts(connection: &mut MultiplexedConnection) -> RedisResult<ServerFacts> {
-    match redis::cmd("INFO").arg("server").query_async::<String>(connection).await {
-        Ok(info) => Ok(ServerFacts::parse(&info)),
+    match redis::cmd("INFO").arg("server").query_async(connection).await {
+        Ok(info) => Ok(ServerFacts::of(&info)),
         Err(error) if is_refusal(&error) => Ok(ServerFacts {
             version: "redis (version not told)".to_owned(),
             run_id: None,
@@ -86,10 +82,8 @@ pub(super) async fn facts(connection: &mut MultiplexedConnection) -> RedisResult
 pub(super) async fn buffer_limits(connection: &mut MultiplexedConnection) -> RedisResult<Option<BufferLimits>> {
     let mut command = redis::cmd("CONFIG");
     command.arg("GET").arg("client-output-buffer-limit");
-    match command.query_async::<Value>(connection).await {
-        Ok(value) => Ok(pairs(value)
-            .into_iter()
-            .find_map(|(_, value)| BufferLimits::parse(std::str::from_utf8(&value).ok()?))),
+    match command.query_async::<HashMap<String, String>>(connection).await {
+        Ok(settings) => Ok(settings.values().find_map(|setting| BufferLimits::parse(setting))),
         Err(error) if is_refusal(&error) => Ok(None),
         Err(error) => Err(error),
     }
@@ -100,45 +94,22 @@ pub(super) fn is_refusal(error: &redis::RedisError) -> bool {
     !error.is_io_error() && !error.is_connection_dropped() && !error.is_unrecoverable_error()
 }
 
-/// Fields and values of a hash, in either version of the protocol; what is no text is left out.
-pub(super) fn pairs(value: Value) -> Vec<(Vec<u8>, Vec<u8>)> {
-    fn bytes(value: Value) -> Option<Vec<u8>> {
-        match value {
-            Value::BulkString(bytes) => Some(bytes),
-            Value::SimpleString(text) | Value::VerbatimString { text, .. } => Some(text.into_bytes()),
-            _ => None,
-        }
-    }
-    match value {
-        Value::Map(pairs) => pairs
-            .into_iter()
-            .filter_map(|(field, value)| bytes(field).zip(bytes(value)))
-            .collect(),
-        Value::Array(values) => {
-            let mut values = values.into_iter();
-            std::iter::from_fn(|| values.next().zip(values.next()))
-                .filter_map(|(field, value)| bytes(field).zip(bytes(value)))
-                .collect()
-        }
-        _ => Vec::new(),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn redis_and_valkey_tell_their_versions() {
+        let facts = |info: &str| ServerFacts::of(&InfoDict::new(info));
         let redis = "# Server\r\nredis_version:7.0.15\r\nredis_git_sha1:0\r\nrun_id:abc\r\n";
-        let facts = ServerFacts::parse(redis);
+        let found = facts(redis);
         assert_eq!(
-            (facts.version.as_str(), facts.run_id.as_deref()),
+            (found.version.as_str(), found.run_id.as_deref()),
             ("redis 7.0.15", Some("abc"))
         );
         let valkey = "# Server\r\nredis_version:7.2.4\r\nserver_name:valkey\r\nvalkey_version:9.1.2\r\nrun_id:d\r\n";
-        assert_eq!(ServerFacts::parse(valkey).version, "valkey 9.1.2");
-        assert_eq!(ServerFacts::parse("").version, "redis");
+        assert_eq!(facts(valkey).version, "valkey 9.1.2");
+        assert_eq!(facts("").version, "redis");
     }
 
     #[test]
@@ -154,14 +125,5 @@ mod tests {
         }
         assert_eq!(BufferLimits::parse("normal 0 0 0"), None);
         assert_eq!(BufferLimits::parse("pubsub 1 x 2"), None);
-    }
-
-    #[test]
-    fn hashes_are_read_in_both_versions_of_the_protocol() {
-        let text = |text: &str| Value::BulkString(text.as_bytes().to_vec());
-        let expected = vec![(b"a".to_vec(), b"1".to_vec())];
-        assert_eq!(pairs(Value::Map(vec![(text("a"), text("1"))])), expected);
-        assert_eq!(pairs(Value::Array(vec![text("a"), text("1"), text("odd")])), expected);
-        assert!(pairs(Value::Nil).is_empty());
     }
 }

@@ -1,9 +1,9 @@
 //! What is known of the connections and of the scope, and what follows from it: the status, and who may read and write.
 //!
 //! ```text
-//! writer, reader, owner ──► State::change ──► Conditions::assess ──┬─► status
-//!                                                                  ├─► gates of the publishers
-//!                                                                  └─► whether messages are delivered
+//! writer, reader, owner ──► State::change ──► Conditions ──┬─► status
+//!                                                          ├─► gates of the publishers
+//!                                                          └─► whether messages are delivered
 //! ```
 
 use std::sync::Arc;
@@ -63,6 +63,24 @@ impl Line {
     }
 }
 
+/// Why there is no connection.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Failure {
+    /// The server answered and said no; otherwise nobody is there, or the connection was lost.
+    pub(super) is_refusal: bool,
+    /// For people.
+    pub(super) why: String,
+}
+
+impl Failure {
+    pub(super) fn away(why: &str) -> Self {
+        Self {
+            is_refusal: false,
+            why: why.to_owned(),
+        }
+    }
+}
+
 /// What one connection is doing.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum LineState {
@@ -75,9 +93,14 @@ pub(super) enum LineState {
     /// The connection stands and the server does not answer.
     Silent,
     /// No connection.
-    Away(String),
-    /// The server answered and said no.
-    Refused(String),
+    Failed(Failure),
+}
+
+impl LineState {
+    /// Whether a connection stands and was up.
+    pub(super) fn is_connected(&self) -> bool {
+        matches!(self, Self::Up | Self::Silent)
+    }
 }
 
 /// Whose scope it is, as far as the server told.
@@ -112,14 +135,6 @@ pub(super) struct Conditions {
     was_owned: bool,
 }
 
-struct Verdict {
-    health: Health,
-    detail: String,
-    scope_open: bool,
-    /// It cannot be reached, and never could.
-    unreachable: bool,
-}
-
 impl Conditions {
     fn new(scope: Scope, place: String) -> Self {
         let start = |line: Line| {
@@ -147,8 +162,7 @@ impl Conditions {
     }
 
     pub(super) fn set_line(&mut self, line: Line, state: LineState) {
-        let was_up = matches!(self.line(line), LineState::Up | LineState::Silent);
-        if line.reads() && was_up && matches!(state, LineState::Away(_) | LineState::Refused(_)) {
+        if line.reads() && self.line(line).is_connected() && matches!(state, LineState::Failed(_)) {
             self.interruptions += 1;
         }
         self.lines[line.index()] = state;
@@ -188,17 +202,6 @@ impl Conditions {
                 LineState::Starting => self.core_is_up(),
                 _ => false,
             }
-    }
-
-    fn assess(&self) -> Verdict {
-        let (health, detail) = self.health();
-        let away = self.lines.iter().any(|line| matches!(line, LineState::Away(_)));
-        Verdict {
-            health,
-            detail,
-            scope_open: self.scope_open(),
-            unreachable: health == Health::Connecting && away,
-        }
     }
 
     fn health(&self) -> (Health, String) {
@@ -241,8 +244,10 @@ impl Conditions {
         let place = &self.place;
         for state in &self.lines {
             match state {
-                LineState::Refused(why) => return Some((Health::Down, format!("{place}: {why}"))),
-                LineState::Away(why) => return Some((waiting, format!("{place}: {why}"))),
+                LineState::Failed(Failure { is_refusal, why }) => {
+                    let health = if *is_refusal { Health::Down } else { waiting };
+                    return Some((health, format!("{place}: {why}")));
+                }
                 LineState::Silent => return Some((waiting, format!("{place} does not answer"))),
                 LineState::Unused | LineState::Starting | LineState::Up => {}
             }
@@ -266,7 +271,7 @@ pub(super) struct State {
 impl State {
     pub(super) fn new(scope: Scope, place: String, gates: [Arc<Gate>; 2]) -> Self {
         let conditions = Conditions::new(scope, place);
-        let Verdict { health, detail, .. } = conditions.assess();
+        let (health, detail) = conditions.health();
         let since = Instant::now();
         Self {
             conditions: Mutex::new(conditions),
@@ -282,22 +287,46 @@ impl State {
     pub(super) fn change(&self, change: impl FnOnce(&mut Conditions)) {
         let mut conditions = self.conditions.lock();
         change(&mut conditions);
-        let verdict = conditions.assess();
-        self.delivers.store(verdict.scope_open, Ordering::Release);
+        self.delivers.store(conditions.scope_open(), Ordering::Release);
         for (gate, line) in self.gates.iter().zip([Line::PublishSmall, Line::PublishLarge]) {
             gate.set_open(conditions.accepts(line));
         }
-        self.tell(verdict);
+        self.tell(&conditions);
         self.version.send_modify(|version| *version += 1);
     }
 
-    fn tell(&self, verdict: Verdict) {
-        let Verdict {
-            health,
-            detail,
-            unreachable,
-            ..
-        } = verdict;
+    /// Sets what a connection is doing, if it is not doing that already.
+    pub(super) fn set_line(&self, line: Line, state: LineState) {
+        if self.read(|conditions| *conditions.line(line) != state) {
+            self.change(|conditions| conditions.set_line(line, state));
+        }
+    }
+
+    /// Sets whether the server answers on a connection that stands. Returns whether that changed.
+    pub(super) fn set_silent(&self, line: Line, silent: bool) -> bool {
+        let (from, to) = if silent {
+            (LineState::Up, LineState::Silent)
+        } else {
+            (LineState::Silent, LineState::Up)
+        };
+        let changes = self.read(|conditions| *conditions.line(line) == from);
+        if changes {
+            self.change(|conditions| conditions.set_line(line, to));
+        }
+        changes
+    }
+
+    /// Sets whose scope it is, if that is not known already.
+    pub(super) fn set_scope(&self, scope: Scope) {
+        if self.read(|conditions| *conditions.scope() != scope) {
+            self.change(|conditions| conditions.set_scope(scope));
+        }
+    }
+
+    fn tell(&self, conditions: &Conditions) {
+        let (health, detail) = conditions.health();
+        let is_away = |line: &LineState| matches!(line, LineState::Failed(failure) if !failure.is_refusal);
+        let unreachable = health == Health::Connecting && conditions.lines.iter().any(is_away);
         if unreachable && !self.told.swap(true, Ordering::AcqRel) {
             tracing::warn!(detail, "redis cannot be reached, trying on");
         }
@@ -356,6 +385,10 @@ mod tests {
         conditions
     }
 
+    fn away(why: &str) -> LineState {
+        LineState::Failed(Failure::away(why))
+    }
+
     fn up(scope: Scope) -> Conditions {
         let mut conditions = conditions(scope);
         conditions.set_line(Line::PublishSmall, LineState::Up);
@@ -379,7 +412,7 @@ mod tests {
             "a connection that is first needed now takes nothing away"
         );
         assert!(c.accepts(Line::PublishLarge));
-        c.set_line(Line::PublishLarge, LineState::Away("refused".to_owned()));
+        c.set_line(Line::PublishLarge, away("refused"));
         assert_eq!(c.health(), (Health::Down, "host:1: refused".to_owned()));
         assert!(!c.accepts(Line::PublishLarge) && c.accepts(Line::PublishSmall));
     }
@@ -387,12 +420,16 @@ mod tests {
     #[test]
     fn a_server_that_was_never_there_is_connecting_and_one_that_says_no_is_down() {
         let mut c = conditions(Scope::Free);
-        c.set_line(Line::ReadSmall, LineState::Away("connection refused".to_owned()));
+        c.set_line(Line::ReadSmall, away("connection refused"));
         assert_eq!(
             c.health(),
             (Health::Connecting, "host:1: connection refused".to_owned())
         );
-        c.set_line(Line::PublishSmall, LineState::Refused("WRONGPASS".to_owned()));
+        let refused = Failure {
+            is_refusal: true,
+            why: "WRONGPASS".to_owned(),
+        };
+        c.set_line(Line::PublishSmall, LineState::Failed(refused));
         assert_eq!(c.health(), (Health::Down, "host:1: WRONGPASS".to_owned()));
     }
 
@@ -433,11 +470,11 @@ mod tests {
     fn interruptions_of_reading_are_counted() {
         let mut c = up(Scope::Free);
         for _ in 0..2 {
-            c.set_line(Line::ReadSmall, LineState::Away("reset".to_owned()));
-            c.set_line(Line::ReadSmall, LineState::Away("refused".to_owned()));
+            c.set_line(Line::ReadSmall, away("reset"));
+            c.set_line(Line::ReadSmall, away("refused"));
             c.set_line(Line::ReadSmall, LineState::Up);
         }
-        c.set_line(Line::PublishSmall, LineState::Away("reset".to_owned()));
+        c.set_line(Line::PublishSmall, away("reset"));
         c.set_line(Line::PublishSmall, LineState::Up);
         assert_eq!(
             c.health(),

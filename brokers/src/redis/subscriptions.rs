@@ -9,7 +9,7 @@
 //! One SUBSCRIBE serves all readers of a channel. SUBSCRIBE and UNSUBSCRIBE are sent by one task, one after the other, so a
 //! channel that is left and wanted again ends up subscribed.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
@@ -17,10 +17,11 @@ use std::time::Instant;
 use blaze_domain::WriterId;
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
+use futures::FutureExt as _;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, oneshot};
 
-use crate::port::{BrokerError, Content, Received, SubscribeOptions, SubscriptionSender};
+use crate::port::{BrokerError, Content, Received, SubscribeOptions, Subscription, SubscriptionSender, subscription};
 
 /// Channels that one broker reads at most, over all its connections.
 pub const MAX_CHANNELS: usize = 10_000;
@@ -45,35 +46,10 @@ enum Stage {
 enum Phase {
     /// All that comes.
     Live,
-    /// Nothing yet: what is kept for late joiners is being read.
-    Joining(Held),
+    /// Nothing yet: what is kept for late joiners is being read. What comes meanwhile waits in a subscription of its own.
+    Joining(SubscriptionSender, Subscription),
     /// All but what it got from what is kept: per writer, the highest sequence.
     Filtered(HashMap<WriterId, u64>),
-}
-
-/// Messages that came while what is kept was read.
-struct Held {
-    messages: VecDeque<Received>,
-    bytes: usize,
-    options: SubscribeOptions,
-    dropped: u64,
-}
-
-impl Held {
-    fn push(&mut self, message: Received) {
-        self.bytes += message.content.size();
-        self.messages.push_back(message);
-        let SubscribeOptions {
-            max_messages,
-            max_bytes,
-            ..
-        } = self.options;
-        while self.messages.len() > 1 && (self.messages.len() > max_messages || self.bytes > max_bytes) {
-            let oldest = self.messages.pop_front();
-            self.bytes -= oldest.map_or(0, |message| message.content.size());
-            self.dropped += 1;
-        }
-    }
 }
 
 struct Reader {
@@ -87,8 +63,8 @@ impl Reader {
     fn offer(&mut self, message: Received) -> bool {
         match &mut self.phase {
             Phase::Live => self.sender.send(message),
-            Phase::Joining(held) => {
-                held.push(message);
+            Phase::Joining(held, _) => {
+                held.send(message);
                 !self.sender.is_closed()
             }
             Phase::Filtered(highest) => {
@@ -112,14 +88,11 @@ impl Reader {
             }
         }
         self.sender.send_kept(kept);
-        if let Phase::Joining(held) = std::mem::replace(&mut self.phase, Phase::Filtered(highest)) {
-            if held.dropped > 0 {
-                tracing::warn!(
-                    dropped = held.dropped,
-                    "messages came faster than what is kept for late joiners could be read"
-                );
-            }
-            for message in held.messages {
+        if let Phase::Joining(_, mut held) = std::mem::replace(&mut self.phase, Phase::Filtered(highest)) {
+            let mut messages = Vec::new();
+            let _ = held.receive(&mut messages, usize::MAX).now_or_never();
+            self.sender.note_lost(held.take_dropped());
+            for message in messages {
                 self.offer(message);
             }
         }
@@ -150,19 +123,17 @@ struct Channel {
 #[derive(Default)]
 struct Channels {
     by_name: HashMap<Name, Channel>,
-    /// Names that may have to be subscribed.
-    asked: Vec<Name>,
-    /// Names that may have no reader any more.
-    left: Vec<Name>,
+    /// Names that may have to be subscribed, or may have no reader any more.
+    changed: Vec<Name>,
     next_id: u64,
     closed: bool,
 }
 
 /// What the connection's task has to do next.
-#[derive(Debug, PartialEq, Eq)]
-pub(super) enum Work {
-    Subscribe(Vec<Name>),
-    Unsubscribe(Vec<Name>),
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(super) struct Work {
+    pub(super) subscribe: Vec<Name>,
+    pub(super) unsubscribe: Vec<Name>,
 }
 
 /// A reader that was added.
@@ -205,7 +176,7 @@ impl Subscriptions {
         }
         if !channels.by_name.contains_key(name) {
             self.count_one()?;
-            channels.asked.push(Arc::clone(name));
+            channels.changed.push(Arc::clone(name));
         }
         let entry = channels.by_name.entry(Arc::clone(name)).or_insert_with(|| Channel {
             reserved: channel.is_reserved(),
@@ -216,12 +187,8 @@ impl Subscriptions {
         let id = channels.next_id;
         channels.next_id += 1;
         let phase = if options.with_kept {
-            Phase::Joining(Held {
-                messages: VecDeque::new(),
-                bytes: 0,
-                options,
-                dropped: 0,
-            })
+            let (held, waiting) = subscription(options);
+            Phase::Joining(held, waiting)
         } else {
             Phase::Live
         };
@@ -278,72 +245,51 @@ impl Subscriptions {
         } else {
             Content::from_bytes(payload)
         };
-        let message = Received {
-            content,
-            at,
-            broker_age_us: 0,
-            kept: false,
-            place: None,
-        };
+        let message = Received::live(content, at);
         channel.readers.retain_mut(|reader| reader.offer(message.clone()));
         if channel.readers.is_empty() {
-            self.note_left(&mut channels, name);
+            channels.changed.push(Arc::from(name));
+            self.changed.notify_one();
         }
-    }
-
-    fn note_left(&self, channels: &mut Channels, name: &str) {
-        channels.left.push(Arc::from(name));
-        self.changed.notify_one();
     }
 
     /// Forgets readers that have gone, also where no message comes.
     pub(super) fn sweep(&self) {
         let mut channels = self.channels.lock();
         let channels = &mut *channels;
-        // All that have none are found anew.
-        channels.left.clear();
         for (name, channel) in &mut channels.by_name {
             channel.readers.retain(|reader| !reader.sender.is_closed());
             if channel.readers.is_empty() {
-                channels.left.push(Arc::clone(name));
+                channels.changed.push(Arc::clone(name));
             }
-        }
-        if !channels.left.is_empty() {
-            self.changed.notify_one();
         }
     }
 
-    /// What is to be asked of the server next, if anything. It is the caller's to report how it ended.
-    pub(super) fn take_work(&self) -> Option<Work> {
+    /// What is to be asked of the server next; it is the caller's to report how it ended.
+    pub(super) fn take_work(&self) -> Work {
         let mut channels = self.channels.lock();
         let channels = &mut *channels;
-        let mut leave = Vec::new();
-        while leave.len() < PER_COMMAND
-            && let Some(name) = channels.left.pop()
+        let mut work = Work::default();
+        while work.subscribe.len().max(work.unsubscribe.len()) < PER_COMMAND
+            && let Some(name) = channels.changed.pop()
         {
-            let gone = |channel: &Channel| channel.readers.is_empty() && channel.stage != Stage::Asking;
-            if channels.by_name.get(&name).is_some_and(gone)
-                && let Some(channel) = self.remove(channels, &name)
-                && channel.stage == Stage::Subscribed
-            {
-                leave.push(name);
+            let Some(channel) = channels.by_name.get_mut(&name) else {
+                continue;
+            };
+            match (channel.stage, channel.readers.is_empty()) {
+                (Stage::Asked, false) => {
+                    channel.stage = Stage::Asking;
+                    work.subscribe.push(name);
+                }
+                (Stage::Asked, true) => drop(self.remove(channels, &name)),
+                (Stage::Subscribed, true) => {
+                    self.remove(channels, &name);
+                    work.unsubscribe.push(name);
+                }
+                (Stage::Asking, _) | (Stage::Subscribed, false) => {}
             }
         }
-        if !leave.is_empty() {
-            return Some(Work::Unsubscribe(leave));
-        }
-        let mut ask = Vec::new();
-        while ask.len() < PER_COMMAND
-            && let Some(name) = channels.asked.pop()
-        {
-            if let Some(channel) = channels.by_name.get_mut(&name)
-                && channel.stage == Stage::Asked
-            {
-                channel.stage = Stage::Asking;
-                ask.push(name);
-            }
-        }
-        (!ask.is_empty()).then_some(Work::Subscribe(ask))
+        work
     }
 
     /// The server has confirmed SUBSCRIBE.
@@ -383,7 +329,7 @@ impl Subscriptions {
         for channel in channels.by_name.values_mut() {
             channel.stage = Stage::Asked;
         }
-        channels.asked = channels.by_name.keys().cloned().collect();
+        channels.changed = channels.by_name.keys().cloned().collect();
     }
 
     /// Those who wait for a confirmation wait no longer.

@@ -24,10 +24,20 @@ fn add(registry: &Subscriptions, name: &str) -> (Subscription, Added) {
 }
 
 fn subscribe_all(registry: &Subscriptions) {
-    while let Some(work) = registry.take_work() {
-        if let Work::Subscribe(names) = work {
-            registry.confirm(&names);
-        }
+    registry.confirm(&registry.take_work().subscribe);
+}
+
+fn subscribe(wanted: &[&str]) -> Work {
+    Work {
+        subscribe: names(wanted),
+        ..Work::default()
+    }
+}
+
+fn unsubscribe(unwanted: &[&str]) -> Work {
+    Work {
+        unsubscribe: names(unwanted),
+        ..Work::default()
     }
 }
 
@@ -44,13 +54,10 @@ fn frame(writer: u8, sequence: u64) -> Vec<u8> {
 }
 
 fn received(writer: u8, sequence: u64) -> Received {
-    Received {
-        content: Content::from_bytes(Bytes::from(frame(writer, sequence))),
-        at: Instant::now(),
-        broker_age_us: 0,
-        kept: false,
-        place: None,
-    }
+    Received::live(
+        Content::from_bytes(Bytes::from(frame(writer, sequence))),
+        Instant::now(),
+    )
 }
 
 fn deliver(registry: &Subscriptions, name: &str, payload: &[u8]) {
@@ -78,8 +85,8 @@ fn readers_of_one_channel_share_its_subscription() {
     let registry = registry();
     let (mut first, mut one) = add(&registry, "a");
     let (mut second, _two) = add(&registry, "a");
-    assert_eq!(registry.take_work(), Some(Work::Subscribe(names(&["a"]))));
-    assert_eq!(registry.take_work(), None);
+    assert_eq!(registry.take_work(), subscribe(&["a"]));
+    assert_eq!(registry.take_work(), Work::default());
     assert!(one.confirmation.try_recv().is_err());
     registry.confirm(&names(&["a"]));
     assert_eq!(one.confirmation.try_recv(), Ok(Ok(())));
@@ -101,14 +108,14 @@ fn the_last_reader_unsubscribes_and_a_new_one_subscribes_again() {
     subscribe_all(&registry);
     drop(first);
     registry.sweep();
-    assert_eq!(registry.take_work(), None);
+    assert_eq!(registry.take_work(), Work::default());
     drop(second);
     deliver(&registry, "a", b"nobody");
-    assert_eq!(registry.take_work(), Some(Work::Unsubscribe(names(&["a"]))));
+    assert_eq!(registry.take_work(), unsubscribe(&["a"]));
     assert_eq!(registry.count.load(Ordering::Relaxed), 0);
     let (mut third, _three) = add(&registry, "a");
     deliver(&registry, "a", b"of the time before");
-    assert_eq!(registry.take_work(), Some(Work::Subscribe(names(&["a"]))));
+    assert_eq!(registry.take_work(), subscribe(&["a"]));
     deliver(&registry, "a", b"new");
     assert_eq!(waiting(&mut third), ["new"]);
 }
@@ -119,15 +126,15 @@ fn a_reader_that_goes_before_it_was_subscribed_leaves_nothing() {
     let (first, _one) = add(&registry, "a");
     drop(first);
     registry.sweep();
-    assert_eq!(registry.take_work(), None);
+    assert_eq!(registry.take_work(), Work::default());
     let (second, _two) = add(&registry, "b");
-    assert_eq!(registry.take_work(), Some(Work::Subscribe(names(&["b"]))));
+    assert_eq!(registry.take_work(), subscribe(&["b"]));
     drop(second);
     registry.sweep();
-    assert_eq!(registry.take_work(), None, "SUBSCRIBE is under way");
+    assert_eq!(registry.take_work(), Work::default(), "SUBSCRIBE is under way");
     registry.confirm(&names(&["b"]));
     registry.sweep();
-    assert_eq!(registry.take_work(), Some(Work::Unsubscribe(names(&["b"]))));
+    assert_eq!(registry.take_work(), unsubscribe(&["b"]));
 }
 
 #[test]
@@ -135,16 +142,14 @@ fn after_a_lost_connection_all_is_subscribed_again() {
     let registry = registry();
     let (_a, _one) = add(&registry, "a");
     let (_b, mut two) = add(&registry, "b");
-    assert!(matches!(registry.take_work(), Some(Work::Subscribe(names)) if names.len() == 2));
+    assert_eq!(registry.take_work().subscribe.len(), 2);
     registry.fail_waiting("gone");
     assert_eq!(
         two.confirmation.try_recv(),
         Ok(Err(BrokerError::Away("gone".to_owned())))
     );
     registry.forget_server();
-    let Some(Work::Subscribe(mut again)) = registry.take_work() else {
-        panic!("nothing is asked")
-    };
+    let mut again = registry.take_work().subscribe;
     again.sort();
     assert_eq!(again, names(&["a", "b"]));
 }
@@ -231,6 +236,7 @@ fn what_is_held_for_a_late_joiner_is_bounded() {
     }
     registry.join(&Arc::from("a"), added.id, Vec::new());
     assert_eq!(waiting(&mut late), ["1:4", "1:5"]);
+    assert_eq!(late.take_dropped(), 3);
 }
 
 #[test]

@@ -1,19 +1,19 @@
 //! The task that writes what publishers hand over.
 
-use std::pin::Pin;
+use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use futures::StreamExt as _;
+use futures::future::BoxFuture;
 use futures::stream::FuturesOrdered;
 use redis::aio::MultiplexedConnection;
 
-use super::connection::{Failure, Serve, Session};
+use super::connection::Session;
 use super::gate::{Busy, Gate};
+use super::liveness::LOOK;
 use super::publisher::{Batch, Keeper, Refusals, Target};
-use super::pulse::{LOOK, Look, Pulse};
-use super::state::{Line, LineState, Scope};
-use super::subscriptions::Subscriptions;
+use super::state::{Failure, Line, LineState, Scope};
 use super::{Shared, server};
 use crate::outbox::Waiting;
 
@@ -30,73 +30,48 @@ const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
 /// How often what is kept of publishers that have gone is forgotten.
 const FORGET_EVERY: Duration = Duration::from_secs(10);
 
-type Answer = Pin<Box<dyn Future<Output = Landed> + Send>>;
-
-/// A batch that was answered, or never will be.
-struct Landed {
-    bytes: usize,
-    outcome: Result<Refusals, Failure>,
-}
+/// Bytes of a batch, and what the server said no to.
+type Answer = BoxFuture<'static, Result<(usize, Refusals), Failure>>;
 
 /// Writes one connection of publishers.
-pub(super) struct Writer {
-    shared: Arc<Shared>,
-    line: Line,
-    gate: Arc<Gate>,
+pub(super) struct Writer<'a> {
+    shared: &'a Shared,
+    keeper: Keeper<'a>,
+    gate: &'a Arc<Gate>,
     taken: Vec<Waiting<Target>>,
     /// Lost fields and new messages take turns.
     rewrites_next: bool,
     refused: u64,
     complained: Option<Instant>,
-    forgot: Instant,
 }
 
-/// What is under way on the connection.
-struct Flight {
-    connection: MultiplexedConnection,
-    answers: FuturesOrdered<Answer>,
-    bytes: usize,
+async fn send(mut connection: MultiplexedConnection, _busy: Busy, batch: Batch) -> Result<(usize, Refusals), Failure> {
+    let answers = connection
+        .send_packed_commands(&batch.pipeline, 0, batch.pipeline.len())
+        .await?;
+    // Not answered, the messages count as dropped.
+    Ok((batch.bytes, batch.settle(&answers)))
 }
 
-impl Flight {
-    fn has_room(&self) -> bool {
-        self.answers.len() < BATCHES && self.bytes < UNANSWERED_BYTES
-    }
-
-    fn send(&mut self, batch: Batch, busy: Busy) {
-        self.bytes += batch.bytes;
-        let mut connection = self.connection.clone();
-        self.answers.push_back(Box::pin(async move {
-            let _busy = busy;
-            let bytes = batch.bytes;
-            let answers = connection
-                .send_packed_commands(&batch.pipeline, 0, batch.pipeline.len())
-                .await;
-            // Not answered, the messages count as dropped.
-            let outcome = answers.map(|answers| batch.settle(&answers)).map_err(Failure::from);
-            Landed { bytes, outcome }
-        }));
-    }
-}
-
-impl Writer {
-    pub(super) fn new(shared: Arc<Shared>, line: Line) -> Self {
-        let gate = Arc::clone(shared.gate(line.is_large()));
+impl<'a> Writer<'a> {
+    pub(super) fn new(shared: &'a Shared, line: Line) -> Self {
         Self {
             shared,
-            line,
-            gate,
+            keeper: Keeper {
+                mirror: &shared.mirror,
+                line,
+            },
+            gate: shared.gate(line.is_large()),
             taken: Vec::with_capacity(BATCH_MESSAGES),
             rewrites_next: false,
             refused: 0,
             complained: None,
-            forgot: Instant::now(),
         }
     }
 
     /// Learns who the server is, and whether it lost what was kept.
     async fn meet(&self, session: &Session) -> Result<(), Failure> {
-        if self.line.is_large() {
+        if self.keeper.line.is_large() {
             return Ok(());
         }
         let mut connection = session.connection.clone();
@@ -106,7 +81,7 @@ impl Writer {
             Ok::<_, redis::RedisError>((facts, limits))
         };
         let answered = tokio::time::timeout(Duration::from_secs(3), asked).await;
-        let (facts, limits) = answered.map_err(|_| Failure::Away("no answer in time".to_owned()))??;
+        let (facts, limits) = answered.map_err(|_| Failure::away("no answer in time"))??;
         self.shared.met(facts, limits);
         Ok(())
     }
@@ -125,135 +100,69 @@ impl Writer {
         if self.taken.is_empty() {
             return None;
         }
-        let keeper = Keeper {
-            mirror: &self.shared.mirror,
-            line: self.line,
-        };
         let mut batch = Batch::with_capacity(self.taken.len());
         for waiting in self.taken.drain(..) {
-            batch.publish(waiting, &keeper, now);
+            batch.publish(waiting, &self.keeper, now);
         }
         Some(batch)
     }
 
     fn rewrite(&self) -> Option<Batch> {
-        let keeper = Keeper {
-            mirror: &self.shared.mirror,
-            line: self.line,
-        };
         let mut batch = Batch::with_capacity(1);
-        while batch.pipeline.len() < BATCH_MESSAGES && batch.bytes < BATCH_BYTES && batch.rewrite(&keeper) {}
+        while batch.pipeline.len() < BATCH_MESSAGES && batch.bytes < BATCH_BYTES && batch.rewrite(&self.keeper) {}
         (!batch.pipeline.is_empty()).then_some(batch)
     }
 
-    fn fill(&mut self, flight: &mut Flight) {
-        while self.gate.is_open() && flight.has_room() {
-            let busy = self.gate.busy();
-            let Some(batch) = self.next_batch(Instant::now()) else {
-                return;
-            };
-            flight.send(batch, busy);
-        }
+    fn has_room(&self, batches: usize, session: &Session) -> bool {
+        batches < BATCHES && session.liveness.unanswered() < UNANSWERED_BYTES
     }
 
-    /// Takes note of an answer.
-    fn landed(&mut self, landed: Landed, flight: &mut Flight, session: &Session) -> Result<(), Failure> {
-        flight.bytes = flight.bytes.saturating_sub(landed.bytes);
-        let refusals = landed.outcome?;
-        session.heard.note(Instant::now());
-        self.set(LineState::Up);
-        if refusals.count > 0 {
-            self.refused += refusals.count;
-            self.complain(&refusals.last.unwrap_or_default());
-        }
-        Ok(())
-    }
-
-    fn complain(&mut self, why: &str) {
-        let now = Instant::now();
-        if self
-            .complained
-            .is_none_or(|at| now.duration_since(at) >= COMPLAIN_EVERY)
-        {
-            tracing::warn!(
-                connection = self.line.name(),
-                refused = self.refused,
-                why,
-                "redis refuses messages"
-            );
-            self.complained = Some(now);
+    fn complain(&mut self, refusals: Refusals) {
+        self.refused += refusals.count;
+        let Some(why) = refusals.last else { return };
+        if self.complained.is_none_or(|at| at.elapsed() >= COMPLAIN_EVERY) {
+            let (connection, refused) = (self.keeper.line.name(), self.refused);
+            tracing::warn!(connection, refused, why, "redis refuses messages");
+            self.complained = Some(Instant::now());
             self.refused = 0;
         }
     }
 
-    fn set(&self, state: LineState) {
-        if self
-            .shared
-            .state
-            .read(|conditions| *conditions.line(self.line) != state)
-        {
-            self.shared
-                .state
-                .change(|conditions| conditions.set_line(self.line, state));
+    /// A flow is told by the end of a lease; a service's publisher takes what it kept with it.
+    fn forget(&self) {
+        if self.shared.state.read(|conditions| *conditions.scope() == Scope::Free) {
+            self.shared.mirror.lock().forget_orphans();
         }
     }
 
-    fn look(&mut self, pulse: &mut Pulse, flight: &mut Flight, session: &Session) {
-        let now = Instant::now();
-        match pulse.look(now, session.heard.last(), flight.bytes) {
-            Look::Fine => {}
-            Look::Ask => flight.send(Batch::ping(), self.gate.busy()),
-            Look::Silent => self.set(LineState::Silent),
-        }
-        if now.duration_since(self.forgot) >= FORGET_EVERY {
-            self.forgot = now;
-            // A flow is told by the end of a lease; a service's publisher takes what it kept with it.
-            if self.shared.state.read(|conditions| *conditions.scope() == Scope::Free) {
-                self.shared.mirror.lock().forget_orphans();
-            }
-        }
-    }
-}
-
-impl Serve for Writer {
-    fn line(&self) -> Line {
-        self.line
-    }
-
-    fn subscriptions(&self) -> Option<Arc<Subscriptions>> {
-        None
-    }
-
-    async fn serve(&mut self, session: &Session) -> Failure {
-        if let Err(failure) = self.meet(session).await {
-            return failure;
-        }
-        let mut flight = Flight {
-            connection: session.connection.clone(),
-            answers: FuturesOrdered::new(),
-            bytes: 0,
-        };
-        let mut pulse = Pulse::new(self.line.is_large(), Instant::now());
+    /// Writes what publishers hand over until the connection fails.
+    pub(super) async fn serve(mut self, session: &Session) -> Result<Infallible, Failure> {
+        self.meet(session).await?;
+        self.shared.state.set_line(self.keeper.line, LineState::Up);
+        let mut answers = FuturesOrdered::<Answer>::new();
+        // What the server has lost is to be written again, which rings no bell.
         let mut looks = tokio::time::interval(LOOK);
-        looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        self.set(LineState::Up);
+        let mut forgets = tokio::time::interval(FORGET_EVERY);
         loop {
-            self.fill(&mut flight);
-            pulse.expect(!flight.answers.is_empty(), Instant::now());
-            let gate = Arc::clone(&self.gate);
-            let has_room = flight.has_room();
+            while self.gate.is_open() && self.has_room(answers.len(), session) {
+                let busy = self.gate.busy();
+                let Some(batch) = self.next_batch(Instant::now()) else {
+                    break;
+                };
+                session.liveness.sent(batch.bytes);
+                answers.push_back(Box::pin(send(session.connection.clone(), busy, batch)));
+            }
+            let has_room = self.has_room(answers.len(), session);
             tokio::select! {
                 biased;
-                Some(landed) = flight.answers.next() => {
-                    if let Err(failure) = self.landed(landed, &mut flight, session) {
-                        return failure;
-                    }
+                Some(answer) = answers.next() => {
+                    let (bytes, refusals) = answer?;
+                    session.liveness.answered(bytes);
+                    self.complain(refusals);
                 }
-                () = session.lost.cancelled() => {
-                    return Failure::Away("the connection was lost".to_owned());
-                }
-                () = gate.outbox.filled(), if has_room => {}
-                _ = looks.tick() => self.look(&mut pulse, &mut flight, session),
+                () = self.gate.outbox.filled(), if has_room => {}
+                _ = looks.tick() => {}
+                _ = forgets.tick() => self.forget(),
             }
         }
     }

@@ -1,28 +1,34 @@
-//! What one client may take: requests at work, requests a second, refused tokens a second, open watches, bodies on their
-//! way.
+//! What clients may take: requests at work, requests a second, refused tokens a second, open watches, bytes of bodies.
 //!
-//! One value of [`ApiLimits`] serves REST and gRPC, so that a client cannot have twice as much by using both. Whatever is
+//! ```text
+//! body ─▶ metered, while it is received ─▶ whole ─▶ a place among the requests at work
+//! ```
+//!
+//! Only what is whole takes a place among the requests at work, so that slow senders do not hold up others. One value of [`ApiLimits`] serves REST and gRPC, so that a client cannot have twice as much by using both. Whatever is
 //! remembered about clients is bounded: the least recently seen are forgotten, with a full allowance.
+//! The buckets are our own: `governor` neither looks without taking, as the check of an address does, nor bounds its keys.
 
 use std::collections::HashMap;
+use std::error::Error;
 use std::hash::Hash;
 use std::net::{IpAddr, Ipv6Addr};
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::time::Instant;
 
+use axum::BoxError;
 use axum::body::Body;
 use blaze_domain::config::{Code, Problem};
 use blaze_domain::node_file::LimitsSection;
+use futures::StreamExt as _;
 use lru::LruCache;
 use parking_lot::Mutex;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
-use super::uploads::Uploads;
-pub(super) use super::uploads::refusal;
-
 /// Clients that are remembered per limit.
 const REMEMBERED: NonZeroUsize = NonZeroUsize::MIN.saturating_add(65_535);
+/// Bytes of bodies that are being received, of all clients together (512 MiB).
+const RECEIVING_BYTES: usize = 512 * 1024 * 1024;
 
 /// A place among the requests at work; free again when dropped.
 #[derive(Debug)]
@@ -52,7 +58,7 @@ impl Drop for WatchSlot {
 /// The limits of both interfaces.
 #[derive(Debug)]
 pub struct ApiLimits {
-    uploads: Arc<Uploads>,
+    receiving: Arc<Semaphore>,
     in_flight: Arc<Semaphore>,
     requests: Option<Buckets<String>>,
     failures: Option<Buckets<IpAddr>>,
@@ -66,7 +72,7 @@ impl ApiLimits {
     pub fn new(section: &LimitsSection) -> Self {
         let in_flight = usize::try_from(section.in_flight).unwrap_or(Semaphore::MAX_PERMITS);
         Self {
-            uploads: Arc::default(),
+            receiving: Arc::new(Semaphore::new(RECEIVING_BYTES)),
             in_flight: Arc::new(Semaphore::new(in_flight.min(Semaphore::MAX_PERMITS))),
             requests: (section.requests_per_s > 0).then(|| Buckets::new(section.requests_per_s)),
             failures: (section.auth_failures_per_s > 0).then(|| Buckets::new(section.auth_failures_per_s)),
@@ -75,9 +81,21 @@ impl ApiLimits {
         }
     }
 
-    /// The body of a request of a subject, bounded while it is on its way. When it fails by that, [`refusal`] finds why.
-    pub(super) fn metered(&self, subject: &str, body: Body) -> Body {
-        self.uploads.metered(subject, body)
+    /// The body of a request, whose bytes count until it is dropped. When it fails by that, [`refusal`] finds why.
+    pub(super) fn metered(&self, body: Body) -> Body {
+        let (receiving, mut held) = (Arc::clone(&self.receiving), None::<OwnedSemaphorePermit>);
+        Body::from_stream(body.into_data_stream().map(move |chunk| {
+            let chunk = chunk?;
+            let bytes = u32::try_from(chunk.len())?;
+            let Ok(taken) = Arc::clone(&receiving).try_acquire_many_owned(bytes) else {
+                return Err(overloaded("the service receives as many bytes of bodies as it may: try again").into());
+            };
+            match &mut held {
+                Some(held) => held.merge(taken),
+                None => held = Some(taken),
+            }
+            Ok::<_, BoxError>(chunk)
+        }))
     }
 
     /// A place among the requests at work, for one whose body is there.
@@ -87,10 +105,7 @@ impl ApiLimits {
     pub fn enter(&self) -> Result<InFlight, Problem> {
         match Arc::clone(&self.in_flight).try_acquire_owned() {
             Ok(permit) => Ok(InFlight { _permit: permit }),
-            Err(_) => {
-                let detail = "the service works on as many requests as it may: try again";
-                Err(Problem::new(Code::Overloaded, detail).retry_after(1))
-            }
+            Err(_) => Err(overloaded("the service works on as many requests as it may: try again")),
         }
     }
 
@@ -142,6 +157,15 @@ impl ApiLimits {
             open: Arc::clone(&self.watches),
         })
     }
+}
+
+/// The refusal that a failed reading of a metered body ends with, if it is one.
+pub(super) fn refusal<'a>(error: &'a (dyn Error + 'static)) -> Option<&'a Problem> {
+    std::iter::successors(Some(error), |&error| error.source()).find_map(|error| error.downcast_ref())
+}
+
+fn overloaded(detail: &str) -> Problem {
+    Problem::new(Code::Overloaded, detail).retry_after(1)
 }
 
 fn limited(detail: &str, wait_s: u64) -> Problem {
@@ -217,7 +241,11 @@ impl<K: Hash + Eq> Buckets<K> {
 
 #[cfg(test)]
 mod tests {
+    use std::convert::Infallible;
     use std::time::Duration;
+
+    use futures::stream;
+    use http_body_util::BodyExt as _;
 
     use super::*;
 
@@ -262,6 +290,24 @@ mod tests {
         drop(watches);
         assert!(limits.open_watch("a").is_ok());
         assert!(limits.watches.lock().is_empty());
+    }
+
+    #[tokio::test]
+    async fn bytes_of_bodies_are_bounded_while_they_are_received() {
+        let limits = limits(0, 0);
+        let first = vec![0; 1024];
+        let half = limits.metered(Body::from_stream(stream::iter(
+            [first, Vec::new()].map(Ok::<_, Infallible>),
+        )));
+        let mut half = half.into_data_stream();
+        assert_eq!(half.next().await.unwrap().unwrap().len(), 1024);
+        let rest = u32::try_from(RECEIVING_BYTES - 1024).unwrap();
+        let _rest = limits.receiving.try_acquire_many(rest).unwrap();
+        let refused = limits.metered(Body::from("x")).collect().await.unwrap_err();
+        assert_eq!(refusal(&refused).unwrap().code, Code::Overloaded);
+        drop(half);
+        assert!(limits.metered(Body::from("x")).collect().await.is_ok());
+        assert_eq!(limits.receiving.available_permits(), 1024);
     }
 
     #[test]

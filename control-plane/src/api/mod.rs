@@ -14,4 +14,3 @@ pub mod json;
 pub mod limits;
 pub mod request;
 pub mod rest;
-mod uploads;

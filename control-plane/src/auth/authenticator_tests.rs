@@ -21,6 +21,7 @@ use serde_json::{Value, json};
 use super::jwks::Provider;
 use super::{Authenticator, NamedKey};
 use crate::listen::{ListenLimits, Listener, Protocols, Tls};
+use crate::metrics::ApiMetrics;
 
 const NOW_S: i64 = 1_795_244_472;
 const SOON: Duration = Duration::from_secs(10);
@@ -255,7 +256,7 @@ async fn identity_provider() -> Served {
         .await
         .unwrap();
     let base = format!("https://localhost:{}", listener.local_addr().port());
-    listener.serve(&supervisor, router);
+    listener.serve(&supervisor, router, &ApiMetrics::new().unwrap());
     Served {
         supervisor,
         keys,

@@ -1,11 +1,12 @@
-//! From a request and a state to changes, or to a refusal. Pure but for new uids and nonces: the same code runs for a
-//! dry run, for the first try and again after another process was first.
+//! From a request and a state to changes, or to a refusal. Pure but for new uids, nonces and the deadline of the checks:
+//! the same code runs for a dry run, for the first try and again after another process was first.
 
 mod faults;
 mod outcome;
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
+use std::time::Instant;
 
 use blaze_domain::NodeName;
 use blaze_domain::config::diff::{document_diff, paths};
@@ -17,8 +18,7 @@ pub(super) use self::faults::invalid;
 use self::faults::{COUNTED, Faults, in_use, twice};
 use self::outcome::{Outcome, Target, cascade_into, outcome_of, prune_into, same_spec};
 
-use super::check::too_many;
-use super::cost::{MAX_WORK_OF_COMMIT, STEPS_OF_REFUSED};
+use super::check::{self, too_many};
 use super::refs;
 use super::rollouts::{begin, tried};
 use super::schema::Schemas;
@@ -214,7 +214,7 @@ impl Evaluator {
         order: Vec<Key>,
         mut faults: Faults,
     ) -> Result<Evaluated, Problem> {
-        let mut compiling = MAX_WORK_OF_COMMIT;
+        let deadline = Instant::now() + check::TIME;
         let places: HashMap<&Key, usize> = order.iter().zip(0..).collect();
         let index_of = |key: &Key| places.get(key).copied().unwrap_or(0);
         let mut changes = Vec::with_capacity(outcomes.len());
@@ -227,15 +227,7 @@ impl Evaluator {
                     .as_ref()
                     .map(|document| removal(document, revision, time, request)),
                 Outcome::Put(target) => {
-                    match self.document(
-                        &key,
-                        before.as_deref(),
-                        *target,
-                        revision,
-                        time,
-                        request,
-                        &mut compiling,
-                    ) {
+                    match self.document(&key, before.as_deref(), *target, revision, time, request, deadline) {
                         Ok(Some(document)) => {
                             // What is written anyway leaves old keys behind, so that they can be taken away one day.
                             let document = self.keyring.reseal(&document).ok().flatten().unwrap_or(document);
@@ -262,15 +254,8 @@ impl Evaluator {
         let mut after = state.clone();
         after.advance(revision, changes.iter().map(Change::step));
         check_rights(state, &after, request, &changes)?;
-        self.begin_rollouts(
-            &mut after,
-            request,
-            &mut changes,
-            &index_of,
-            &mut faults,
-            &mut compiling,
-        )?;
-        self.check_result(state, &after, request, &changes, &index_of, &mut faults)?;
+        self.begin_rollouts(&mut after, request, &mut changes, &index_of, &mut faults, deadline)?;
+        self.check_result([state, &after], request, &changes, &index_of, &mut faults, deadline)?;
         let results = order.into_iter().map(|key| {
             let action = actions.get(&key).copied().unwrap_or(ApplyAction::Unchanged);
             (key, action)
@@ -281,7 +266,7 @@ impl Evaluator {
         })
     }
 
-    /// The document that is stored; `None` if nothing changes. `compiling` is what schemas may still take.
+    /// The document that is stored; `None` if nothing changes.
     #[allow(clippy::too_many_arguments, reason = "one step of `build`, cut for reading")]
     fn document(
         &self,
@@ -291,7 +276,7 @@ impl Evaluator {
         revision: u64,
         time: Timestamp,
         request: &Request,
-        compiling: &mut u64,
+        deadline: Instant,
     ) -> Result<Option<Document>, Vec<FieldFault>> {
         let uid = before.map_or_else(|| uuid::Uuid::now_v7().to_string(), |document| document.uid.clone());
         let mut spec = target.spec;
@@ -316,7 +301,7 @@ impl Evaluator {
             // One that is stored was sound when it came, and does not stand in the way of other changes.
             && stored != Some(schema)
         {
-            self.check_schema(schema, "/spec/schema", compiling)
+            self.check_schema(schema, "/spec/schema", deadline)
                 .map_err(|fault| vec![fault])?;
         }
         if let Some(before) = before
@@ -341,21 +326,12 @@ impl Evaluator {
         }))
     }
 
-    /// Whether a schema is sound. `left` is what schemas may still take.
-    fn check_schema(&self, schema: &Value, pointer: &str, left: &mut u64) -> Result<(), FieldFault> {
-        if *left == 0 {
+    /// Whether a schema is sound.
+    fn check_schema(&self, schema: &Value, pointer: &str, deadline: Instant) -> Result<(), FieldFault> {
+        if Instant::now() >= deadline {
             return Err(too_many());
         }
-        match self.schemas.check(schema) {
-            Ok(steps) => {
-                *left = left.checked_sub(steps).ok_or_else(too_many)?;
-                Ok(())
-            }
-            Err(reason) => {
-                *left = left.saturating_sub(STEPS_OF_REFUSED);
-                Err(invalid(pointer, &reason))
-            }
-        }
+        self.schemas.check(schema).map_err(|reason| invalid(pointer, &reason))
     }
 
     /// Judges roll-outs that begin by what there is after the change, of which their targets and nodes may be part.
@@ -366,7 +342,7 @@ impl Evaluator {
         changes: &mut [Change],
         index_of: &dyn Fn(&Key) -> usize,
         faults: &mut Faults,
-        compiling: &mut u64,
+        deadline: Instant,
     ) -> Result<(), Problem> {
         let view = view(&request.caller.claims);
         let is_begun = |change: &&mut Change| begins(request, change);
@@ -384,7 +360,7 @@ impl Evaluator {
                 let state: &State = after;
                 let written = view.check_write((state, Some(&target)), (state, Some(&patched)));
                 written.map_err(|_| view.outside(&format!("what {} makes of its target", rollout.key)))?;
-                for fault in self.faults_of_tried(state, &rollout, &patched, faults.room(), compiling) {
+                for fault in self.faults_of_tried(state, &rollout, &patched, faults.room(), deadline) {
                     faults.add(index, fault);
                 }
             }
@@ -403,7 +379,7 @@ impl Evaluator {
         rollout: &Document,
         patched: &Document,
         most: usize,
-        compiling: &mut u64,
+        deadline: Instant,
     ) -> Vec<FieldFault> {
         let mut found = refs::missing_of(after, patched, most);
         for fault in &mut found {
@@ -413,7 +389,7 @@ impl Evaluator {
         if patched.key.kind() == Kind::Service
             && tries_schema(rollout)
             && let Some(schema) = patched.spec_member("schema")
-            && let Err(fault) = self.check_schema(schema, "/spec/patch/schema", compiling)
+            && let Err(fault) = self.check_schema(schema, "/spec/patch/schema", deadline)
         {
             found.push(fault);
         }
@@ -423,12 +399,12 @@ impl Evaluator {
     /// What can only be judged on the resulting state: references, schemas, sizes, counts.
     fn check_result(
         &self,
-        before: &State,
-        after: &State,
+        [before, after]: [&State; 2],
         request: &Request,
         changes: &[Change],
         index_of: &dyn Fn(&Key) -> usize,
         faults: &mut Faults,
+        deadline: Instant,
     ) -> Result<(), Problem> {
         let view = view(&request.caller.claims);
         for change in changes.iter().filter(|change| change.op != Op::Delete) {
@@ -442,7 +418,7 @@ impl Evaluator {
         }
         faults.finish_invalid()?;
         let keys: Vec<Key> = changes.iter().map(|change| change.document.key.clone()).collect();
-        for fault in self.schemas.check_effective(before, after, &keys, &view) {
+        for fault in self.schemas.check_effective(before, after, &keys, &view, deadline) {
             faults.add(keys.first().map_or(0, index_of), fault);
         }
         faults.finish_invalid()?;

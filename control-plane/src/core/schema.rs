@@ -4,20 +4,19 @@ use std::collections::{HashMap, HashSet};
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
-use blaze_domain::config::{canonical, secret};
-use jsonschema::{Draft, Keyword, PatternOptions, ValidationError, Validator};
+use blaze_domain::config::secret;
+use jsonschema::{Draft, Validator};
 use lru::LruCache;
 use parking_lot::Mutex;
 use serde_json::{Map, Value};
 use sha2::{Digest as _, Sha256};
 
-use super::cost::{self, Cost};
-use super::pattern::{self, Patterns};
+use super::{cost, pattern};
 
 /// Compiled schemas that are kept.
 const CACHED: NonZeroUsize = NonZeroUsize::MIN.saturating_add(511);
-/// Patterns in them, at most: each keeps up to [`pattern::CACHE_BYTES`] in each direction from one match to the next.
-const CACHED_PATTERNS: usize = 1000;
+/// Patterns in one schema.
+const MAX_PATTERNS: usize = 200;
 /// The dialect that schemas are in.
 const DIALECT: &str = "https://json-schema.org/draft/2020-12/schema";
 
@@ -25,40 +24,16 @@ const DIALECT: &str = "https://json-schema.org/draft/2020-12/schema";
 pub(super) struct Compiled {
     full: Validator,
     partial: Validator,
-    cost: Cost,
+    /// Steps for each value of a configuration, at most.
+    pub(super) steps: u64,
 }
 
-/// Compiled schemas, the most recently used.
-pub(crate) struct Schemas {
-    cache: Mutex<Cache>,
-}
-
-struct Cache {
-    by_text: LruCache<[u8; 32], Arc<Compiled>>,
-    patterns: usize,
-}
-
-impl Cache {
-    fn put(&mut self, id: [u8; 32], compiled: Arc<Compiled>) {
-        self.patterns += compiled.cost.patterns;
-        if let Some((_, gone)) = self.by_text.push(id, compiled) {
-            self.patterns -= gone.cost.patterns;
-        }
-        while self.patterns > CACHED_PATTERNS && self.by_text.len() > 1 {
-            let gone = self.by_text.pop_lru();
-            self.patterns -= gone.map_or(0, |(_, gone)| gone.cost.patterns);
-        }
-    }
-}
+/// Compiled schemas, the most recently used, by their texts' hashes.
+pub(crate) struct Schemas(Mutex<LruCache<[u8; 32], Arc<Compiled>>>);
 
 impl Default for Schemas {
     fn default() -> Self {
-        Self {
-            cache: Mutex::new(Cache {
-                by_text: LruCache::new(CACHED),
-                patterns: 0,
-            }),
-        }
+        Self(Mutex::new(LruCache::new(CACHED)))
     }
 }
 
@@ -70,23 +45,18 @@ impl Compiled {
             false => &self.partial,
         }
     }
-
-    /// What it takes.
-    pub(super) fn cost(&self) -> &Cost {
-        &self.cost
-    }
 }
 
 impl Schemas {
-    /// What is wrong with the schema itself, or the steps that it takes to know that nothing is.
-    pub(crate) fn check(&self, schema: &Value) -> Result<u64, String> {
-        self.compiled(schema).map(|compiled| compiled.cost.compiling)
+    /// What is wrong with the schema itself.
+    pub(crate) fn check(&self, schema: &Value) -> Result<(), String> {
+        self.compiled(schema).map(drop)
     }
 
     pub(super) fn compiled(&self, schema: &Value) -> Result<Arc<Compiled>, String> {
         let text = schema.to_string();
         let id: [u8; 32] = Sha256::digest(text.as_bytes()).into();
-        if let Some(found) = self.cache.lock().by_text.get(&id) {
+        if let Some(found) = self.0.lock().get(&id) {
             return Ok(Arc::clone(found));
         }
         if let Some(reference) = foreign_reference(schema) {
@@ -102,36 +72,29 @@ impl Schemas {
             let text: String = error.to_string().chars().take(500).collect();
             format!("at {:?}: {text}", error.instance_path().as_str())
         })?;
-        let cost = cost::of_schema(schema, &text)?;
-        let patterns = Patterns::default();
-        let build = |schema: &Value| built(schema, &patterns);
+        let patterns = patterns(schema);
+        if patterns > MAX_PATTERNS {
+            return Err(format!("it has {patterns} patterns; {MAX_PATTERNS} are allowed"));
+        }
         let compiled = Arc::new(Compiled {
-            cost,
-            full: build(schema)?,
+            steps: cost::steps(schema)?,
+            full: built(schema)?,
             // What refers into a keyword that goes leads nowhere: then only the full form can be judged.
-            partial: build(&without_required(schema)).or_else(|_| build(&Value::Bool(true)))?,
+            partial: built(&without_required(schema)).or_else(|_| built(&Value::Bool(true)))?,
         });
-        self.cache.lock().put(id, Arc::clone(&compiled));
+        self.0.lock().put(id, Arc::clone(&compiled));
         Ok(compiled)
     }
 }
 
-fn built(schema: &Value, patterns: &Patterns) -> Result<Validator, String> {
-    let patterns = patterns.clone();
-    // Those of `patternProperties`, which are matched against names alone.
-    let of_names = PatternOptions::regex()
-        .size_limit(pattern::MAX_BYTES)
-        .dfa_size_limit(pattern::CACHE_BYTES);
+fn built(schema: &Value) -> Result<Validator, String> {
     jsonschema::options()
         .with_draft(Draft::Draft202012)
         .offline()
-        .with_pattern_options(of_names)
-        .with_keyword("maxLength", |_, limit, _| pattern::length(limit, false))
-        .with_keyword("minLength", |_, limit, _| pattern::length(limit, true))
-        .with_keyword("pattern", move |parent, schema, path| {
-            patterns.keyword(parent, schema, path)
-        })
-        .with_keyword("uniqueItems", unique_items)
+        .with_pattern_options(pattern::options())
+        .with_keyword("maxLength", |_, limit, _| pattern::keyword("maxLength", limit))
+        .with_keyword("minLength", |_, limit, _| pattern::keyword("minLength", limit))
+        .with_keyword("pattern", |_, text, _| pattern::keyword("pattern", text))
         .build(schema)
         .map_err(|error| {
             let text: String = error.to_string().chars().take(500).collect();
@@ -140,6 +103,22 @@ fn built(schema: &Value, patterns: &Patterns) -> Result<Validator, String> {
                 place => format!("at {place:?}: {text}"),
             }
         })
+}
+
+/// Patterns in a schema, or what looks like one.
+fn patterns(schema: &Value) -> usize {
+    let own = |(name, value): (&String, &Value)| match (name.as_str(), value) {
+        ("pattern", Value::String(_)) => 1,
+        ("patternProperties", Value::Object(named)) => named.len(),
+        _ => 0,
+    };
+    match schema {
+        Value::Object(members) => {
+            members.iter().map(own).sum::<usize>() + members.values().map(patterns).sum::<usize>()
+        }
+        Value::Array(list) => list.iter().map(patterns).sum(),
+        Value::Null | Value::Bool(_) | Value::Number(_) | Value::String(_) => 0,
+    }
 }
 
 /// A configuration with a text in place of each secret that says nothing of it, and where they are. Whether a text has a
@@ -153,45 +132,6 @@ pub(super) fn with_placeholders(mut config: Value) -> (Value, HashSet<String>) {
         });
     }
     (config, found)
-}
-
-/// `uniqueItems` in the time that it takes to write the list: to compare each item with each other takes for ever.
-struct UniqueItems(bool);
-
-impl UniqueItems {
-    fn holds(&self, instance: &Value) -> bool {
-        let Some(items) = instance.as_array().filter(|_| self.0) else {
-            return true;
-        };
-        let mut seen = HashSet::with_capacity(items.len());
-        items.iter().all(|item| seen.insert(canonical::to_string(item)))
-    }
-}
-
-impl<'i> Keyword<'i> for UniqueItems {
-    fn validate(&self, instance: &'i Value) -> Result<(), ValidationError<'i>> {
-        match self.holds(instance) {
-            true => Ok(()),
-            false => Err(ValidationError::custom("two items of the list are equal")),
-        }
-    }
-
-    fn is_valid(&self, instance: &'i Value) -> bool {
-        self.holds(instance)
-    }
-}
-
-#[allow(
-    clippy::unnecessary_wraps,
-    clippy::result_large_err,
-    reason = "the form of jsonschema"
-)]
-fn unique_items<'a>(
-    _parent: &'a Map<String, Value>,
-    schema: &'a Value,
-    _path: jsonschema::paths::Location,
-) -> Result<Box<dyn for<'i> Keyword<'i>>, ValidationError<'a>> {
-    Ok(Box::new(UniqueItems(schema.as_bool().unwrap_or(false))))
 }
 
 /// What is wrong with the dialect that a schema, or a part of it, says it is in: only one is taken. A part in another one
@@ -553,42 +493,16 @@ mod tests {
     }
 
     #[test]
-    fn equal_items_are_found_whatever_their_form() {
-        let schemas = Schemas::default();
-        let unique = schemas.compiled(&json!({ "uniqueItems": true })).unwrap();
-        for (list, expected) in [
-            (json!([1, "1", true, [1], { "a": 1 }, null]), true),
-            (json!([{ "a": 1, "b": 2 }, { "b": 2, "a": 1.0 }]), false),
-            (json!([1, 1.0]), false),
-            (json!([]), true),
-            (json!("text"), true),
-        ] {
-            assert_eq!(unique.full.is_valid(&list), expected, "{list}");
-        }
-        let any = schemas.compiled(&json!({ "uniqueItems": false })).unwrap();
-        assert!(any.full.is_valid(&json!([1, 1])));
-        // At one value it may be asked for so often only.
-        let often: Vec<Value> = (0..300).map(|_| json!({ "uniqueItems": true })).collect();
-        assert!(schemas.check(&json!({ "allOf": often })).is_err());
-    }
-
-    #[test]
-    fn few_patterns_are_kept_compiled() {
-        let schemas = Schemas::default();
-        let of = |number: usize| {
-            let names: Map<String, Value> = (0..180)
-                .map(|name| (format!("^{number}-{name}$"), json!(true)))
+    fn a_schema_has_so_many_patterns() {
+        let of = |count: usize| {
+            let list: Vec<Value> = (0..count)
+                .map(|number| json!({ "pattern": format!("^{number}$") }))
                 .collect();
-            json!({ "patternProperties": names })
+            json!({ "properties": { "pattern": { "prefixItems": list } }, "patternProperties": { "^a": true } })
         };
-        let first = schemas.compiled(&of(0)).unwrap();
-        let is_kept = |schemas: &Schemas| Arc::ptr_eq(&first, &schemas.compiled(&of(0)).unwrap());
-        assert!(is_kept(&schemas));
-        for number in 1..=6 {
-            schemas.check(&of(number)).unwrap();
-            let cache = schemas.cache.lock();
-            assert!(cache.patterns <= CACHED_PATTERNS, "{}", cache.patterns);
-        }
-        assert!(!is_kept(&schemas));
+        let schemas = Schemas::default();
+        assert_eq!(schemas.check(&of(199)), Ok(()));
+        let error = schemas.check(&of(200)).unwrap_err();
+        assert!(error.contains("201 patterns"), "{error}");
     }
 }

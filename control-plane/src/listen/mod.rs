@@ -1,18 +1,13 @@
 //! The ports of REST and gRPC: TCP or TLS, HTTP/1.1 and HTTP/2.
 //!
 //! ```text
-//! accept ─(limit)─▶ TLS handshake ─(10 s)─▶ HTTP ─(first head: 30 s)─▶ Router
-//!                                            └─ watched: idle, stalled, shutdown ─▶ told, then closed
+//! accept ─(limit)─▶ TLS handshake ─(10 s)─▶ HTTP ─(first request: 30 s)─▶ unread bodies ─▶ Router
 //! ```
 //!
-//! Nothing that comes in from outside ends the listener or takes more than its share: connections, the time for each
-//! step, and the bytes of a head are bounded, and what became of every connection is counted. Heads up to
-//! [`ListenLimits::head_bytes`] reach the router, which answers those that are over the contract's limits itself.
+//! `axum-server` accepts, serves and drains; hyper bounds heads and HTTP/2. This module adds what both leave open: the
+//! number of connections, silence before the first request, clients that do not read, and bodies that nobody reads.
 
-mod activity;
-mod connection;
-mod counters;
-mod stall;
+mod socket;
 #[cfg(test)]
 mod tests;
 mod tls;
@@ -21,19 +16,34 @@ mod unread;
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use axum::Router;
+use axum::{Router, middleware};
+use axum_server::tls_rustls::RustlsAcceptor;
+use axum_server::{Handle, Server};
 use blaze_runtime::{Supervisor, TaskHandle, TaskPolicy};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::task::{JoinError, JoinSet};
+use hyper_util::rt::TokioTimer;
+use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 
-use connection::Connection;
-use counters::Outcome;
+use crate::metrics::ApiMetrics;
+use socket::Acceptor;
+use unread::Reader;
 
-pub use counters::{ListenCounters, metrics_text};
 pub use tls::{Tls, install_crypto_provider};
+
+/// Lines of a head of HTTP/1.1; one with more is answered 431 by the library, without a body. What has fewer lines and too
+/// many bytes reaches the router.
+const MAX_HEADER_LINES: usize = 1024;
+/// Bytes of a head beyond which the library answers 431. Twice what the contract allows, so that the refusal of the router
+/// can have its form.
+const MAX_HEAD_BYTES: u32 = 64 * 1024;
+/// Requests at once on one connection of HTTP/2.
+const MAX_STREAMS: u32 = 1000;
+/// Bytes of answers that wait in one stream of HTTP/2.
+const STREAM_BUFFER_BYTES: usize = 128 * 1024;
 
 /// What is spoken on a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,20 +61,10 @@ pub struct ListenLimits {
     pub connections: usize,
     /// For the TLS handshake.
     pub handshake_timeout: Duration,
-    /// For the head of a request, and until the first one.
+    /// For the head of a request, and from the acceptance to the first request.
     pub head_timeout: Duration,
-    /// Head of a request, in bytes, beyond which the connection answers 431 itself and closes; at least 8192.
-    pub head_bytes: usize,
-    /// A connection of HTTP/2 without requests is closed after this; one of HTTP/1.1 after [`Self::head_timeout`].
-    pub idle_timeout: Duration,
     /// A client that takes no byte for this long loses its connection.
     pub write_stall: Duration,
-    /// A client that takes nothing from one answer for this long, though it acknowledges on others, loses its connection.
-    pub stream_stall: Duration,
-    /// Requests at once on one connection of HTTP/2.
-    pub streams: u32,
-    /// Bytes of answers that wait in one stream of HTTP/2.
-    pub stream_buffer_bytes: usize,
     /// HTTP/2: between a sign of life and a PING.
     pub keep_alive_interval: Duration,
     /// HTTP/2: for the answer to a PING.
@@ -83,13 +83,7 @@ impl Default for ListenLimits {
             connections: 10_000,
             handshake_timeout: Duration::from_secs(10),
             head_timeout: Duration::from_secs(30),
-            // Twice what the contract allows, so that the refusal can be told in its form.
-            head_bytes: 64 * 1024,
-            idle_timeout: Duration::from_secs(300),
             write_stall: Duration::from_secs(60),
-            stream_stall: Duration::from_secs(600),
-            streams: 1000,
-            stream_buffer_bytes: 128 * 1024,
             keep_alive_interval: Duration::from_secs(20),
             keep_alive_timeout: Duration::from_secs(10),
             // Twice the largest body.
@@ -100,18 +94,16 @@ impl Default for ListenLimits {
     }
 }
 
-/// Where a request comes from. In the extensions of every request, beside `ConnectInfo<SocketAddr>`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The connection that a request came on. In the extensions of every request, beside `ConnectInfo<SocketAddr>`.
+#[derive(Debug, Clone)]
 pub struct Peer {
-    /// Address of the client.
-    pub address: SocketAddr,
     /// Whether the connection is encrypted.
     pub encrypted: bool,
-    /// Whether the client has shown a certificate that was accepted. Who it is says its token alone.
-    pub certificate: bool,
+    has_asked: Arc<AtomicBool>,
 }
 
 /// A port that is bound and not served yet; connections wait.
+#[derive(Debug)]
 pub struct Listener {
     name: &'static str,
     listener: TcpListener,
@@ -119,7 +111,6 @@ pub struct Listener {
     tls: Option<Tls>,
     protocols: Protocols,
     limits: Arc<ListenLimits>,
-    counters: Arc<ListenCounters>,
 }
 
 impl Listener {
@@ -145,7 +136,6 @@ impl Listener {
             tls,
             protocols,
             limits: Arc::new(limits),
-            counters: Arc::new(ListenCounters::new(name)),
         })
     }
 
@@ -155,94 +145,70 @@ impl Listener {
         self.address
     }
 
-    /// What became of the connections, for [`metrics_text`].
-    #[must_use]
-    pub fn counters(&self) -> Arc<ListenCounters> {
-        Arc::clone(&self.counters)
-    }
-
     /// Serves until [`Serving::stop`] or the supervisor's shutdown.
-    pub fn serve(self, supervisor: &Supervisor, router: Router) -> Serving {
+    pub fn serve(self, supervisor: &Supervisor, router: Router, metrics: &ApiMetrics) -> Serving {
         let (name, address) = (self.name, self.address);
+        let (drain, handle) = (self.limits.drain_timeout, Handle::new());
+        let reader = Reader {
+            limits: Arc::clone(&self.limits),
+            supervisor: supervisor.clone(),
+        };
+        let app = router
+            .layer(middleware::from_fn_with_state(reader, unread::read_on))
+            .into_make_service_with_connect_info::<SocketAddr>();
         let stop = supervisor.shutdown_token().child_token();
-        let task = self.accept(router, stop.clone());
+        let server = self.server(metrics, stop.clone()).handle(handle.clone());
+        let stopped = stop.clone();
+        let task = async move {
+            let served = server.serve(app);
+            tokio::pin!(served);
+            tokio::select! {
+                ended = &mut served => return ended,
+                () = stopped.cancelled() => handle.graceful_shutdown(Some(drain)),
+            }
+            let ended = served.await;
+            let left = handle.connection_count();
+            if left > 0 {
+                tracing::warn!(port = name, left, "connections are cut: their requests did not end");
+            }
+            ended
+        };
         let task = supervisor.spawn(format!("{name} port"), TaskPolicy::Essential, task);
         Serving { address, stop, task }
     }
 
-    async fn accept(self, router: Router, stop: CancellationToken) {
-        let mut connections = JoinSet::new();
-        loop {
-            tokio::select! {
-                () = stop.cancelled() => break,
-                Some(ended) = connections.join_next() => self.count_panic(&ended),
-                accepted = self.listener.accept() => match accepted {
-                    Ok((stream, peer)) if connections.len() < self.limits.connections => {
-                        self.counters.count(Outcome::Accepted);
-                        connections.spawn(self.connection(stream, peer, router.clone(), stop.clone()));
-                    }
-                    // Dropped, that is closed: whoever asks may come again.
-                    Ok(_) => self.counters.count(Outcome::Refused),
-                    Err(error) => {
-                        // Too many open files, mostly: without a pause this would spin.
-                        tracing::warn!(%error, port = self.name, "cannot accept");
-                        tokio::time::sleep(Duration::from_millis(100)).await;
-                    }
-                },
-            }
-        }
-        // From now on connecting is refused, so that clients turn to another process.
-        let Self {
-            name, listener, limits, ..
-        } = self;
-        drop(listener);
-        let drained = async { while connections.join_next().await.is_some() {} };
-        if tokio::time::timeout(limits.drain_timeout, drained).await.is_err() {
-            // What is left is aborted with the set.
-            tracing::warn!(
-                port = name,
-                left = connections.len(),
-                "connections are cut: their requests did not end"
-            );
-        }
-    }
-
-    fn connection(
-        &self,
-        stream: TcpStream,
-        peer: SocketAddr,
-        router: Router,
-        stop: CancellationToken,
-    ) -> impl Future<Output = ()> + Send + 'static {
-        let connection = Connection {
-            peer,
-            router,
-            protocols: self.protocols,
-            limits: Arc::clone(&self.limits),
-            counters: Arc::clone(&self.counters),
+    fn server(self, metrics: &ApiMetrics, stop: CancellationToken) -> Server<SocketAddr, Acceptor> {
+        let (limits, protocols) = (self.limits, self.protocols);
+        let acceptor = Acceptor {
+            tls: self
+                .tls
+                .map(|tls| RustlsAcceptor::new(tls.config(protocols)).handshake_timeout(limits.handshake_timeout)),
+            places: Arc::new(Semaphore::new(limits.connections)),
+            limits: Arc::clone(&limits),
+            metrics: metrics.connections(self.name),
             stop,
         };
-        // Of now: a certificate that is renewed holds for the next connection.
-        let tls = self.tls.as_ref().map(|tls| tls.config(self.protocols));
-        connection.run(stream, tls)
-    }
-
-    fn count_panic(&self, ended: &Result<(), JoinError>) {
-        if let Err(error) = ended
-            && error.is_panic()
-        {
-            self.counters.count(Outcome::Panicked);
-            tracing::error!(port = self.name, "a handler panicked");
+        let mut server = Server::from_listener(self.listener).acceptor(acceptor);
+        let builder = server.http_builder();
+        builder
+            .http1()
+            .timer(TokioTimer::new())
+            .header_read_timeout(limits.head_timeout)
+            .max_headers(MAX_HEADER_LINES)
+            .max_buf_size(MAX_HEAD_BYTES as usize);
+        // A head that does not end holds up the answer to a PING: the keep-alive is its limit of time.
+        builder
+            .http2()
+            .timer(TokioTimer::new())
+            .keep_alive_interval(limits.keep_alive_interval)
+            .keep_alive_timeout(limits.keep_alive_timeout)
+            .max_concurrent_streams(MAX_STREAMS)
+            .max_send_buf_size(STREAM_BUFFER_BYTES)
+            .max_header_list_size(MAX_HEAD_BYTES);
+        match protocols {
+            Protocols::Both => server,
+            Protocols::Http2 => server.http2_only(),
         }
-    }
-}
-
-impl std::fmt::Debug for Listener {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Listener")
-            .field("name", &self.name)
-            .field("address", &self.address)
-            .finish_non_exhaustive()
     }
 }
 

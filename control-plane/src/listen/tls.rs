@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use arc_swap::ArcSwap;
+use axum_server::tls_rustls::RustlsConfig;
 use blaze_domain::node_file::TlsSection;
 use blaze_runtime::Supervisor;
 use rustls::crypto::aws_lc_rs::default_provider;
@@ -24,25 +24,18 @@ pub fn install_crypto_provider() {
 }
 
 /// TLS of all ports. Clones share it.
-#[derive(Clone)]
+#[derive(Debug, Clone)]
 pub struct Tls {
-    shared: Arc<Shared>,
+    files: Arc<Files>,
+    both: RustlsConfig,
+    http2: RustlsConfig,
 }
 
-struct Shared {
-    files: Files,
-    now: ArcSwap<Configs>,
-}
-
+#[derive(Debug)]
 struct Files {
     certificate: PathBuf,
     key: PathBuf,
     client_authorities: Option<PathBuf>,
-}
-
-struct Configs {
-    both: Arc<ServerConfig>,
-    http2: Arc<ServerConfig>,
 }
 
 impl Tls {
@@ -59,9 +52,11 @@ impl Tls {
             key: key.clone(),
             client_authorities: section.client_ca_file.clone(),
         };
-        let now = ArcSwap::from_pointee(files.read()?);
+        let [both, http2] = files.read()?.map(RustlsConfig::from_config);
         Ok(Some(Self {
-            shared: Arc::new(Shared { files, now }),
+            files: Arc::new(files),
+            both,
+            http2,
         }))
     }
 
@@ -72,16 +67,16 @@ impl Tls {
     }
 
     pub(super) fn watch_every(&self, supervisor: &Supervisor, period: Duration) {
-        let files = &self.shared.files;
+        let files = &self.files;
         let paths = [&files.certificate, &files.key]
             .into_iter()
             .chain(&files.client_authorities);
-        let paths = paths.cloned().collect();
-        let shared = Arc::clone(&self.shared);
+        let (paths, tls) = (paths.cloned().collect(), self.clone());
         watch_files(supervisor, "certificates", paths, period, move || {
-            match shared.files.read() {
-                Ok(configs) => {
-                    shared.now.store(Arc::new(configs));
+            match tls.files.read() {
+                Ok([both, http2]) => {
+                    tls.both.reload_from_config(both);
+                    tls.http2.reload_from_config(http2);
                     Vec::new()
                 }
                 Err(faults) => faults,
@@ -89,28 +84,18 @@ impl Tls {
         });
     }
 
-    /// For the next connection.
-    pub(super) fn config(&self, protocols: Protocols) -> Arc<ServerConfig> {
-        let now = self.shared.now.load();
+    /// What the connections of a port are encrypted with, now and after each reload.
+    pub(super) fn config(self, protocols: Protocols) -> RustlsConfig {
         match protocols {
-            Protocols::Both => Arc::clone(&now.both),
-            Protocols::Http2 => Arc::clone(&now.http2),
+            Protocols::Both => self.both,
+            Protocols::Http2 => self.http2,
         }
     }
 }
 
-impl std::fmt::Debug for Tls {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let files = &self.shared.files;
-        f.debug_struct("Tls")
-            .field("certificate", &files.certificate)
-            .field("client_authorities", &files.client_authorities)
-            .finish_non_exhaustive()
-    }
-}
-
 impl Files {
-    fn read(&self) -> Result<Configs, Vec<String>> {
+    /// For [`Protocols::Both`], and for [`Protocols::Http2`].
+    fn read(&self) -> Result<[Arc<ServerConfig>; 2], Vec<String>> {
         let at = |name: &str| {
             let place = format!("control_plane.tls.{name}: ");
             move |fault: String| place.clone() + &fault
@@ -120,13 +105,13 @@ impl Files {
         let authorities = self.client_authorities.as_deref().map(authorities).transpose();
         match (chain, key, authorities.map_err(at("client_ca_file"))) {
             (Ok(chain), Ok(key), Ok(clients)) => {
-                build(chain, key, clients).map_err(|fault| vec![at("cert_file")(self.told(&fault))])
+                build(chain, key, clients).map_err(|fault| vec![at("cert_file")(self.mismatch(&fault))])
             }
             (chain, key, clients) => Err([chain.err(), key.err(), clients.err()].into_iter().flatten().collect()),
         }
     }
 
-    fn told(&self, fault: &str) -> String {
+    fn mismatch(&self, fault: &str) -> String {
         let (certificate, key) = (self.certificate.display(), self.key.display());
         format!("{certificate} and {key} do not go together: {fault}")
     }
@@ -136,7 +121,7 @@ fn build(
     chain: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
     clients: Option<Arc<dyn ClientCertVerifier>>,
-) -> Result<Configs, String> {
+) -> Result<[Arc<ServerConfig>; 2], String> {
     let builder = ServerConfig::builder_with_provider(Arc::new(default_provider()))
         .with_safe_default_protocol_versions()
         .map_err(|error| error.to_string())?;
@@ -150,10 +135,7 @@ fn build(
     let mut http2 = both.clone();
     both.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
     http2.alpn_protocols = vec![b"h2".to_vec()];
-    Ok(Configs {
-        both: Arc::new(both),
-        http2: Arc::new(http2),
-    })
+    Ok([both, http2].map(Arc::new))
 }
 
 /// Who may sign certificates of clients.

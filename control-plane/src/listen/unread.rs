@@ -2,97 +2,90 @@
 //!
 //! ```text
 //! request ─▶ handler ─▶ answer
-//!    body ──────┘ └ dropped before its end: read on for a while, and forgotten
+//!    body ──────┘ └ dropped before its end: read on for a while, and thrown away
 //! ```
 //!
-//! Who sends everything before it reads would lose the answer, a 413 above all: over HTTP/1.1 the connection would be
-//! reset, over HTTP/2 the stream. So what is left is read, up to a number of bytes and for a time; then the client loses
-//! its connection or stream after all.
+//! A client that sends everything before it reads would lose the answer, a 413 above all: over HTTP/1.1 the connection
+//! would be reset. So the rest is read, up to a number of bytes and for a time.
 
-use std::pin::Pin;
-use std::task::{Context, Poll};
-use std::time::Duration;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
+use axum::body::{Body, HttpBody as _};
+use axum::extract::{Request, State};
+use axum::http::header::EXPECT;
+use axum::middleware::Next;
+use axum::response::Response;
+use blaze_runtime::{Supervisor, TaskPolicy};
 use bytes::Bytes;
-use http_body_util::BodyExt as _;
-use hyper::body::{Body as HttpBody, Frame, Incoming, SizeHint};
-use hyper::header::{EXPECT, HeaderMap};
-use hyper::rt::Executor;
+use futures::stream;
+use http_body_util::{BodyExt as _, StreamBody};
 
-use super::connection::StreamTasks;
+use super::{ListenLimits, Peer};
 
-/// What is read of one body that nobody wants.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Patience {
-    pub(super) bytes: usize,
-    pub(super) time: Duration,
+/// What reads on.
+#[derive(Clone)]
+pub(super) struct Reader {
+    pub(super) limits: Arc<ListenLimits>,
+    pub(super) supervisor: Supervisor,
 }
 
-/// The body of a request. Dropped before its end, it is read on.
-pub(super) struct ReadOn {
-    /// `None` after its end.
-    body: Option<Incoming>,
+/// The first middleware of a request.
+pub(super) async fn read_on(State(reader): State<Reader>, request: Request, next: Next) -> Response {
+    if let Some(peer) = request.extensions().get::<Peer>() {
+        peer.has_asked.store(true, Ordering::Relaxed);
+    }
+    let waits = request.headers().contains_key(EXPECT);
+    next.run(request.map(|body| reader.read_on(body, waits))).await
+}
+
+impl Reader {
+    fn read_on(self, body: Body, waits: bool) -> Body {
+        if body.is_end_stream() {
+            return body;
+        }
+        let rest = Rest {
+            body,
+            waits,
+            reader: self,
+        };
+        Body::new(StreamBody::new(stream::unfold(rest, |mut rest| async {
+            rest.waits = false;
+            let frame = rest.body.frame().await;
+            if !matches!(frame, Some(Ok(_))) {
+                rest.body = Body::empty();
+            }
+            Some((frame?, rest))
+        })))
+    }
+}
+
+/// What is left of a body.
+struct Rest {
+    body: Body,
     /// `Expect: 100-continue`: the client waits to be asked for the body, and reading is asking.
     waits: bool,
-    patience: Patience,
-    tasks: StreamTasks,
+    reader: Reader,
 }
 
-impl ReadOn {
-    pub(super) fn new(body: Incoming, headers: &HeaderMap, patience: Patience, tasks: StreamTasks) -> Self {
-        Self {
-            body: Some(body),
-            waits: headers.contains_key(EXPECT),
-            patience,
-            tasks,
-        }
-    }
-}
-
-impl HttpBody for ReadOn {
-    type Data = Bytes;
-    type Error = hyper::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<Bytes>, hyper::Error>>> {
-        self.waits = false;
-        let Some(body) = &mut self.body else {
-            return Poll::Ready(None);
-        };
-        let frame = Pin::new(body).poll_frame(context);
-        if matches!(frame, Poll::Ready(None | Some(Err(_)))) {
-            self.body = None;
-        }
-        frame
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.as_ref().is_none_or(HttpBody::is_end_stream)
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body
-            .as_ref()
-            .map_or_else(|| SizeHint::with_exact(0), HttpBody::size_hint)
-    }
-}
-
-impl Drop for ReadOn {
+impl Drop for Rest {
     fn drop(&mut self) {
-        let Some(body) = self.body.take().filter(|body| !self.waits && !body.is_end_stream()) else {
+        let body = std::mem::take(&mut self.body);
+        if self.waits || body.is_end_stream() {
             return;
-        };
-        let Patience { bytes, time } = self.patience;
-        self.tasks.execute(async move {
+        }
+        let limits = Arc::clone(&self.reader.limits);
+        let reading = async move {
             // Over the time it is dropped, as it would have been at once.
-            let _ = tokio::time::timeout(time, read(body, bytes)).await;
-        });
+            let _ = tokio::time::timeout(limits.unread_time, read(body, limits.unread_bytes)).await;
+        };
+        self.reader
+            .supervisor
+            .spawn("rest of a body", TaskPolicy::MayEnd, reading);
     }
 }
 
-async fn read(mut body: Incoming, most: usize) {
+async fn read(mut body: Body, most: usize) {
     let mut left = most;
     while let Some(Ok(frame)) = body.frame().await {
         let bytes = frame.data_ref().map_or(0, Bytes::len);

@@ -3,7 +3,7 @@ use std::io::Cursor;
 use blaze_runtime::supervisor::Supervisor;
 
 use super::*;
-use crate::store::conformance::samples::{audit, commit, record, token};
+use crate::store::samples::{audit, commit, record, token};
 use crate::store::upkeep::RESTORE_RAISES_BY;
 use crate::store::{Archive as _, CommitLog as _, SqliteStore, TokenStore as _};
 

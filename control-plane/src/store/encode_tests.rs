@@ -2,7 +2,7 @@ use proptest::prelude::*;
 use serde_json::json;
 
 use super::*;
-use crate::store::conformance::samples::{commit, node, record};
+use crate::store::samples::{commit, node, record};
 
 /// Any JSON of some depth, with the keys that databases take for their own.
 fn value() -> impl Strategy<Value = Value> {

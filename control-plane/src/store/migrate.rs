@@ -278,51 +278,51 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
 }
 
 fn first() -> Migration {
-    const SQL: &str = include_str!("../../migrations/0001_first.sql");
+    const SQL: &str = include_str!("../../../migrations/0001_first.sql");
     let commands: [(&'static str, &'static str); 11] = [
         (
             "events",
-            include_str!("../../migrations/0001_first.mongodb/01_events.json"),
+            include_str!("../../../migrations/0001_first.mongodb/01_events.json"),
         ),
         (
             "versions",
-            include_str!("../../migrations/0001_first.mongodb/02_versions.json"),
+            include_str!("../../../migrations/0001_first.mongodb/02_versions.json"),
         ),
         (
             "documents",
-            include_str!("../../migrations/0001_first.mongodb/03_documents.json"),
+            include_str!("../../../migrations/0001_first.mongodb/03_documents.json"),
         ),
         (
             "audit",
-            include_str!("../../migrations/0001_first.mongodb/04_audit.json"),
+            include_str!("../../../migrations/0001_first.mongodb/04_audit.json"),
         ),
         (
             "idempotency",
-            include_str!("../../migrations/0001_first.mongodb/05_idempotency.json"),
+            include_str!("../../../migrations/0001_first.mongodb/05_idempotency.json"),
         ),
         (
             "tokens",
-            include_str!("../../migrations/0001_first.mongodb/06_tokens.json"),
+            include_str!("../../../migrations/0001_first.mongodb/06_tokens.json"),
         ),
         (
             "versions-index",
-            include_str!("../../migrations/0001_first.mongodb/07_versions_index.json"),
+            include_str!("../../../migrations/0001_first.mongodb/07_versions_index.json"),
         ),
         (
             "audit-index",
-            include_str!("../../migrations/0001_first.mongodb/08_audit_index.json"),
+            include_str!("../../../migrations/0001_first.mongodb/08_audit_index.json"),
         ),
         (
             "idempotency-index",
-            include_str!("../../migrations/0001_first.mongodb/09_idempotency_index.json"),
+            include_str!("../../../migrations/0001_first.mongodb/09_idempotency_index.json"),
         ),
         (
             "tokens-index",
-            include_str!("../../migrations/0001_first.mongodb/10_tokens_index.json"),
+            include_str!("../../../migrations/0001_first.mongodb/10_tokens_index.json"),
         ),
         (
             "events-index",
-            include_str!("../../migrations/0001_first.mongodb/11_events_index.json"),
+            include_str!("../../../migrations/0001_first.mongodb/11_events_index.json"),
         ),
     ];
     Migration {

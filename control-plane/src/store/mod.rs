@@ -10,8 +10,6 @@
 //! the store or nothing of it is. Nobody gives revisions out: who inserts revision n + 1 first has it.
 
 pub mod backup;
-#[cfg(any(test, feature = "conformance"))]
-pub mod conformance;
 pub(crate) mod encode;
 pub mod migrate;
 #[cfg(feature = "mongodb")]
@@ -19,6 +17,9 @@ pub mod mongo;
 mod port;
 pub(crate) mod retain;
 pub(crate) mod rows;
+#[cfg(test)]
+#[path = "../../../conformance/src/store/samples.rs"]
+pub(crate) mod samples;
 pub mod sqlite;
 pub mod upkeep;
 

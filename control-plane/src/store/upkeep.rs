@@ -125,8 +125,9 @@ pub(crate) fn rewritten(key: &str, text: &str, make: Rewriter<'_>) -> Result<Opt
     }
 }
 
-/// Now, for people.
-pub(crate) fn now() -> Timestamp {
+/// The time of day, to milliseconds; before 1970 it is 1970.
+#[must_use]
+pub fn now() -> Timestamp {
     let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     let millis = since.map_or(0, |since| i64::try_from(since.as_millis()).unwrap_or(i64::MAX));
     Timestamp::from_millis(millis)

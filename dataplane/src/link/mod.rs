@@ -32,7 +32,6 @@ pub mod transport;
 mod wire;
 
 #[cfg(test)]
-#[path = "../../tests/support/flights.rs"]
 mod flights;
 #[cfg(test)]
 pub(crate) mod sim;

@@ -41,7 +41,8 @@ impl LinkProcess {
             ways,
             changes: shape.changes(),
         };
-        let mut child = std::process::Command::new(binary("blaze-wan")?)
+        let mut child = std::process::Command::new(binary("blaze-testbed")?)
+            .arg("wan")
             .args(["--a", a.0, "--a-device", a.1, "--a-mtu", &link.forward.mtu.to_string()])
             .args(["--b", b.0, "--b-device", b.1, "--b-mtu", &link.back.mtu.to_string()])
             .args(["--seed", &link.seed.to_string()])

@@ -157,7 +157,7 @@ pub fn check_rights() -> anyhow::Result<()> {
     let user = run("id -u")?;
     anyhow::ensure!(
         user.trim() == "0",
-        "this test makes network namespaces and must be run by root: `sudo -E env PATH=\"$PATH\" cargo test --workspace --test NAME`"
+        "this test makes network namespaces and must be run by root: `sudo -E env PATH=\"$PATH\" cargo nextest run -E 'binary(net)'`"
     );
     for tool in ["ip", "nft"] {
         anyhow::ensure!(

@@ -135,7 +135,7 @@ impl Running {
             .iter()
             .for_each(|stream| option("--topic", words(stream)));
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-        let process = Process::start("blaze-probe", &arguments, Some(&host.namespace))?;
+        let process = Process::tool("probe", &arguments, Some(&host.namespace))?;
         let ready = format!("ready node={} ", service.flow);
         wait::until(
             &format!("{} is ready", service.name),

@@ -1,5 +1,4 @@
-//! Against the server that the client library simulates. The test polls in place of the thread, so that it decides what happens
-//! between polling and handing out.
+//! Against the server that the client library simulates. The test hands out in place of the thread, one record at a time.
 
 use std::future::Future as _;
 use std::pin::pin;
@@ -9,13 +8,12 @@ use std::time::Instant;
 use blaze_domain::TopicName;
 use bytes::Bytes;
 use rdkafka::ClientConfig;
-use rdkafka::message::{BorrowedMessage, Message as _};
 use rdkafka::mocking::MockCluster;
 use rdkafka::producer::{BaseProducer, BaseRecord, DefaultProducerContext, Producer as _};
 
 use super::*;
 use crate::kafka::directory::Marks;
-use crate::kafka::settings::tests::section_at;
+use crate::kafka::settings::tests::shared_at;
 use crate::port::{Content, Place, SubscribeOptions, Subscription, subscription};
 
 const TOPIC: &str = "fog.imu.data";
@@ -26,7 +24,6 @@ const INFO: TopicInfo = TopicInfo {
 
 struct Bench {
     consumer: Consumer,
-    client: Arc<Client>,
     source: Source,
     server: MockCluster<'static, DefaultProducerContext>,
 }
@@ -64,14 +61,10 @@ impl Bench {
             producer.send(record).map_err(|(error, _)| error).unwrap();
         }
         producer.flush(Duration::from_secs(10)).unwrap();
-        let settings = Settings::new(&section_at(&bootstrap, "{}")).unwrap();
-        let clock = Arc::new(Mutex::new(BrokerClock::new(Instant::now())));
-        let consumer = Consumer::new(false, "fog", &settings, &clock, &Arc::default()).unwrap();
-        let client = consumer.client.lock().clone().unwrap();
+        let consumer = Consumer::new(false, "fog", &shared_at(&bootstrap)).unwrap();
         let channel = ChannelName::from(&"imu/data".parse::<TopicName>().unwrap());
         Self {
             consumer,
-            client,
             source: Source {
                 channel,
                 topic: TOPIC.into(),
@@ -92,53 +85,30 @@ impl Bench {
         }
     }
 
-    /// Polls a record without handing it out.
-    fn poll(&self) -> BorrowedMessage<'_> {
-        let until = Instant::now() + Duration::from_secs(20);
-        while Instant::now() < until {
-            match self.client.poll(POLL) {
-                Some(Ok(message)) => return message,
-                other => self.consumer.hand_out(other),
-            }
-        }
-        panic!("nothing came");
-    }
-
     /// Hands records out until a reader has got the one at `last`.
     fn hand_out_until(&self, reader: &mut Offsets, last: i64) {
+        let client = self.consumer.client().unwrap();
+        let mut stream = client.stream();
+        let mut context = Context::from_waker(Waker::noop());
+        let until = Instant::now() + Duration::from_secs(20);
         while reader.take().last() != Some(&last) {
-            let message = self.poll();
-            self.consumer.hand_out(Some(Ok(message)));
+            assert!(Instant::now() < until, "{:?}", reader.got);
+            let _ = self.consumer.hand_out(&client, &mut stream, &mut context, 1);
         }
     }
-}
 
-#[test]
-fn a_record_that_waited_while_a_reader_came_does_not_hide_what_is_read_again() {
-    let bench = Bench::new(6);
-    let mut first = bench.add(0, Join::Following);
-    bench.hand_out_until(&mut first, 2);
-    let waiting = bench.poll();
-    assert_eq!(waiting.offset(), 3);
-    let mut second = bench.add(0, Join::Rewinding);
-    bench.consumer.hand_out(Some(Ok(waiting)));
-    bench.hand_out_until(&mut second, 5);
-    assert_eq!(second.take(), [0, 1, 2, 3, 4, 5]);
-    assert_eq!(first.take(), [0, 1, 2, 3, 4, 5]);
-}
+    fn next(&self) -> i64 {
+        self.consumer.state.lock().topics[TOPIC].partitions[0].next
+    }
 
-#[test]
-fn a_record_that_was_polled_after_a_reader_came_is_not_lost() {
-    let bench = Bench::new(6);
-    let mut first = bench.add(0, Join::Following);
-    bench.hand_out_until(&mut first, 3);
-    let mut second = bench.add(1, Join::Rewinding);
-    let fresh = bench.poll();
-    assert_eq!(fresh.offset(), 1, "the client reads from there already");
-    bench.consumer.hand_out(Some(Ok(fresh)));
-    bench.hand_out_until(&mut second, 5);
-    assert_eq!(second.take(), [1, 2, 3, 4, 5]);
-    assert_eq!(first.take(), [0, 1, 2, 3, 4, 5]);
+    /// As if the server had said so of the topic.
+    fn follow(&self, now: Instant, marks: Marks, lost_position: bool) {
+        let info = TopicInfo {
+            uuid: self.consumer.state.lock().topics[TOPIC].uuid.clone(),
+            ..INFO
+        };
+        self.consumer.follow(now, TOPIC, (&info, &[marks]), lost_position);
+    }
 }
 
 #[test]
@@ -166,10 +136,9 @@ fn readers_that_come_while_records_flow_get_each_once_and_in_order() {
     let bench = Bench::new(40);
     let mut readers = vec![bench.add(0, Join::Following)];
     for at in [7, 19, 31] {
+        // What the client has fetched beyond lies in its queue.
         bench.hand_out_until(&mut readers[0], at);
-        let waiting = bench.poll();
         readers.push(bench.add(at / 2, Join::Rewinding));
-        bench.consumer.hand_out(Some(Ok(waiting)));
     }
     for (reader, start) in readers.iter_mut().zip([0, 3, 9, 15]) {
         bench.hand_out_until(reader, 39);
@@ -183,18 +152,10 @@ fn readers_that_come_while_records_flow_get_each_once_and_in_order() {
 
 #[test]
 fn a_client_that_is_made_anew_reads_on_where_the_old_one_stood() {
-    let mut bench = Bench::new(20);
+    let bench = Bench::new(20);
     let mut reader = bench.add(0, Join::Following);
     bench.hand_out_until(&mut reader, 6);
-    // It was polled and not handed out.
-    let waiting = bench
-        .client
-        .poll(Duration::from_secs(10))
-        .map(|polled| polled.map(|message| message.detach()));
-    assert!(matches!(&waiting, Some(Ok(message)) if message.offset() == 7));
-    let settings = Settings::new(&section_at(&bench.server.bootstrap_servers(), "{}")).unwrap();
-    bench.consumer.remake(&settings).unwrap();
-    bench.client = bench.consumer.client.lock().clone().unwrap();
+    bench.consumer.remake().unwrap();
     bench.hand_out_until(&mut reader, 19);
     assert!(reader.take().iter().copied().eq(0..20), "{:?}", reader.got);
 }
@@ -205,18 +166,10 @@ fn an_end_before_what_was_read_is_not_believed_at_once() {
     let bench = Bench::new(20);
     let mut reader = bench.add(0, Join::Following);
     bench.hand_out_until(&mut reader, 9);
-    let next = || bench.consumer.state.lock().topics[TOPIC].partitions[0].next;
-    let info = TopicInfo {
-        uuid: bench.consumer.state.lock().topics[TOPIC].uuid.clone(),
-        ..INFO
-    };
     let begun = Instant::now();
     let check = |after_ms: u64, high: i64| {
-        let now = begun + Duration::from_millis(after_ms);
-        bench
-            .consumer
-            .check_positions(now, TOPIC, &info, &[Marks { low: 0, high }]);
-        (next(), bench.consumer.take_lost_position())
+        bench.follow(begun + Duration::from_millis(after_ms), Marks { low: 0, high }, true);
+        (bench.next(), bench.consumer.take_lost_position())
     };
     assert_eq!(check(0, 7), (10, true), "it is asked again");
     assert_eq!(check(2_900, 7), (10, true));
@@ -231,17 +184,10 @@ fn a_beginning_behind_what_was_read_is_not_believed_at_once() {
     let bench = Bench::new(20);
     let mut reader = bench.add(0, Join::Following);
     bench.hand_out_until(&mut reader, 9);
-    let next = || bench.consumer.state.lock().topics[TOPIC].partitions[0].next;
-    let info = TopicInfo {
-        uuid: bench.consumer.state.lock().topics[TOPIC].uuid.clone(),
-        ..INFO
-    };
     let begun = Instant::now();
     let check = |after_ms: u64, low: i64| {
-        let now = begun + Duration::from_millis(after_ms);
-        let marks = [Marks { low, high: 20 }];
-        bench.consumer.check_positions(now, TOPIC, &info, &marks);
-        (next(), bench.consumer.take_lost_position())
+        bench.follow(begun + Duration::from_millis(after_ms), Marks { low, high: 20 }, true);
+        (bench.next(), bench.consumer.take_lost_position())
     };
     assert_eq!(check(0, 20), (10, true), "it is asked again");
     assert_eq!(check(500, 0), (10, false));
@@ -254,51 +200,47 @@ fn a_topic_that_the_client_did_not_take_is_read_on_where_it_stood() {
     let bench = Bench::new(20);
     let mut reader = bench.add(0, Join::Following);
     bench.hand_out_until(&mut reader, 9);
-    let marks = [Marks { low: 0, high: 20 }];
-    let resume = || {
-        let info = TopicInfo {
-            uuid: bench.consumer.state.lock().topics[TOPIC].uuid.clone(),
-            ..INFO
-        };
-        bench.consumer.resume(TOPIC, &info, &marks, || true);
-    };
+    let resume = || bench.follow(Instant::now(), Marks { low: 0, high: 20 }, false);
     // As after an attempt that failed.
+    let client = bench.consumer.client().unwrap();
     if let Some(topic) = bench.consumer.state.lock().topics.get_mut(TOPIC) {
-        topic.unassign(&bench.client);
+        topic.unassign(&client);
     }
     resume();
     bench.hand_out_until(&mut reader, 14);
     assert!(reader.take().iter().copied().eq(0..15), "{:?}", reader.got);
+    bench.consumer.shared.gate.set_stood_back(true);
     bench.consumer.stand_back();
     resume();
-    let next = bench.consumer.state.lock().topics[TOPIC].partitions[0].next;
-    assert_eq!(next, 20, "what was written meanwhile was another's");
+    assert_eq!(bench.next(), 15, "the scope is another's");
+    bench.consumer.shared.gate.set_stood_back(false);
+    resume();
+    assert_eq!(bench.next(), 20, "what was written meanwhile was another's");
 }
 
 #[test]
 fn a_reader_that_comes_while_the_client_is_made_anew_reads_with_the_new_one() {
-    let mut bench = Bench::new(10);
+    let bench = Bench::new(10);
     let (sender, subscription) = subscription(SubscribeOptions::default());
     let mut reader = Offsets {
         subscription,
         got: Vec::new(),
     };
-    let settings = Settings::new(&section_at(&bench.server.bootstrap_servers(), "{}")).unwrap();
     // It waits for an answer about its topic meanwhile.
     bench.server.broker_down(1).unwrap();
+    let client = Arc::downgrade(&bench.consumer.client().unwrap());
     std::thread::scope(|scope| {
         let add = scope.spawn(|| {
             let join = Join::Following;
             bench.consumer.add(&bench.source, &INFO, vec![0], sender, join)
         });
-        while Arc::strong_count(&bench.client) < 3 && !add.is_finished() {
+        while client.strong_count() < 2 && !add.is_finished() {
             std::thread::yield_now();
         }
-        bench.consumer.remake(&settings).unwrap();
+        bench.consumer.remake().unwrap();
         bench.server.broker_up(1).unwrap();
         add.join().unwrap().unwrap();
     });
-    bench.client = bench.consumer.client.lock().clone().unwrap();
     bench.hand_out_until(&mut reader, 9);
     assert!(reader.take().iter().copied().eq(0..10), "{:?}", reader.got);
 }

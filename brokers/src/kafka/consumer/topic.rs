@@ -1,4 +1,4 @@
-//! One topic that is read: where it stands, and who reads it.
+//! One topic that is read: where it stands, and its readers.
 
 use std::time::{Duration, Instant};
 
@@ -7,10 +7,17 @@ use rdkafka::consumer::Consumer as _;
 use rdkafka::error::KafkaError;
 use rdkafka::{Offset, TopicPartitionList};
 
-use super::{Client, Join, Source};
+use super::{Client, Source};
 use crate::kafka::directory::{Marks, TopicInfo};
 use crate::kafka::identity::TopicUuid;
 use crate::port::SubscriptionSender;
+
+/// How long a reader may stand still while records wait for it.
+const PATIENCE: Duration = Duration::from_secs(1);
+const MOST_PATIENCE: Duration = Duration::from_secs(60);
+/// A beginning or an end that does not hold what is to be read next is believed after this time: a server that stood still for a moment,
+/// and begins to lead the partition again, names others first. To believe them would be to read the last records twice, or never.
+const BELIEVED: Duration = Duration::from_secs(3);
 
 pub(super) struct Partition {
     /// Offset of the next record.
@@ -18,7 +25,7 @@ pub(super) struct Partition {
     /// Writer of its bare records, where the topic has an identity.
     pub(super) bare_writer: Option<WriterId>,
     /// Since when the server has named a beginning or an end that does not hold `next`.
-    pub(super) doubted_since: Option<Instant>,
+    doubted_since: Option<Instant>,
 }
 
 pub(super) struct Reader {
@@ -30,45 +37,82 @@ pub(super) struct Reader {
 pub(super) struct TopicState {
     pub(super) source: Source,
     pub(super) uuid: Option<TopicUuid>,
+    /// None while the topic is not there: all that it will hold came after its readers, so it is read from its beginning.
     pub(super) partitions: Vec<Partition>,
     pub(super) readers: Vec<Reader>,
     /// Whether the client reads it now.
     pub(super) assigned: bool,
-    /// It belongs to another flow: what is written meanwhile is not for its readers.
+    /// It belongs to another flow: its readers do not get what is written meanwhile.
     pub(super) stood_back: bool,
-    /// It was not there when its readers came: whatever it will hold came after them, so it is read from its beginning.
-    pub(super) awaited: bool,
     /// It was behind the server's end when it was last looked at.
-    pub(super) behind: Option<Behind>,
+    behind: Option<Behind>,
 }
 
 /// Records wait on the server and are not read.
-pub(super) struct Behind {
+struct Behind {
     /// Where the partitions stood.
-    pub(super) positions: Vec<i64>,
+    positions: Vec<i64>,
     /// Since when.
-    pub(super) since: Instant,
+    since: Instant,
     /// How long that may last: longer each time that asking again has changed nothing, because what waits may be a mark of
     /// a transaction, which no reader gets.
-    pub(super) patience: Duration,
+    patience: Duration,
 }
 
-/// How long a reader may stand still while records wait for it.
-const PATIENCE: Duration = Duration::from_secs(1);
-const MOST_PATIENCE: Duration = Duration::from_secs(60);
-
 impl TopicState {
-    pub(super) fn take_in(&mut self, sender: SubscriptionSender, starts: Vec<i64>, join: Join<'_>) {
-        if let Join::AfterKept(kept) = join {
-            sender.send_kept(kept());
+    pub(super) fn new(source: &Source) -> Self {
+        Self {
+            source: source.clone(),
+            uuid: None,
+            partitions: Vec::new(),
+            readers: Vec::new(),
+            assigned: false,
+            stood_back: false,
+            behind: None,
         }
-        self.readers.push(Reader { sender, starts });
+    }
+
+    /// Whether the server does not have it yet.
+    pub(super) fn is_awaited(&self) -> bool {
+        self.partitions.is_empty()
+    }
+
+    pub(super) fn positions(&self) -> Vec<i64> {
+        self.partitions.iter().map(|at| at.next).collect()
+    }
+
+    /// Whether records at or behind these offsets have been read.
+    pub(super) fn is_beyond(&self, starts: &[i64]) -> bool {
+        self.partitions.iter().zip(starts).any(|(at, start)| at.next > *start)
+    }
+
+    /// The server has it: further partitions than `starts` are read from their beginning.
+    pub(super) fn begin_at(&mut self, starts: &[i64], info: &TopicInfo, layer: &str) {
+        self.grow(info.partitions, layer);
+        for (partition, start) in self.partitions.iter_mut().zip(starts) {
+            partition.next = *start;
+        }
+        self.identify(info.uuid.clone(), layer);
+    }
+
+    /// It is to be read again. A topic that this flow stood back from begins at its end, because what was written meanwhile
+    /// was another's; one that the client did not take, where it stood.
+    pub(super) fn begin(&mut self, info: &TopicInfo, marks: &[Marks], layer: &str) {
+        let ends: Vec<i64> = marks.iter().map(|mark| mark.high).collect();
+        if !std::mem::take(&mut self.stood_back) || self.is_awaited() {
+            return self.begin_at(&[], info, layer);
+        }
+        self.begin_at(&ends, info, layer);
+        for reader in &mut self.readers {
+            reader.starts.clone_from(&ends);
+        }
     }
 
     /// A reader that comes begins before what is read next: it is read again from there, and not given to those that had it.
-    /// Returns whether that is so.
-    pub(super) fn rewind(&mut self, starts: &[i64], client: &Client) -> bool {
-        let mut moved = false;
+    pub(super) fn rewind(&mut self, starts: &[i64], client: &Client) {
+        if !self.is_beyond(starts) {
+            return;
+        }
         for (number, (partition, start)) in self.partitions.iter_mut().zip(starts).enumerate() {
             if *start >= partition.next {
                 continue;
@@ -80,12 +124,10 @@ impl TopicState {
                 reader.starts[number] = reader.starts[number].max(partition.next);
             }
             partition.next = *start;
-            moved = true;
         }
-        if moved && self.assigned {
+        if self.assigned {
             self.reassign(client);
         }
-        moved
     }
 
     pub(super) fn identify(&mut self, uuid: Option<TopicUuid>, layer: &str) {
@@ -114,7 +156,7 @@ impl TopicState {
             self.behind = None;
             return;
         }
-        let positions: Vec<i64> = self.partitions.iter().map(|at| at.next).collect();
+        let positions = self.positions();
         match &mut self.behind {
             Some(behind) if behind.positions == positions => {
                 if now.saturating_duration_since(behind.since) < behind.patience {
@@ -135,15 +177,29 @@ impl TopicState {
         }
     }
 
-    /// What was waited for is there: it is read from its beginning.
-    pub(super) fn came(&mut self, info: &TopicInfo, layer: &str, client: &Client) {
-        self.identify(info.uuid.clone(), layer);
-        self.grow(info.partitions, layer);
-        self.awaited = false;
-        if let Err(error) = self.assign(client) {
-            tracing::warn!(topic = %self.source.topic, %error, "the topic cannot be read yet");
-            self.awaited = true;
+    /// Moves positions that the server does not have to what is nearest. Returns whether that is not sure yet.
+    pub(super) fn compare(&mut self, marks: &[Marks], now: Instant, client: &Client) -> bool {
+        let mut in_doubt = false;
+        for (number, (partition, mark)) in self.partitions.iter_mut().zip(marks).enumerate() {
+            if mark.holds(partition.next) {
+                partition.doubted_since = None;
+                continue;
+            }
+            let since = *partition.doubted_since.get_or_insert(now);
+            if now.saturating_duration_since(since) < BELIEVED {
+                in_doubt = true;
+                continue;
+            }
+            let at = partition.next.clamp(mark.low, mark.high.max(mark.low));
+            tracing::warn!(
+                topic = %self.source.topic, partition = number, position = partition.next, moved_to = at,
+                "the server no longer has what was to be read next"
+            );
+            partition.next = at;
         }
+        // Also where nothing moved: the client stops reading a partition whose position it could not find for a moment.
+        self.reassign(client);
+        in_doubt
     }
 
     pub(super) fn grow(&mut self, partitions: usize, layer: &str) {
@@ -164,10 +220,14 @@ impl TopicState {
         Ok(list)
     }
 
-    pub(super) fn assign(&mut self, client: &Client) -> Result<(), KafkaError> {
-        client.incremental_assign(&self.list()?)?;
-        self.assigned = true;
-        Ok(())
+    /// Reads it from now on. Returns whether the client takes that; else it is tried again with the next look.
+    pub(super) fn assign(&mut self, client: &Client) -> bool {
+        let done = self.list().and_then(|list| client.incremental_assign(&list));
+        if let Err(error) = &done {
+            tracing::warn!(topic = %self.source.topic, %error, "the topic cannot be read yet");
+        }
+        self.assigned = done.is_ok();
+        self.assigned
     }
 
     pub(super) fn unassign(&mut self, client: &Client) {
@@ -190,8 +250,6 @@ impl TopicState {
     /// Reads on at the positions of now.
     pub(super) fn reassign(&mut self, client: &Client) {
         self.unassign(client);
-        if let Err(error) = self.assign(client) {
-            tracing::warn!(topic = %self.source.topic, %error, "the topic cannot be read");
-        }
+        self.assign(client);
     }
 }

@@ -5,7 +5,6 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use blaze_domain::DropReason;
-use parking_lot::Mutex;
 use rdkafka::ClientContext;
 use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
@@ -13,62 +12,40 @@ use rdkafka::message::{DeliveryResult, Message as _, Timestamp};
 use rdkafka::producer::{NoCustomPartitioner, ProducerContext};
 use tokio::sync::{Notify, oneshot};
 
-use crate::kafka::bell::Bell;
-use crate::kafka::clock::BrokerClock;
-use crate::kafka::context::{self, LastError};
+use super::CROWD;
+use crate::kafka::context;
+use crate::kafka::inner::Shared;
 use crate::kafka::topics::Topic;
+use crate::kafka::waker::ThreadWaker;
 use crate::outbox::{Fate, Receipt};
 
 /// What comes back from librdkafka with the acknowledgement.
-pub(in crate::kafka) enum Delivery {
+pub(in crate::kafka) struct Delivery {
+    pub(in crate::kafka) topic: Arc<Topic>,
+    /// Bytes that it counts for while it is in flight.
+    pub(in crate::kafka) bytes: usize,
+    pub(in crate::kafka) sent: Instant,
+    pub(in crate::kafka) receipt: Sent,
+}
+
+/// The party that learns what became of a record.
+pub(in crate::kafka) enum Sent {
     /// A message of a publisher.
-    Message {
-        receipt: Receipt,
-        topic: Arc<Topic>,
-        bytes: usize,
-        sent: Instant,
-        /// Ends with the last message of the batch.
-        batch: Arc<Batch>,
-    },
-    /// A value of a key; told what became of it.
-    Keyed {
-        done: oneshot::Sender<Fate>,
-        topic: Arc<Topic>,
-        sent: Instant,
-        batch: Arc<Batch>,
-    },
-}
-
-/// Messages that were handed over together.
-pub(in crate::kafka) struct Batch(Arc<WriteContext>);
-
-impl Batch {
-    pub(in crate::kafka) fn begin(context: &Arc<WriteContext>) -> Arc<Self> {
-        context.batches.fetch_add(1, Ordering::AcqRel);
-        context.bell.ring();
-        Arc::new(Self(Arc::clone(context)))
-    }
-}
-
-impl Drop for Batch {
-    fn drop(&mut self) {
-        self.0.batches.fetch_sub(1, Ordering::AcqRel);
-        self.0.room.notify_one();
-    }
+    Message(Receipt),
+    /// A value of a key.
+    Keyed(oneshot::Sender<Fate>),
 }
 
 /// What the client calls back.
 pub(in crate::kafka) struct WriteContext {
     /// Bytes that are with librdkafka and not acknowledged.
     pub(in crate::kafka) in_flight: AtomicUsize,
-    /// Batches of which something is.
-    pub(in crate::kafka) batches: AtomicUsize,
     /// Wakes the poll thread.
-    pub(in crate::kafka) bell: Bell,
+    pub(in crate::kafka) waker: ThreadWaker,
+    /// Wakes the feeder.
     pub(in crate::kafka) room: Notify,
     pub(in crate::kafka) fatal: AtomicBool,
-    pub(in crate::kafka) clock: Arc<Mutex<BrokerClock>>,
-    pub(in crate::kafka) last_error: Arc<LastError>,
+    pub(in crate::kafka) shared: Arc<Shared>,
 }
 
 /// One client calls back, but its successor goes on with the same numbers.
@@ -83,7 +60,7 @@ impl ClientContext for SharedContext {
         if error.rdkafka_error_code() == Some(RDKafkaErrorCode::Fatal) {
             self.0.fatal.store(true, Ordering::Release);
         }
-        self.0.last_error.note(format!("{error}: {reason}"));
+        self.0.shared.last_error.note(format!("{error}: {reason}"));
     }
 }
 
@@ -99,48 +76,43 @@ impl ProducerContext<NoCustomPartitioner> for SharedContext {
             },
             Err(_) => None,
         };
-        let sent = match *delivery {
-            Delivery::Message {
-                receipt,
-                topic,
-                bytes,
-                sent,
-                batch,
-            } => {
-                let fate = match result {
-                    Ok(_) => Fate::Delivered,
-                    Err((error, _)) => self.0.failed(error, &topic),
-                };
-                receipt.settle(fate);
-                topic.note_in_flight(false);
-                self.0.in_flight.fetch_sub(bytes, Ordering::AcqRel);
-                // The feeder may come when the room is counted.
-                drop(batch);
-                sent
-            }
-            Delivery::Keyed {
-                done,
-                topic,
-                sent,
-                batch: _batch,
-            } => {
-                let fate = match result {
-                    Ok(_) => Fate::Delivered,
-                    Err((error, _)) => self.0.failed(error, &topic),
-                };
-                // Nobody waits any more when the broker is closed.
-                let _ = done.send(fate);
-                sent
-            }
-        };
+        let sent = delivery.sent;
+        self.0.settle(*delivery, result.as_ref().err().map(|(error, _)| error));
         if let Some(appended) = appended {
-            self.0.clock.lock().acknowledged(sent, now, appended);
+            self.0.shared.clock.lock().acknowledged(sent, now, appended);
         }
     }
 }
 
 impl WriteContext {
-    pub(in crate::kafka) fn failed(&self, error: &KafkaError, topic: &Topic) -> Fate {
+    /// A record goes to the client.
+    pub(in crate::kafka) fn begin(&self, delivery: &Delivery) {
+        delivery.topic.note_in_flight(true);
+        if self.in_flight.fetch_add(delivery.bytes, Ordering::AcqRel) == 0 {
+            self.waker.wake();
+        }
+    }
+
+    /// A record is no longer with the client: it was delivered, or there is an error.
+    pub(in crate::kafka) fn settle(&self, delivery: Delivery, error: Option<&KafkaError>) {
+        let Delivery {
+            topic, bytes, receipt, ..
+        } = delivery;
+        let fate = error.map_or(Fate::Delivered, |error| self.failed(error, &topic));
+        match receipt {
+            Sent::Message(receipt) => receipt.settle(fate),
+            // Without a receiver the broker is closed.
+            Sent::Keyed(done) => drop(done.send(fate)),
+        }
+        topic.note_in_flight(false);
+        let before = self.in_flight.fetch_sub(bytes, Ordering::AcqRel);
+        let after = before.saturating_sub(bytes);
+        if after == 0 || (before >= CROWD && after < CROWD) || topic.is_limited() {
+            self.room.notify_one();
+        }
+    }
+
+    fn failed(&self, error: &KafkaError, topic: &Topic) -> Fate {
         let code = error.rdkafka_error_code();
         if matches!(
             code,

@@ -6,7 +6,7 @@ use std::time::Instant;
 use bytes::Bytes;
 use rdkafka::message::OwnedHeaders;
 
-use super::delivery::{Batch, Delivery};
+use super::delivery::{Delivery, Sent};
 use crate::kafka::record;
 use crate::kafka::topics::Topic;
 use crate::outbox::{Body, Waiting};
@@ -32,8 +32,6 @@ pub(in crate::kafka) struct Target {
 
 /// A message as the client takes it.
 pub(super) struct Ready {
-    pub(super) topic: Arc<Topic>,
-    pub(super) bytes: usize,
     pub(super) payload: Bytes,
     pub(super) key: Option<String>,
     pub(super) partition: Option<i32>,
@@ -42,7 +40,7 @@ pub(super) struct Ready {
 }
 
 impl Ready {
-    pub(super) fn new(waiting: Waiting<Target>, batch: &Arc<Batch>, scratch: &mut String) -> Self {
+    pub(super) fn new(waiting: Waiting<Target>, scratch: &mut String) -> Self {
         let (bytes, target, sent) = (waiting.size(), Arc::clone(&waiting.to), Instant::now());
         let (payload, key, partition, headers);
         match &waiting.body {
@@ -68,17 +66,13 @@ impl Ready {
                 payload = bytes.clone();
             }
         }
-        let topic = Arc::clone(&target.topic);
-        let delivery = Box::new(Delivery::Message {
-            receipt: waiting.into_receipt(),
-            topic: Arc::clone(&topic),
+        let delivery = Box::new(Delivery {
+            receipt: Sent::Message(waiting.into_receipt()),
+            topic: Arc::clone(&target.topic),
             bytes,
             sent,
-            batch: Arc::clone(batch),
         });
         Self {
-            topic,
-            bytes,
             payload,
             key,
             partition,

@@ -1,7 +1,7 @@
 //! Without a server: nothing that is handed over is ever acknowledged.
 
 use super::*;
-use crate::kafka::settings::tests::section_at;
+use crate::kafka::settings::tests::shared_at;
 use crate::kafka::topics::Topics;
 use crate::outbox::Body;
 use crate::port::PublishOutcome;
@@ -11,15 +11,12 @@ use crate::port::PublishOutcome;
 fn what_is_being_handed_over_is_not_drained() {
     const MESSAGES: u64 = 200;
     for _ in 0..20 {
-        let settings = Settings::new(&section_at("127.0.0.1:9", "{}")).unwrap();
-        let gate = Arc::<Gate>::default();
-        gate.set_up(true);
-        let clock = Arc::new(Mutex::new(BrokerClock::new(Instant::now())));
-        let producer = Producer::new(Lot::default(), &settings, &gate, &clock, &Arc::default()).unwrap();
+        let producer = Producer::new(Lot::default(), &shared_at("127.0.0.1:9")).unwrap();
+        producer.shared().gate.set_up(true);
         let topics = Topics::default();
         let name: Arc<str> = "fog.imu.data".into();
         let (topic, _) = topics.of(&name, false);
-        topics.note(&name, 1);
+        topics.note(&std::collections::HashMap::from([(name.to_string(), 1)]), false);
         let lane = producer.lane(Target {
             topic,
             keying: Keying::Writer { depth: 0 },

@@ -115,7 +115,7 @@ impl Gate {
                 // The messages of a worker come as long as its stream is open: they are no upload on its way.
                 let request = match method == methods::SYNC {
                     true => request,
-                    false => request.map(|body| limits.metered(&caller.claims.subject, body)),
+                    false => request.map(|body| limits.metered(body)),
                 };
                 serve(Call::new(caller, method), time, request, next).await
             }

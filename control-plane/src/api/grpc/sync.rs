@@ -21,6 +21,7 @@ use tonic::{Request, Response, Status, Streaming};
 use super::gate::{self, Call};
 use super::{outgoing, status};
 use crate::api::limits::ApiLimits;
+use crate::api::request::client_address;
 use crate::core::{
     Acknowledged, ConfigService, OLDEST_SYNC_PROTOCOL, RolloutReport, Running, RunningState, SYNC_PROTOCOL, SyncHello,
     SyncItem, SyncStream, WorkerSession,
@@ -76,8 +77,8 @@ impl sync_service_server::SyncService for Service {
     type SyncStream = Responses;
 
     async fn sync(&self, request: Request<Streaming<v1::SyncRequest>>) -> Result<Response<Responses>, Status> {
-        let peer = request.extensions().get::<Peer>().copied();
-        let is_safe = peer.is_some_and(|peer| peer.encrypted || peer.address.ip().to_canonical().is_loopback());
+        let peer = request.extensions().get::<Peer>();
+        let is_safe = peer.is_some_and(|peer| peer.encrypted) || client_address(request.extensions()).is_loopback();
         let (call, mut said) = Call::open(request)?;
         let slot = self
             .limits

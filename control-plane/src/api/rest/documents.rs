@@ -9,17 +9,14 @@ use blaze_domain::config::spec::{self, Envelope};
 use blaze_domain::config::{Code, FieldFault, Key, Kind, Problem};
 use serde_json::Value;
 
-use super::fields::Fields;
 use super::headers::{self, Tags, etag};
 use super::operation::Call;
 use super::query::Param;
 use super::reply;
+use super::requests::AbortRequest;
 use crate::api::json;
 use crate::auth::Claims;
 use crate::core::{ApplyItem, Caller, DocumentInput, ListQuery, Precondition, ReadOptions};
-
-/// Longest reason of an aborted roll-out, in characters.
-pub(super) const MAX_REASON: usize = 1000;
 
 /// `GET /{c}`
 pub(super) async fn list(call: &Call, kind: Kind) -> Result<Response, Problem> {
@@ -114,10 +111,7 @@ pub(super) async fn promote(call: &Call) -> Result<Response, Problem> {
 /// `POST /rollouts/{n}/abort`
 pub(super) async fn abort(call: &Call) -> Result<Response, Problem> {
     let (key, idempotency) = (call.key(Kind::Rollout)?, call.idempotency()?);
-    let body = call.json()?;
-    let mut fields = Fields::of(&body);
-    let reason = fields.free_text("reason", MAX_REASON);
-    fields.done()?;
+    let AbortRequest { reason } = call.read()?;
     let answer = call
         .service()
         .abort_rollout(&call.caller, key.name(), &reason, idempotency)

@@ -165,8 +165,8 @@ fn words(code: Code) -> (&'static str, &'static str) {
             "Send If-Match with the ETag of the document, or If-Match: * to overwrite whatever is there.",
         ),
         Code::RateLimited => (
-            "There were too many requests of this subject, too many refused tokens from this address, too many open \
-             watches of this subject, or too much of it that is on its way and not whole yet.",
+            "There were too many requests of this subject, too many refused tokens from this address, or too many open \
+             watches of this subject.",
             "Wait as long as Retry-After says. The limits are in control_plane.limits of the node file.",
         ),
         Code::HeadersTooLarge => (
@@ -194,7 +194,8 @@ fn words(code: Code) -> (&'static str, &'static str) {
              safely.",
         ),
         Code::Overloaded => (
-            "The service works on as many requests as it may. Nothing was written.",
+            "The service works on as many requests, or receives as many bytes of bodies, as it may. Nothing was \
+             written.",
             "Try again after Retry-After, with growing pauses.",
         ),
         Code::ShuttingDown => (

@@ -4,11 +4,11 @@ use axum::http::StatusCode;
 use axum::response::Response;
 use blaze_domain::config::{Code, Kind, MAX_INTEGER, Problem};
 
-use super::fields::Fields;
 use super::headers;
 use super::operation::Call;
 use super::query::Param;
 use super::reply;
+use super::requests::RollbackRequest;
 use crate::api::json;
 
 /// What `view` may be.
@@ -54,10 +54,7 @@ pub(super) async fn diff(call: &Call, kind: Kind) -> Result<Response, Problem> {
 pub(super) async fn rollback(call: &Call, kind: Kind) -> Result<Response, Problem> {
     let precondition = headers::precondition(&call.headers)?;
     let idempotency = call.idempotency()?;
-    let body = call.json()?;
-    let mut fields = Fields::of(&body);
-    let revision = fields.revision("revision");
-    fields.done()?;
+    let RollbackRequest { revision } = call.read()?;
     let mut answer = call
         .service()
         .rollback(&call.caller, &call.key(kind)?, revision, precondition, idempotency)

@@ -8,10 +8,10 @@ use serde_json::Value;
 
 use super::body::Media;
 use super::documents::apply_item;
-use super::fields::Fields;
 use super::operation::Call;
 use super::query::Param;
 use super::reply;
+use super::requests::RevertRequest;
 use crate::api::json as answers;
 use crate::core::{Answer, ApplyItem, ApplyReport, ApplyRequest};
 
@@ -60,10 +60,7 @@ fn read(media: Media, bytes: &[u8]) -> Result<Vec<ApplyItem>, Problem> {
 /// `POST /revert`
 pub(super) async fn revert(call: &Call) -> Result<Response, Problem> {
     let idempotency = call.idempotency()?;
-    let body = call.json()?;
-    let mut fields = Fields::of(&body);
-    let (revision, force) = (fields.revision("revision"), fields.flag("force"));
-    fields.done()?;
+    let RevertRequest { revision, force } = call.read()?;
     let answer = call
         .service()
         .revert(&call.caller, revision, force, idempotency)

@@ -15,7 +15,6 @@ mod body;
 mod documents;
 mod effective;
 mod error_pages;
-mod fields;
 mod frame;
 mod gate;
 mod headers;
@@ -27,6 +26,7 @@ mod operation;
 mod pages;
 mod query;
 mod reply;
+mod requests;
 mod routes;
 mod system;
 #[cfg(test)]

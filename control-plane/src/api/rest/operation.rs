@@ -8,6 +8,7 @@ use axum::response::Response;
 use blaze_domain::config::{Applied, Code, Key, Kind, Problem};
 use blaze_domain::{DocumentName, ServiceName};
 use bytes::Bytes;
+use serde::de::DeserializeOwned;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 use tokio::time::timeout_at;
@@ -17,7 +18,7 @@ use super::frame::{Visit, note};
 use super::gate::{Known, unknown};
 use super::query::Query;
 use super::routes::{Action, Route, Verb};
-use super::{Rest, documents, effective, headers, history, many, negotiate, reply, system, tokens, watch};
+use super::{Rest, documents, effective, headers, history, many, negotiate, reply, requests, system, tokens, watch};
 use crate::auth::Right;
 use crate::core::{Caller, ConfigService, Idempotency, ReadOptions};
 
@@ -113,6 +114,11 @@ impl Call {
         }
     }
 
+    /// A small body.
+    pub(super) fn read<T: DeserializeOwned>(&self) -> Result<T, Problem> {
+        requests::read(&self.json()?)
+    }
+
     /// The body as strict JSON.
     pub(super) fn json(&self) -> Result<Value, Problem> {
         body::json(self.body().1)
@@ -193,7 +199,7 @@ async fn answer(
     negotiate::check(request.headers(), route.action)?;
     rest.service.authorize(&caller.claims, route.right)?;
     let (parts, body) = request.into_parts();
-    let body = rest.options.limits.metered(&caller.claims.subject, body);
+    let body = rest.options.limits.metered(body);
     let read = body::read(route.payload, &parts.headers, body);
     let body = timeout_at(visit.deadline, read).await.map_err(|_| too_late(false))??;
     let call = Call {

@@ -6,10 +6,10 @@ use blaze_domain::config::{Code, Kind, Problem};
 use blaze_domain::{DocumentName, LayerName};
 use serde_json::{Value, json};
 
-use super::fields::Fields;
 use super::operation::Call;
 use super::query::Param;
 use super::reply;
+use super::requests::TrimRequest;
 use crate::api::json as answers;
 use crate::core::Answer;
 use crate::store::AuditQuery;
@@ -109,10 +109,7 @@ fn action(text: Option<&str>) -> Result<Option<String>, Problem> {
 /// `POST /trim`
 pub(super) async fn trim(call: &Call) -> Result<Response, Problem> {
     let idempotency = call.idempotency()?;
-    let body = call.json()?;
-    let mut fields = Fields::of(&body);
-    let before = fields.revision("before");
-    fields.done()?;
+    let TrimRequest { before } = call.read()?;
     let answer = call.service().trim(&call.caller, before, idempotency).await?;
     let body = json!({ "oldest_revision": answer.value });
     Ok(reply::replayed(

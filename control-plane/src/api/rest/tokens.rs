@@ -2,21 +2,13 @@
 
 use axum::http::StatusCode;
 use axum::response::Response;
-use blaze_domain::LayerName;
 use blaze_domain::config::{Code, Problem};
-use serde_json::Value;
 
-use super::fields::Fields;
 use super::operation::Call;
-use super::reply;
-use crate::api::{DEFAULT_TOKEN_LIFE_S, json};
+use super::{reply, requests};
+use crate::api::json;
 use crate::auth::Role;
 use crate::core::{Page, TokenRequest};
-
-/// Longest subject, in characters.
-pub(super) const MAX_SUBJECT: usize = 256;
-/// Longest life of a token, in seconds: a year.
-pub(super) const MAX_LIFE_S: u64 = 31_536_000;
 
 /// `GET /tokens`
 pub(super) async fn list(call: &Call) -> Result<Response, Problem> {
@@ -31,7 +23,7 @@ pub(super) async fn list(call: &Call) -> Result<Response, Problem> {
 
 /// `POST /tokens`; a second one like it makes a second token.
 pub(super) async fn create(call: &Call) -> Result<Response, Problem> {
-    let request = request(&call.json()?)?;
+    let request = request(call.read()?)?;
     let answer = call.service().create_token(&call.caller, request).await?;
     let (record, text) = &answer.value;
     let body = json::new_token(record, text);
@@ -47,32 +39,37 @@ pub(super) async fn revoke(call: &Call) -> Result<Response, Problem> {
     Ok(reply::empty(StatusCode::NO_CONTENT, answer.revision))
 }
 
-fn request(body: &Value) -> Result<TokenRequest, Problem> {
-    let known: Vec<&str> = Role::ALL.iter().map(|role| role.as_str()).collect();
-    let mut fields = Fields::of(body);
-    let subject = fields.text("subject", MAX_SUBJECT);
-    let roles = fields.words("roles", &known);
-    let layer = fields.optional_text("layer", 63);
-    let expires_in_s = fields.number("expires_in_s", 1, MAX_LIFE_S, DEFAULT_TOKEN_LIFE_S.into());
-    if let Some(layer) = &layer
-        && let Err(error) = layer.parse::<LayerName>()
-    {
-        fields.refuse("layer", error.to_string());
+fn request(asked: requests::TokenRequest) -> Result<TokenRequest, Problem> {
+    let roles = asked.roles;
+    if roles.is_empty() {
+        return Err(requests::fault("/roles", "is empty"));
     }
-    fields.done()?;
+    for (index, role) in roles.iter().enumerate() {
+        let is_known = Role::ALL.iter().any(|known| known.as_str() == role);
+        if !is_known || roles[..index].contains(role) {
+            let known: Vec<&str> = Role::ALL.iter().map(|role| role.as_str()).collect();
+            let detail = format!("comes twice, or is not one of {}", known.join(", "));
+            return Err(requests::fault(&format!("/roles/{index}"), &detail));
+        }
+    }
     Ok(TokenRequest {
-        subject,
+        subject: asked.subject,
         roles,
-        layer,
-        expires_in_s: u32::try_from(expires_in_s).unwrap_or(u32::MAX),
+        layer: asked.layer.map(|layer| layer.to_string()),
+        expires_in_s: u32::try_from(asked.expires_in_s).unwrap_or(u32::MAX),
     })
 }
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
+    use serde_json::{Value, json};
 
     use super::*;
+    use crate::api::DEFAULT_TOKEN_LIFE_S;
+
+    fn request(body: &Value) -> Result<TokenRequest, Problem> {
+        super::request(requests::read(body)?)
+    }
 
     #[test]
     fn a_request_is_read_strictly() {
@@ -86,7 +83,12 @@ mod tests {
         assert_eq!(short.expires_in_s, DEFAULT_TOKEN_LIFE_S);
         for (body, pointer) in [
             (json!({ "subject": "", "roles": ["viewer"] }), "/subject"),
+            (json!({ "subject": "ops" }), "/roles"),
+            (json!({ "subject": "ops", "roles": [] }), "/roles"),
+            (json!({ "subject": "ops", "roles": "admin" }), "/roles"),
+            (json!({ "subject": "ops", "roles": [1] }), "/roles/0"),
             (json!({ "subject": "ops", "roles": ["root"] }), "/roles/0"),
+            (json!({ "subject": "ops", "roles": ["admin", "admin"] }), "/roles/1"),
             (
                 json!({ "subject": "ops", "roles": ["viewer"], "layer": "Edge" }),
                 "/layer",

@@ -28,7 +28,7 @@ use super::reply;
 use crate::api::json as answers;
 use crate::api::limits::WatchSlot;
 use crate::core::{WatchItem, WatchQuery};
-use crate::metrics::OpenWatch;
+use crate::metrics::OpenGauge;
 
 /// Tells reverse proxies to hand on every event at once.
 const X_ACCEL_BUFFERING: HeaderName = HeaderName::from_static("x-accel-buffering");
@@ -93,7 +93,7 @@ struct Events<S> {
     ready: VecDeque<Bytes>,
     ended: bool,
     _slot: WatchSlot,
-    _open: OpenWatch,
+    _open: OpenGauge,
 }
 
 impl<S: Stream<Item = WatchItem> + Send + Unpin + 'static> Events<S> {

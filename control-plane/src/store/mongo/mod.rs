@@ -117,7 +117,7 @@ impl MongoStore {
 
     /// Removes records below the floor at once, where others are sure not to be late, and brings the documents up to date at
     /// each tidying: for tests.
-    #[cfg(any(test, feature = "conformance"))]
+    #[doc(hidden)]
     #[must_use]
     pub fn in_a_hurry(self) -> Self {
         *self.fence.lock() = Fence::removing_after(Duration::ZERO);
@@ -131,7 +131,7 @@ impl MongoStore {
     ///
     /// # Errors
     /// [`StoreError`].
-    #[cfg(any(test, feature = "conformance"))]
+    #[doc(hidden)]
     pub async fn records(&self) -> Result<u64, StoreError> {
         client::limited(USUAL, self.tables.events.count_documents(mongodb::bson::doc! {})).await
     }

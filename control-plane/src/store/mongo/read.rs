@@ -389,7 +389,7 @@ mod tests {
             subject: String::new(),
             request_id: String::new(),
             paths: "[]".to_owned(),
-            document: crate::store::encode::document_text(&crate::store::conformance::samples::node("x", 1)).unwrap(),
+            document: crate::store::encode::document_text(&crate::store::samples::node("x", 1)).unwrap(),
         }
     }
 

@@ -105,8 +105,8 @@ impl Recent {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::conformance::samples::{commit, record};
     use crate::store::encode::encode_group;
+    use crate::store::samples::{commit, record};
 
     fn group(revisions: std::ops::RangeInclusive<u64>, key: &str) -> Vec<EncodedCommit> {
         let records: Vec<_> = revisions.map(|revision| record(commit(revision, &[key]))).collect();

@@ -359,8 +359,8 @@ fn date(found: &Document, name: &str) -> Result<i64, StoreError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::store::conformance::samples;
     use crate::store::encode::encode_group;
+    use crate::store::samples;
 
     #[test]
     fn rows_are_read_as_they_were_written() {

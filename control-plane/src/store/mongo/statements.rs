@@ -104,8 +104,8 @@ pub(super) fn update_command(table: &str, updates: Vec<Document>) -> Document {
 mod tests {
     use super::*;
     use crate::store::Op;
-    use crate::store::conformance::samples::{answer, change, commit, commit_of, record};
     use crate::store::encode::encode_group;
+    use crate::store::samples::{answer, change, commit, commit_of, record};
 
     #[test]
     fn a_group_is_one_record() {

@@ -6,7 +6,7 @@ use tempfile::TempDir;
 
 use super::*;
 use crate::store::backup;
-use crate::store::conformance::samples::{commit, commit_of, record};
+use crate::store::samples::{commit, commit_of, record};
 
 /// Files in a folder.
 struct Files {

@@ -31,6 +31,7 @@ use super::body::Media;
 use super::routes::{self, Action, Payload, Route, Verb};
 use shapes::{Shape, list, refer, refer_or_null};
 
+pub(super) use schemas::{layer_or_null, roles};
 pub(super) use twin::to_3_0;
 
 /// Name of the only security scheme.

@@ -4,6 +4,8 @@ mod answers;
 mod documents;
 mod requests;
 
+pub(in super::super) use requests::{layer_or_null, roles};
+
 use blaze_domain::config::selector::MAX_SELECTOR_BYTES;
 use blaze_domain::config::{Kind, MAX_INTEGER};
 use utoipa::openapi::schema::ObjectBuilder;

@@ -1,12 +1,11 @@
 //! Bodies of requests that are no documents.
 
 use serde_json::json;
+use utoipa::PartialSchema;
 
-use super::super::super::documents::MAX_REASON;
-use super::super::super::tokens::{MAX_LIFE_S, MAX_SUBJECT};
-use super::super::shapes::{Shape, closed, flag, free, like, list, or_null, refer, said, text, whole, word};
-use super::{kinds, name, real_revision, revision};
-use crate::api::DEFAULT_TOKEN_LIFE_S;
+use super::super::super::requests::{AbortRequest, RevertRequest, RollbackRequest, TokenRequest, TrimRequest};
+use super::super::shapes::{Shape, closed, flag, free, like, list, or_null, refer, said, word};
+use super::{kinds, name, revision};
 use crate::auth::Role;
 
 /// All of them.
@@ -14,14 +13,11 @@ pub(super) fn all() -> [(&'static str, Shape); 7] {
     [
         ("DocumentPatch", document_patch()),
         ("ApplyItem", apply_item()),
-        ("TokenRequest", token_request()),
-        (
-            "RollbackRequest",
-            revision_request("Content as it was at this revision."),
-        ),
-        ("RevertRequest", revert_request()),
-        ("TrimRequest", trim_request()),
-        ("AbortRequest", abort_request()),
+        ("TokenRequest", TokenRequest::schema()),
+        ("RollbackRequest", RollbackRequest::schema()),
+        ("RevertRequest", RevertRequest::schema()),
+        ("TrimRequest", TrimRequest::schema()),
+        ("AbortRequest", AbortRequest::schema()),
     ]
 }
 
@@ -68,74 +64,16 @@ fn apply_item() -> Shape {
     .into()
 }
 
-fn token_request() -> Shape {
-    let request = closed(
-        &["subject", "roles"],
-        [
-            (
-                "subject",
-                text().min_length(Some(1)).max_length(Some(MAX_SUBJECT)).into(),
-            ),
-            (
-                "roles",
-                list(word(Role::ALL.iter().map(|role| role.as_str())))
-                    .min_items(Some(1))
-                    .unique_items(true)
-                    .into(),
-            ),
-            (
-                "layer",
-                said(
-                    or_null(name()),
-                    "Nothing outside its view is seen; needed with the role worker.",
-                ),
-            ),
-            (
-                "expires_in_s",
-                whole(1, MAX_LIFE_S as i64)
-                    .default(Some(json!(DEFAULT_TOKEN_LIFE_S)))
-                    .into(),
-            ),
-        ],
-    );
-    let example = json!({ "subject": "ops@example.org", "roles": ["operator"], "layer": null, "expires_in_s": 86400 });
-    like(request, example).into()
+/// Roles of a token.
+pub(in super::super::super) fn roles() -> Shape {
+    list(word(Role::ALL.iter().map(|role| role.as_str())))
+        .min_items(Some(1))
+        .unique_items(true)
+        .into()
 }
 
-fn revision_request(description: &str) -> Shape {
-    like(
-        closed(&["revision"], [("revision", said(real_revision(), description))]),
-        json!({ "revision": 7 }),
-    )
-    .into()
-}
-
-fn revert_request() -> Shape {
-    let request = closed(
-        &["revision"],
-        [
-            (
-                "revision",
-                said(real_revision(), "The commit whose changes are taken back."),
-            ),
-            (
-                "force",
-                said(
-                    flag().default(Some(json!(false))),
-                    "Also documents that were changed since.",
-                ),
-            ),
-        ],
-    );
-    like(request, json!({ "revision": 7, "force": false })).into()
-}
-
-fn trim_request() -> Shape {
-    let before = said(real_revision(), "Commits before this revision are forgotten.");
-    like(closed(&["before"], [("before", before)]), json!({ "before": 1 })).into()
-}
-
-fn abort_request() -> Shape {
-    let reason = said(text().max_length(Some(MAX_REASON)), "For people.");
-    like(closed(&[], [("reason", reason)]), json!({ "reason": "too slow" })).into()
+/// Layer of a token.
+pub(in super::super::super) fn layer_or_null() -> Shape {
+    let said_of = "Nothing outside its view is seen; needed with the role worker.";
+    said(or_null(name()), said_of)
 }

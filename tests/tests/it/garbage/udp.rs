@@ -1,0 +1,214 @@
+//! Garbage at all DDS ports of a process, while another one receives messages from it.
+
+use std::collections::BTreeSet;
+use std::net::{Ipv4Addr, UdpSocket};
+use std::time::{Duration, Instant};
+
+use blaze_tests::admin::Admin;
+use blaze_tests::flow::free_domain;
+use blaze_tests::process::Process;
+use blaze_tests::wait;
+
+use super::inside::DEADLINE;
+use super::random::Random;
+
+/// After the storm the two must have found each other again; RustDDS alone repeats its announcements every 10 s.
+const RECOVERY: Duration = Duration::from_secs(25);
+/// Datagrams of a storm; the full count with `--long`.
+const STORM: usize = 20_000;
+const MAX_RESIDENT: u64 = 400 * 1024 * 1024;
+
+/// The UDP ports that a process holds.
+fn udp_ports(process: &Process) -> BTreeSet<u16> {
+    let folder = format!("/proc/{}/fd", process.id());
+    let inodes: BTreeSet<String> = std::fs::read_dir(folder)
+        .unwrap()
+        .filter_map(|entry| std::fs::read_link(entry.ok()?.path()).ok())
+        .filter_map(|link| {
+            Some(
+                link.to_str()?
+                    .strip_prefix("socket:[")?
+                    .trim_end_matches(']')
+                    .to_owned(),
+            )
+        })
+        .collect();
+    let table = std::fs::read_to_string("/proc/net/udp").unwrap();
+    let port = |line: &str| {
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        let local = fields.get(1)?.rsplit(':').next()?;
+        inodes
+            .contains(*fields.get(9)?)
+            .then(|| u16::from_str_radix(local, 16).ok())?
+    };
+    table.lines().skip(1).filter_map(port).collect()
+}
+
+/// Announcements of the participants of a domain, as a newcomer hears them.
+fn announcements(domain: u16) -> Vec<Vec<u8>> {
+    let base = 7400 + 250 * domain;
+    let ear = (1..12)
+        .rev()
+        .find_map(|slot| UdpSocket::bind((Ipv4Addr::LOCALHOST, base + 10 + 2 * slot)).ok())
+        .unwrap();
+    ear.set_read_timeout(Some(Duration::from_millis(50))).unwrap();
+    let mut heard = Vec::new();
+    let mut buffer = vec![0; 65_536];
+    wait::until(
+        "announcements",
+        Duration::from_secs(15),
+        || {
+            if let Ok((length, _)) = ear.recv_from(&mut buffer) {
+                heard.push(buffer[..length].to_vec());
+            }
+            heard.len() >= 2
+        },
+        || "nothing was heard".into(),
+    )
+    .unwrap();
+    heard
+}
+
+/// What RTPS knows, well formed but for its contents. Fragments, heartbeats and gaps have tests of their own.
+fn submessages(random: &mut Random) -> Vec<u8> {
+    let mut datagram = b"RTPS\x02\x04\x01\x12".to_vec();
+    datagram.extend(random.bytes(12));
+    for _ in 0..=random.below(4) {
+        let kinds = [0x01, 0x06, 0x09, 0x0c, 0x0d, 0x0e, 0x0f, 0x12, 0x15, 0x80];
+        let kind = kinds[random.below(kinds.len())];
+        let length = random.below(300);
+        datagram.extend([kind, random.below(256) as u8]);
+        datagram.extend(u16::try_from(length).unwrap().to_le_bytes());
+        // Known entities now and then: discovery's writers and readers.
+        let mut body = random.bytes(length);
+        if length > 12 && random.below(2) == 0 {
+            let entities = [[0, 1, 0, 0xc2], [0, 3, 0, 0xc2], [0, 4, 0, 0xc2], [0, 2, 0, 0xc2]];
+            body[4..8].copy_from_slice(&[0, 0, 0, 0]);
+            body[8..12].copy_from_slice(&entities[random.below(4)]);
+        }
+        datagram.extend(body);
+    }
+    datagram
+}
+
+/// Whether a datagram holds a fragment, heartbeat or gap.
+fn is_for_others(datagram: &[u8]) -> bool {
+    let mut at = 20;
+    while let Some(head) = datagram.get(at..at + 4) {
+        if matches!(head[0], 0x07 | 0x08 | 0x13 | 0x16) {
+            return true;
+        }
+        let little = u16::from_le_bytes([head[2], head[3]]);
+        let length = if head[1] & 1 == 1 { little } else { little.swap_bytes() };
+        if length == 0 {
+            return false;
+        }
+        at += 4 + usize::from(length);
+    }
+    false
+}
+
+fn garbage(random: &mut Random, heard: &[Vec<u8>]) -> Vec<u8> {
+    let mut datagram = heard[random.below(heard.len())].clone();
+    match random.below(6) {
+        0 => {
+            let length = random.below(2000);
+            datagram = random.bytes(length);
+        }
+        1 => datagram.truncate(random.below(datagram.len() + 1)),
+        2 => return submessages(random),
+        3 => {
+            // The announcement of a participant that is not there.
+            let prefix = random.bytes(12);
+            let own = datagram[8..20].to_vec();
+            for from in 0..datagram.len() - 12 {
+                if datagram[from..from + 12] == own[..] {
+                    datagram[from..from + 12].copy_from_slice(&prefix);
+                }
+            }
+        }
+        _ => {
+            for _ in 0..=random.below(8) {
+                let at = random.below(datagram.len());
+                datagram[at] = random.bytes(1)[0];
+            }
+        }
+    }
+    datagram
+}
+
+/// Messages that left bridges towards a layer broker.
+fn delivered(admin: &Admin) -> f64 {
+    let name = "blaze_flow_messages_total";
+    admin
+        .metric(name, &["topic=\"imu/data\"", "direction=\"out\"", "to=\"layer\""])
+        .unwrap_or(0.0)
+}
+
+#[test]
+fn a_storm_of_datagrams_leaves_the_processes_alive_and_messages_flow() {
+    let domain = free_domain().unwrap();
+    let set = format!("brokers.inter.dds.domain={domain}");
+    let arguments = |node| ["demo", "--only", node, "--duration", "10m", "--set", set.as_str()];
+    let mut robot = Process::start("blaze", &arguments("robot-1"), None).unwrap();
+    let mut fog = Process::start("blaze", &arguments("fog-1"), None).unwrap();
+    let robot_admin = robot.node_ready("robot-1", DEADLINE).unwrap();
+    let fog_admin = fog.node_ready("fog-1", DEADLINE).unwrap();
+    let flow = |deadline, when: &str, fog: &Process| {
+        let before = delivered(&fog_admin);
+        wait::until(when, deadline, || delivered(&fog_admin) >= before + 30.0, || fog.tail()).unwrap()
+    };
+    flow(DEADLINE, "messages flow before", &fog);
+    let heard = announcements(domain);
+    let ports: Vec<u16> = udp_ports(&robot).union(&udp_ports(&fog)).copied().collect();
+    assert!(ports.len() >= 4, "two processes hold {ports:?}");
+    let before = [robot.resident_bytes().unwrap(), fog.resident_bytes().unwrap()];
+
+    let mut random = Random::new(2026);
+    let sender = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+    let begin = Instant::now();
+    let count = if blaze_tests::long() { 20 * STORM } else { STORM };
+    let mut sent = 0;
+    while sent < count {
+        let datagram = garbage(&mut random, &heard);
+        if is_for_others(&datagram) {
+            continue;
+        }
+        let port = ports[random.below(ports.len())];
+        let _ = sender.send_to(&datagram, (Ipv4Addr::LOCALHOST, port));
+        sent += 1;
+        if sent % 500 == 0 {
+            assert!(robot.runs(), "after {sent}: {}", robot.tail());
+            assert!(fog.runs(), "after {sent}: {}", fog.tail());
+        }
+    }
+    let storm = begin.elapsed();
+    let recovered = flow(RECOVERY, "messages flow again", &fog);
+    for (name, process, admin) in [("robot-1", &mut robot, &robot_admin), ("fog-1", &mut fog, &fog_admin)] {
+        assert!(process.runs(), "{}", process.tail());
+        wait::until("ready", DEADLINE, || admin.ready(), || process.tail()).unwrap();
+        let bytes = process.resident_bytes().unwrap();
+        assert!(bytes < MAX_RESIDENT, "{name}: {bytes} bytes, before {before:?}");
+        let label = ["event=\"participant_rebuilt\""];
+        let rebuilt = admin.metric("blaze_flow_link_events_total", &label);
+        eprintln!("{name}: {} MiB, rebuilt {rebuilt:?}", bytes >> 20);
+        let deaths = process
+            .stderr()
+            .iter()
+            .filter(|line| line.contains("participant died"))
+            .count();
+        assert_eq!(
+            rebuilt,
+            Some(deaths as f64),
+            "each death is counted\n{}",
+            process.tail()
+        );
+    }
+    eprintln!(
+        "{sent} datagrams to {} ports in {storm:?}; messages flowed again after {recovered:?}",
+        ports.len()
+    );
+    for process in [&mut robot, &mut fog] {
+        process.terminate(DEADLINE).unwrap();
+    }
+}

@@ -1,0 +1,4 @@
+//! The SDK over the memory broker.
+
+mod leases;
+mod publish_subscribe;

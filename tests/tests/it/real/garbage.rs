@@ -1,0 +1,192 @@
+//! Garbage on every door of a real broker: counted, nothing crashes, memory is bounded.
+
+use std::time::Duration;
+
+use blaze_tests::flow::FlowProcess;
+use blaze_tests::plain::{KafkaReader, KafkaWriter};
+use blaze_tests::servers::{shared_kafka, shared_redis};
+use blaze_tests::wait;
+use rand::rngs::StdRng;
+use rand::{Rng as _, RngExt as _, SeedableRng as _};
+use serde_json::json;
+
+use crate::real::support::{RobotAndCloud, SOON, connect};
+
+const TOPIC: &str = "imu/data";
+/// What a flow may hold beside what it had before.
+const MAX_GROWTH_KIB: u64 = 160 * 1024;
+
+fn metric_sum(flow: &FlowProcess, name: &str, label: &str) -> f64 {
+    let Ok((_, text)) = flow.admin().get("/metrics") else {
+        return 0.0;
+    };
+    text.lines()
+        .filter(|line| line.starts_with(name) && line.contains(label))
+        .filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok())
+        .sum()
+}
+
+/// Payloads that claim to be frames and are none.
+fn broken_frames() -> Vec<Vec<u8>> {
+    let mut all = vec![
+        b"BLZ1".to_vec(),
+        b"BLZ1\x00".to_vec(),
+        b"BLZ1\xff\xff\xff\xff".to_vec(),
+        b"BLZ1\x10\x00\x00\x00short".to_vec(),
+        b"BLZ1\x00\x00\x00\x00no header at all".to_vec(),
+        [b"BLZ1\x08\x00\x00\x00".as_slice(), &[0xff; 8], b"payload"].concat(),
+        [b"BLZ1\x00\x10\x00\x00".as_slice(), &[0x0a; 4096], b"payload"].concat(),
+    ];
+    let mut random = StdRng::seed_from_u64(7);
+    for _ in 0..200 {
+        let length = random.random_range(4..600);
+        let mut bytes = vec![0; length];
+        random.fill_bytes(&mut bytes);
+        bytes[..4].copy_from_slice(b"BLZ1");
+        all.push(bytes);
+    }
+    all
+}
+
+/// Control payloads that nobody should send.
+fn hostile_control() -> Vec<Vec<u8>> {
+    let deep = "[".repeat(30_000);
+    let mut all: Vec<Vec<u8>> = vec![
+        b"".to_vec(),
+        b"null".to_vec(),
+        b"[]".to_vec(),
+        b"{".to_vec(),
+        b"\xff\xfe\x00".to_vec(),
+        deep.into_bytes(),
+        b"{\"op\":\"advertise\"}".to_vec(),
+        b"{\"op\":\"advertise\",\"topic\":1,\"service\":{}}".to_vec(),
+        b"{\"op\":\"request\",\"topic\":\"a\",\"service\":\"s\",\"max_rate_hz\":1e999}".to_vec(),
+        json!({"op":"advertise","topic":"x".repeat(60_000),"service":"s"})
+            .to_string()
+            .into_bytes(),
+        vec![b'a'; 70_000],
+        json!(vec![json!({"op":"fly"}); 201]).to_string().into_bytes(),
+    ];
+    let mut random = StdRng::seed_from_u64(11);
+    for _ in 0..200 {
+        let mut bytes = vec![0; random.random_range(1..300)];
+        random.fill_bytes(&mut bytes);
+        all.push(bytes);
+    }
+    all
+}
+
+fn flowing(system: &RobotAndCloud, reader: &KafkaReader) -> anyhow::Result<()> {
+    let mark = format!("mark-{}", rand::random::<u64>());
+    wait::until(
+        "a good message still passes",
+        SOON,
+        || {
+            let _ = system.publish(TOPIC, mark.as_bytes());
+            while let Some(record) = reader.next(Duration::from_millis(100)) {
+                if record.payload == mark.as_bytes() {
+                    return true;
+                }
+            }
+            false
+        },
+        || format!("{}\n{}", system.robot.tail(), system.cloud.tail()),
+    )?;
+    Ok(())
+}
+
+#[test]
+fn garbage_is_counted_and_does_no_harm() -> anyhow::Result<()> {
+    const BACK: &str = "fleet/commands";
+    let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
+    system.tell_robot(&json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","ttl_s":0}))?;
+    system.tell_robot(&json!({"op":"request","topic":BACK,"service":"driver","ttl_s":0}))?;
+    system.tell_cloud(&json!([{"op":"request","topic":TOPIC,"service":"logger","ttl_s":0},
+        {"op":"advertise","topic":BACK,"service":"planner","ttl_s":0}]))?;
+    for flow in [&system.robot, &system.cloud] {
+        flow.wait_bridge(TOPIC, SOON)?;
+        flow.wait_bridge(BACK, SOON)?;
+    }
+    let reader = KafkaReader::from_end(&system.kafka, &system.topic(TOPIC))?;
+    flowing(&system, &reader)?;
+    let memory = [system.robot.rss_kib()?, system.cloud.rss_kib()?];
+
+    // Frames on a Redis channel.
+    let frames = broken_frames();
+    let before = metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"decode_error\"");
+    for frame in &frames {
+        system.publish(TOPIC, frame)?;
+    }
+    let counted = || metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"decode_error\"") - before;
+    wait::until(
+        "every broken frame is counted",
+        SOON,
+        || counted() >= frames.len() as f64,
+        || format!("{} of {}", counted(), frames.len()),
+    )?;
+    flowing(&system, &reader)?;
+
+    // One byte too many.
+    let before = metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"too_large\"");
+    system.publish(TOPIC, &vec![b'x'; 16 * 1024 * 1024 + 1])?;
+    wait::until(
+        "a payload of 16 MiB + 1 is counted",
+        SOON,
+        || metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"too_large\"") > before,
+        || system.robot.tail(),
+    )?;
+    flowing(&system, &reader)?;
+
+    // Control topic of both brokers.
+    let mut connection = connect(&system.redis)?;
+    let writer = KafkaWriter::new(&system.kafka)?;
+    for payload in hostile_control() {
+        redis::cmd("PUBLISH")
+            .arg(system.channel("blaze/flow/control"))
+            .arg(&payload)
+            .exec(&mut connection)?;
+        writer.produce_later(&system.topic("blaze/flow/control"), &payload)?;
+    }
+    writer.produce(&system.topic("blaze/flow/control"), b"{}")?;
+    flowing(&system, &reader)?;
+
+    // Kafka records with headers that lie.
+    let before = metric_sum(&system.cloud, "blaze_flow_dropped_total", "reason=\"decode_error\"");
+    let hostile: Vec<Vec<(&str, Vec<u8>)>> = vec![
+        vec![("blaze-writer", b"no hex".to_vec())],
+        vec![("blaze-writer", vec![0xff; 40]), ("blaze-sequence", b"1".to_vec())],
+        vec![("blaze-writer", vec![b'a'; 32]), ("blaze-sequence", b"0".to_vec())],
+        vec![("blaze-writer", vec![b'a'; 32]), ("blaze-sequence", b"-1".to_vec())],
+        vec![("blaze-writer", vec![b'a'; 32])],
+        vec![
+            ("blaze-writer", vec![b'a'; 32]),
+            ("blaze-sequence", b"1".to_vec()),
+            ("blaze-origin", vec![b'/'; 9_000]),
+        ],
+    ];
+    for headers in &hostile {
+        let headers: Vec<(&str, &[u8])> = headers.iter().map(|(key, value)| (*key, value.as_slice())).collect();
+        writer.produce_with(&system.topic(BACK), b"payload", &headers)?;
+    }
+    wait::until(
+        "every hostile record is counted",
+        SOON,
+        || {
+            metric_sum(&system.cloud, "blaze_flow_dropped_total", "reason=\"decode_error\"") - before
+                >= hostile.len() as f64
+        },
+        || system.cloud.tail(),
+    )?;
+    flowing(&system, &reader)?;
+
+    for (flow, memory) in [&system.robot, &system.cloud].into_iter().zip(memory) {
+        let now = flow.rss_kib()?;
+        println!("{}: {memory} KiB before, {now} KiB after", flow.spec.node);
+        assert!(
+            now <= memory + MAX_GROWTH_KIB,
+            "{}: {memory} → {now} KiB",
+            flow.spec.node
+        );
+    }
+    Ok(())
+}

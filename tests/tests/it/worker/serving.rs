@@ -1,0 +1,131 @@
+//! What services are told, and who is not.
+
+use serde_json::json;
+
+use super::stage::{PATIENCE, Stage, next, rest};
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_service_that_is_deleted_hears_it_and_has_no_key_any_more() {
+    let stage = Stage::new();
+    let _main = stage.main();
+    stage.robot().await;
+    let worker = stage.worker("robot-1");
+    stage.equal(&worker, PATIENCE).await;
+    let service = stage.service().await;
+    let mut nav = service.listen("nav").await;
+    stage.send(reqwest::Method::DELETE, "/services/nav", None).await;
+    let notice = next(&mut nav).await;
+    assert_eq!(
+        (&notice["deleted"], &notice["config"], &notice["hash"]),
+        (&json!(true), &json!(null), &json!(null))
+    );
+    assert_eq!(stage.keys().get("blaze:config:nav").await.unwrap(), None);
+}
+
+mod quick {
+    use super::*;
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_change_reaches_whom_it_concerns_and_nobody_else() {
+        let stage = Stage::new();
+        let _main = stage.main();
+        stage.robot().await;
+        let worker = stage.worker("robot-1");
+        stage.equal(&worker, PATIENCE).await;
+        let mut service = stage.service().await;
+        let (mut slam, mut nav) = (service.listen("slam").await, service.listen("nav").await);
+
+        let answer = service
+            .ask(json!({ "service": "slam", "instance": "0" }), PATIENCE)
+            .await;
+        assert_eq!(
+            answer["config"],
+            json!({ "camera": { "rate_hz": 30 }, "verbosity": "info" })
+        );
+        assert_eq!(
+            (&answer["source"], &answer["node"]),
+            (&json!("main"), &json!("robot-1"))
+        );
+        let effective = stage.get("/effective?service=slam&instance=0").await;
+        assert_eq!(
+            (&answer["hash"], &answer["config"]),
+            (&effective["hash"], &effective["config"])
+        );
+        let again = json!({ "service": "slam", "instance": "0", "hash": answer["hash"] });
+        assert_eq!(service.ask(again, PATIENCE).await["unchanged"], true);
+        let misspelt = service.ask(json!({ "service": "slamm" }), PATIENCE).await;
+        assert_eq!(misspelt["error"]["code"], "not_found");
+        assert!(
+            misspelt["error"]["detail"].as_str().unwrap().contains("slam?"),
+            "{misspelt}"
+        );
+
+        rest(&mut slam).await;
+        rest(&mut nav).await;
+        let instance = json!({ "node": "robot-1", "config": { "camera": { "rate_hz": 10 } } });
+        let revision = stage.put("/services/slam/instances/0", instance).await;
+        let notice = next(&mut slam).await;
+        assert_eq!(
+            (&notice["revision"], &notice["instance"]),
+            (&json!(revision), &json!("0"))
+        );
+        assert_eq!(
+            (&notice["paths"], &notice["scopes"]),
+            (&json!(["/camera/rate_hz"]), &json!(["instance"]))
+        );
+        assert_eq!(notice["previous_hash"], answer["hash"]);
+        assert_eq!(notice["config"]["camera"]["rate_hz"], 10);
+        // The key was written no later than the notice.
+        let key = stage
+            .keys()
+            .get("blaze:config:slam:0")
+            .await
+            .unwrap()
+            .expect("the key is there");
+        let key: serde_json::Value = serde_json::from_slice(&key).unwrap();
+        assert_eq!((&key["hash"], &key["config"]), (&notice["hash"], &notice["config"]));
+
+        // A change of the layer that says nothing new to anybody, then one that does; in between nobody hears.
+        stage
+            .put(
+                "/layers/edge",
+                json!({ "kind": "edge", "config": { "verbosity": "info" }, "overrides": { "other": { "x": 1 } } }),
+            )
+            .await;
+        let revision = stage
+            .put(
+                "/layers/edge",
+                json!({ "kind": "edge", "config": { "verbosity": "debug" } }),
+            )
+            .await;
+        let mut heard = Vec::new();
+        for notices in [&mut slam, &mut nav] {
+            let notice = next(notices).await;
+            assert_eq!(
+                (&notice["revision"], &notice["scopes"]),
+                (&json!(revision), &json!(["layer"]))
+            );
+            heard.push(notice);
+        }
+        let of_nav = rest(&mut nav).await;
+        assert!(
+            of_nav.is_empty(),
+            "one service without instance, one notice: {heard:?} {of_nav:?}"
+        );
+
+        let known = stage.get("/workers").await;
+        let known = &known["items"][0];
+        assert_eq!(
+            (&known["layer"], &known["node"], &known["connected"]),
+            (&json!("edge"), &json!("robot-1"), &json!(true))
+        );
+        let metrics = worker.text("/metrics").await;
+        for line in ["blaze_worker_connected 1", "blaze_worker_source{source=\"main\"} 1"] {
+            assert!(
+                metrics.lines().any(|found| found == line),
+                "{line} is not in\n{metrics}"
+            );
+        }
+        worker.stop();
+    }
+}
