@@ -10,5 +10,7 @@ pub mod limit;
 pub mod link;
 pub mod plan;
 pub mod registry;
+#[cfg(test)]
+mod testing;
 pub mod why;
 pub mod world;

@@ -589,27 +589,4 @@ mod tests {
             );
         }
     }
-
-    #[test]
-    fn where_a_lane_is_reliable_what_is_published_counts_as_advertised() {
-        let mut published = Published::default();
-        published.take(30.0, Some(30.0), Some(10.0));
-        assert_eq!(
-            published.told(Some(10.0), true),
-            Told {
-                hz: 30.0,
-                exceeded: false
-            }
-        );
-        assert_eq!(
-            published.told(None, true),
-            Told {
-                hz: 30.0,
-                exceeded: false
-            }
-        );
-        // Nobody says anything any more.
-        published.take(30.0, Some(30.0), None);
-        assert!(!published.told(Some(10.0), false).exceeded);
-    }
 }

@@ -264,15 +264,6 @@ mod tests {
     use super::ETHERNET as PACKETS;
     use super::*;
 
-    #[test]
-    fn a_datagram_has_the_headers_of_all_its_packets() {
-        assert_eq!(PACKETS.wire_bytes(1_296), 1_376);
-        assert_eq!(PACKETS.wire_bytes(1_293), 1_376, "filled up");
-        assert_eq!(PACKETS.wire_bytes(1_400), 2 * 84 + 1_408);
-        assert_eq!(PACKETS.wire_bytes(6_000), 5 * 84 + 6_008);
-        assert_eq!(PACKETS.wire_bytes(0), 80);
-    }
-
     fn budgets(
         limit_bytes_per_s: f64,
         layers: &[(&LayerName, f64)],
@@ -285,34 +276,6 @@ mod tests {
             adaptive,
             packets,
         }
-    }
-
-    /// Bytes that two peers of two layers send in ten seconds, as fast as they may.
-    #[test]
-    fn a_slow_link_holds_back_its_own_peers_alone() {
-        let start = Instant::now();
-        let (fog, cloud): (LayerName, LayerName) = ("fog".parse().unwrap(), "cloud".parse().unwrap());
-        let mut link = Budgets::default();
-        link.set(start, budgets(1e6, &[(&cloud, 1e5)], false, PACKETS), 1_296);
-        let mut paths = [PathBudget::default(), PathBudget::default()];
-        let mut sent = [0usize; 2];
-        for tick in 0..10_000u32 {
-            let now = start + Duration::from_millis(1) * tick;
-            link.paced_until = None;
-            for (at, layer) in [&fog, &cloud].into_iter().enumerate() {
-                if link.may_send(now, layer, &mut paths[at]) {
-                    link.spend(now, layer, &mut paths[at], 1_296);
-                    sent[at] += 1_376;
-                }
-            }
-            assert!(link.paced_until.is_none_or(|until| until > now));
-        }
-        assert_eq!(
-            sent[0],
-            10_000 * 1_376,
-            "nothing but the pacer of the process bounds the fog"
-        );
-        assert!((970_000..=1_000_000).contains(&sent[1]), "{sent:?}");
     }
 
     /// Datagrams that may leave at once after a pause.
@@ -350,33 +313,6 @@ mod tests {
                 3,
                 "two, and one into debt"
             );
-        }
-    }
-
-    #[test]
-    fn what_is_small_has_its_share_after_an_outage() {
-        let start = Instant::now();
-        let cloud: LayerName = "cloud".parse().unwrap();
-        let (mut link, mut path) = (Budgets::default(), PathBudget::default());
-        // Told before there is anything to follow.
-        path.set_needed(start, 100_000.0);
-        link.set(start, budgets(1e6, &[], true, PACKETS), 1_296);
-        link.fit(start, &cloud, 1_296, &mut path);
-        path.outage(start);
-        let capacity = path.capacity().unwrap();
-        assert_eq!(capacity.state, State::SlowStart);
-        assert!((capacity.bytes_per_s - 125_000.0).abs() < 1.0, "{capacity:?}");
-    }
-
-    #[test]
-    fn without_budgets_nobody_waits() {
-        let now = Instant::now();
-        let layer = "fog".parse().unwrap();
-        let mut budgets = Budgets::default();
-        let mut path = PathBudget::default();
-        for _ in 0..1_000 {
-            assert!(budgets.may_send(now, &layer, &mut path));
-            budgets.spend(now, &layer, &mut path, 60_000);
         }
     }
 }

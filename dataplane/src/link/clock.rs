@@ -191,28 +191,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_offset_is_that_of_the_shortest_exchange() {
-        let mut offset = ClockOffset::default();
-        assert_eq!(offset.get(), None);
-        // The peer is 1 s ahead. The second exchange was held up for 80 ms on the way back.
-        for (there, back) in [(10, 10), (10, 90), (20, 20)] {
-            let ms = 1_000_000u64;
-            let t1 = 5_000 * ms;
-            let t2 = t1 + there * ms + 1_000 * ms;
-            let t3 = t2 + 7 * ms;
-            let t4 = t3 + back * ms - 1_000 * ms;
-            let clock = Clock {
-                sent_wall_ns: t3,
-                echo_wall_ns: t2,
-                echo_received_wall_ns: t1,
-                ..Clock::default()
-            };
-            offset.exchange(&clock, t4, Duration::from_millis(there + back));
-        }
-        assert_eq!(offset.get(), Some((1_000_000_000, Duration::from_millis(10))));
-    }
-
-    #[test]
     fn round_trips_smooth_and_show_queueing() {
         let now = Instant::now();
         let mut trip = RoundTrip::default();

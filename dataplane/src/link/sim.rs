@@ -12,43 +12,7 @@ use bytes::Bytes;
 use super::flights::Flights;
 use super::transport::Endpoint;
 use super::{Engine, EngineConfig, LaneId, Limits, LinkEvent, StreamKey, Submit, Tally};
-
-/// Random numbers from a seed (SplitMix64).
-#[derive(Debug, Clone)]
-pub(crate) struct Random(u64);
-
-impl Random {
-    pub(crate) fn new(seed: u64) -> Self {
-        Self(seed)
-    }
-
-    pub(crate) fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
-    }
-
-    /// A number below `end`; 0 if that is 0.
-    pub(crate) fn below(&mut self, end: u64) -> u64 {
-        if end == 0 { 0 } else { self.next() % end }
-    }
-
-    /// From 0 to 1.
-    #[allow(clippy::cast_precision_loss, reason = "53 bits fit")]
-    pub(crate) fn share(&mut self) -> f64 {
-        (self.next() >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    pub(crate) fn chance(&mut self, share: f64) -> bool {
-        self.share() < share
-    }
-
-    pub(crate) fn duration(&mut self, end: Duration) -> Duration {
-        Duration::from_nanos(self.below(u64::try_from(end.as_nanos()).unwrap()))
-    }
-}
+use crate::testing::Random;
 
 /// What a path does to datagrams.
 #[derive(Debug, Clone, Copy, Default)]
@@ -96,7 +60,7 @@ pub(crate) struct Network {
 impl Network {
     pub(crate) fn new(seed: u64, weather: Weather) -> Self {
         Self {
-            random: Random::new(seed),
+            random: Random(seed),
             weather,
             paths: HashMap::new(),
             cuts: HashSet::new(),
@@ -244,17 +208,30 @@ impl Post {
     }
 
     pub(crate) fn large(stream: u32, bytes: usize) -> Self {
-        Self {
-            class: Priority::Bulk,
-            bytes,
-            ..Self::small(stream)
-        }
+        Self::small(stream).class(Priority::Bulk).bytes(bytes)
+    }
+
+    pub(crate) fn class(self, class: Priority) -> Self {
+        Self { class, ..self }
+    }
+
+    pub(crate) fn bytes(self, bytes: usize) -> Self {
+        Self { bytes, ..self }
+    }
+
+    pub(crate) fn lifespan(self, lifespan: Option<Duration>) -> Self {
+        Self { lifespan, ..self }
+    }
+
+    /// Of those that wait only the newest stays.
+    pub(crate) fn newest(self) -> Self {
+        Self { keep_newest: 1, ..self }
     }
 }
 
 /// The content that a message of a stream has.
 pub(crate) fn payload(stream: u32, sequence: u64, bytes: usize) -> Bytes {
-    let mut random = Random::new(u64::from(stream) << 32 | sequence);
+    let mut random = Random(u64::from(stream) << 32 | sequence);
     let mut content = Vec::with_capacity(bytes + 8);
     while content.len() < bytes {
         content.extend(random.next().to_le_bytes());

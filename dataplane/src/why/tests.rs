@@ -4,9 +4,10 @@ use blaze_domain::{DropReason, Durability, Reliability};
 use serde_json::json;
 
 use super::*;
-use crate::plan::tests::generate::{Dice, System};
+use crate::plan::tests::generate::System;
 use crate::plan::tests::worlds::{ask, entry, filter, id, offer, rules, topic, world};
 use crate::plan::{PlanRules, TopicPlan, plan_topic};
+use crate::testing::Random;
 use crate::world::World;
 
 /// A question, with everything well: each planned bridge is up and carried ten messages.
@@ -456,7 +457,7 @@ fn a_target_is_a_layer_a_node_or_a_service() {
 fn why_and_the_planner_agree_in_random_systems() {
     let mut compared = 0;
     for seed in 0..300 {
-        let mut system = System::random(&mut Dice(seed));
+        let mut system = System::random(&mut Random(seed));
         for view in system.world.flows.values_mut() {
             (view.state, view.reach) = (FlowState::Ready, Reach::Up);
         }

@@ -1,28 +1,15 @@
 //! Frames as a camera sees them, for tests and measurements.
 
+use crate::testing::Random;
+
 /// 640×480 RGB.
 pub(crate) const FRAME_BYTES: usize = WIDTH * HEIGHT * 3;
 const WIDTH: usize = 640;
 const HEIGHT: usize = 480;
 
-/// The same numbers for the same seed (SplitMix64).
-#[derive(Debug, Clone)]
-pub(crate) struct Noise(pub(crate) u64);
-
-impl Noise {
-    /// The next 64 bits.
-    pub(crate) fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut mixed = self.0;
-        mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        mixed ^ (mixed >> 31)
-    }
-}
-
 /// One frame: planes of light that fall off, edges, and a sensor whose noise changes every fourth byte or so by one.
 pub(crate) fn frame(number: u64) -> Vec<u8> {
-    let mut noise = Noise(number);
+    let mut noise = Random(number);
     let moved = usize::try_from(number % 640).unwrap_or(0) * 3;
     let mut out = Vec::with_capacity(FRAME_BYTES);
     for y in 0..HEIGHT {

@@ -64,47 +64,6 @@ fn what_is_ready_waits_for_what_came_before_in_its_line() {
     );
 }
 
-#[test]
-fn what_comes_to_nothing_holds_nobody_up_and_a_ticket_is_good_once() {
-    let mut queue = Queue::new(ROOMY);
-    let key = (1, 'a');
-    wait(&mut queue, key, 1, 100, 0);
-    queue.push_ready(key, 2, 10).unwrap();
-    let (first, _) = begin(&mut queue).unwrap();
-    assert_eq!(queue.give_up(&first), Some(1));
-    assert_eq!(pop_all(&mut queue, key), [2]);
-    assert!(queue.give_up(&first).is_none() && queue.begun(&first).is_none() && !queue.finish(&first, 1));
-    wait(&mut queue, key, 3, 1, 0);
-    wait(&mut queue, key, 4, 1, 0);
-    let (third, _) = begin(&mut queue).unwrap();
-    let (fourth, _) = begin(&mut queue).unwrap();
-    assert!(queue.finish(&fourth, 1) && !queue.finish(&fourth, 1));
-    assert_eq!(queue.give_up(&fourth), None, "what is ready stays");
-    assert!(queue.finish(&third, 1));
-    assert_eq!(pop_all(&mut queue, key), [3, 4]);
-    assert_eq!(begin(&mut queue), None);
-}
-
-#[test]
-fn of_what_waits_the_newest_stay_and_what_is_begun() {
-    let mut queue = Queue::new(ROOMY);
-    let key = (1, 'a');
-    for item in 0..4 {
-        assert!(wait(&mut queue, key, item, 10, 0).is_empty());
-    }
-    let (first, _) = begin(&mut queue).unwrap();
-    // What is to be done soon is not meant.
-    queue.push_waiting(key, Urgency::Quick, 9, 10, 1);
-    assert_eq!(wait(&mut queue, key, 4, 10, 2), [1, 2]);
-    assert_eq!(queue.held(), Waiting { items: 4, bytes: 40 });
-    assert_eq!(queue.waits(LONG), Waiting { items: 2, bytes: 20 });
-    assert_eq!(wait(&mut queue, key, 5, 10, 1), [3, 4]);
-    let (last, item) = begin(&mut queue).unwrap();
-    assert_eq!((item, begin(&mut queue)), (5, None));
-    assert!(queue.finish(&first, 1) && queue.finish(&last, 1));
-    assert_eq!(pop_all(&mut queue, key), [0], "the quick one comes before the last");
-}
-
 /// A frame that replaces a waiting one has waited as long as that: else who publishes often would never be begun with.
 #[test]
 fn who_gives_way_leaves_its_turn_to_the_newer_one() {
@@ -135,61 +94,6 @@ fn turns_go_round_groups_and_within_them_round_lines() {
     let order: Vec<u32> = std::iter::from_fn(|| begin(&mut queue)).map(|(_, item)| item).collect();
     assert_eq!(order, [0, 20, 30, 10, 21, 1, 11, 2, 3]);
     assert_eq!(queue.begin(Urgency::Quick).map(|(_, item)| *item), Some(40));
-}
-
-/// Whoever wants the newest alone gets it, also where fewer fit than may wait.
-#[test]
-fn where_bytes_are_short_the_oldest_give_way() {
-    let mut queue = Queue::new(Bounds {
-        waiting_of_one: 30,
-        ..ROOMY
-    });
-    wait(&mut queue, (1, 'a'), 1, 12, 3);
-    wait(&mut queue, (1, 'a'), 2, 12, 3);
-    assert_eq!(wait(&mut queue, (1, 'a'), 3, 12, 3), [1]);
-    assert_eq!(wait(&mut queue, (1, 'a'), 4, 25, 3), [2, 3]);
-    // Another line has nothing of its own to give.
-    let pushed = queue.push_waiting((1, 'b'), LONG, 5, 12, 3);
-    assert_eq!((pushed.gave_way.len(), pushed.refused), (0, Some((5, Full::Group))));
-}
-
-#[test]
-fn full_is_said_and_one_alone_always_fits() {
-    let mut queue = Queue::new(Bounds {
-        items: 4,
-        bytes: 100,
-        items_of_one: 3,
-        bytes_of_one: 60,
-        waiting_of_one: 30,
-    });
-    let full = |queue: &mut Queue, key: Key, bytes: usize| {
-        let refused = queue.push_waiting(key, LONG, 7, bytes, 0).refused;
-        refused.map(|(item, full)| {
-            assert_eq!(item, 7);
-            full
-        })
-    };
-    wait(&mut queue, (1, 'a'), 1, 1_000, 0);
-    assert_eq!(full(&mut queue, (1, 'b'), 0), Some(Full::Group));
-    assert_eq!(queue.push_ready((2, 'a'), 5, 1), Err((5, Full::All)));
-    let (large, _) = begin(&mut queue).unwrap();
-    assert_eq!(queue.give_up(&large), Some(1));
-    wait(&mut queue, (1, 'a'), 1, 20, 0);
-    assert_eq!(full(&mut queue, (1, 'b'), 11), Some(Full::Group), "too much waits");
-    let (begun, _) = begin(&mut queue).unwrap();
-    wait(&mut queue, (1, 'b'), 2, 30, 0);
-    assert_eq!(queue.push_ready((1, 'b'), 7, 11), Err((7, Full::Group)), "bytes");
-    queue.push_ready((1, 'b'), 3, 10).unwrap();
-    assert_eq!(queue.push_ready((1, 'c'), 7, 0), Err((7, Full::Group)), "items");
-    assert_eq!(full(&mut queue, (2, 'a'), 41), Some(Full::All), "bytes of all");
-    queue.push_ready((2, 'a'), 0, 40).unwrap();
-    assert_eq!(queue.push_ready((3, 'a'), 8, 0), Err((8, Full::All)), "items of all");
-    // Who makes room for himself fits; where that is not enough nothing gives way.
-    assert_eq!(wait(&mut queue, (1, 'b'), 4, 30, 1), [2]);
-    let refused = queue.push_waiting((1, 'b'), LONG, 5, 31, 1);
-    assert_eq!((refused.gave_way.len(), refused.refused), (0, Some((5, Full::Group))));
-    assert!(queue.finish(&begun, 1));
-    assert_eq!(pop_all(&mut queue, (1, 'a')), [1]);
 }
 
 #[test]

@@ -1,21 +1,8 @@
 //! Every turn ends, whatever else happens; those that matter most go first.
 
 use super::*;
+use crate::testing::{eventually, on_threads};
 use std::sync::atomic::{AtomicBool, AtomicUsize};
-
-const DEADLINE: Duration = Duration::from_secs(20);
-
-fn on_threads() -> Spawner {
-    Box::new(|name, run| std::thread::Builder::new().name(name).spawn(run).map(|_| ()))
-}
-
-fn eventually(mut holds: impl FnMut() -> bool) {
-    let until = Instant::now() + DEADLINE;
-    while !holds() {
-        assert!(Instant::now() < until, "not within {DEADLINE:?}");
-        std::thread::sleep(Duration::from_millis(1));
-    }
-}
 
 /// Turns that do not end before they may.
 #[derive(Default)]
@@ -179,17 +166,6 @@ fn stopped_under_load_it_ends() {
 }
 
 #[test]
-fn dropped_it_ends_too() {
-    let gate = Arc::<Gate>::default();
-    let pool = gate.busy_pool();
-    let shared = Arc::clone(&pool.shared);
-    drop(pool);
-    gate.open();
-    eventually(|| shared.state.lock().threads == 0);
-    eventually(|| Arc::strong_count(&shared) == 1);
-}
-
-#[test]
 fn more_and_fewer_threads_while_it_runs() {
     let gate = Arc::<Gate>::default();
     let pool = gate.busy_pool();
@@ -209,20 +185,6 @@ fn more_and_fewer_threads_while_it_runs() {
     }
     pool.resize(0).unwrap();
     eventually(|| pool.counters().threads == 1);
-}
-
-#[test]
-fn threads_that_wait_for_work_end_as_well() {
-    let gate = Arc::<Gate>::default();
-    let pool = gate.pool(6);
-    // So that they wait; if one does not yet it is all the easier.
-    let a_moment = Duration::from_millis(50);
-    std::thread::sleep(a_moment);
-    pool.resize(2).unwrap();
-    eventually(|| pool.counters().threads == 2);
-    std::thread::sleep(a_moment);
-    pool.stop();
-    eventually(|| pool.counters().threads == 0);
 }
 
 #[test]

@@ -16,21 +16,9 @@ use crate::lane::press::CompressionRules;
 use crate::lane::writer::NewWriter;
 use crate::link::{EngineConfig, Limits};
 use crate::plan::{Bridge, LaneSpec, Target, TopicPlan};
+use crate::testing::{eventually, on_threads};
 
-const DEADLINE: Duration = Duration::from_secs(20);
 const BYTES: usize = 200_000;
-
-fn eventually(mut holds: impl FnMut() -> bool) {
-    let until = Instant::now() + DEADLINE;
-    while !holds() {
-        assert!(Instant::now() < until, "not within {DEADLINE:?}");
-        std::thread::sleep(Duration::from_millis(1));
-    }
-}
-
-fn on_threads() -> Spawner {
-    Box::new(|name, run| std::thread::Builder::new().name(name).spawn(run).map(|_| ()))
-}
 
 #[derive(Default)]
 struct Collector(Mutex<Vec<Frame>>);

@@ -348,39 +348,6 @@ fn bare_payloads_get_an_identity_of_this_life_of_the_flow() {
     assert_eq!(bench.out.bare.lock().len(), 2);
 }
 
-#[test]
-fn messages_of_origins_that_may_not_publish_are_dropped() {
-    let file = serde_json::json!({
-        "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "robot-1"}, "brokers": {"node": {"memory": {}}},
-        "flow": {"access": [{"match": "imu/**", "advertise": {"deny": ["edge/robot-1/imu", "fog"]}}]},
-    });
-    let (file, _) = blaze_domain::node_file::NodeFile::read(&file).unwrap();
-    let info = TopicInfo {
-        node: BareInfo {
-            service: "imu".into(),
-            ..BareInfo::default()
-        },
-        access: file.flow.access.of(&"imu/data".parse().unwrap()),
-        ..TopicInfo::default()
-    };
-    let mut bench = Bench::new(vec![bridge(Scope::Node, to_cloud())]);
-    bench.apply(vec![bridge(Scope::Node, to_cloud())], info);
-    let bare = Content::Bare {
-        payload: Bytes::from_static(b"a"),
-        identity: None,
-    };
-    bench.take(Scope::Node, vec![bare]);
-    assert_eq!(bench.link.submitted.len(), 0);
-    assert_eq!(bench.drops(), vec![(DropReason::ForeignOrigin, 1)]);
-    bench.apply(vec![bridge(Scope::Node, to_cloud())], TopicInfo::default());
-    let bare = Content::Bare {
-        payload: Bytes::from_static(b"a"),
-        identity: None,
-    };
-    bench.take(Scope::Node, vec![bare]);
-    assert_eq!(bench.link.submitted.len(), 1, "without rules everybody may");
-}
-
 /// What the rules of a node file say of the topic that do not let these publish it.
 fn refusing(origins: &[&str]) -> TopicInfo {
     let file = serde_json::json!({
@@ -532,21 +499,6 @@ fn a_bridge_that_is_no_longer_planned_drains_and_comes_back_with_its_counters() 
     bench.take(Scope::Node, vec![Content::Frame(frame(1, 3, "robot-1", 0, 1))]);
     let bridges = &bench.core.path(bench.topic).bridges;
     assert_eq!((bridges.len(), bridges[0].stats.taken.messages), (1, 2));
-}
-
-#[test]
-fn topics_are_bounded() {
-    let mut bench = Bench::new(Vec::new());
-    for n in 1..MAX_TOPICS {
-        assert!(
-            bench
-                .core
-                .intern(&format!("t{n}").parse().unwrap(), bench.now)
-                .is_some()
-        );
-    }
-    assert!(bench.core.intern(&"one-more".parse().unwrap(), bench.now).is_none());
-    assert!(bench.core.intern(&"t5".parse().unwrap(), bench.now).is_some());
 }
 
 proptest! {
@@ -752,21 +704,6 @@ fn a_bridge_without_a_writer_has_failed_and_reads_nothing() {
     bench.write_with(Err("no such name"));
     bench.apply(Vec::new(), TopicInfo::default());
     assert!(bench.core.path(bench.topic).bridges[0].is_over());
-}
-
-#[test]
-fn the_writer_of_a_layer_gets_one_hop_and_the_link_none() {
-    let mut bench = Bench::new(vec![
-        bridge(Scope::Node, Target::Layer),
-        bridge(Scope::Node, to_cloud()),
-    ]);
-    let bare = Content::Bare {
-        payload: Bytes::from_static(b"{}"),
-        identity: None,
-    };
-    bench.take(Scope::Node, vec![bare]);
-    assert_eq!(bench.out.frames.lock()[0].hops(), 1, "Redis to Kafka on one flow");
-    assert_eq!(bench.link.submitted[0].2.hops(), 0, "the link adds its own");
 }
 
 #[test]

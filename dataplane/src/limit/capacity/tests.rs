@@ -1,7 +1,8 @@
 mod garbage;
 mod simulator;
 
-use simulator::{Demand, Link, Random, Simulator};
+use crate::testing::Random;
+use simulator::{Demand, Link, Simulator};
 
 use super::*;
 

@@ -6,26 +6,7 @@ use std::time::Duration;
 
 use super::tests::{DISCOVERY, endpoint, free_domain, start, wait_for};
 use super::*;
-
-/// Small, so that a failure can be repeated.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        self.0
-    }
-
-    fn below(&mut self, limit: usize) -> usize {
-        usize::try_from(self.next() % limit.max(1) as u64).unwrap()
-    }
-
-    fn bytes(&mut self, count: usize) -> Vec<u8> {
-        (0..count).map(|_| self.next().to_le_bytes()[0]).collect()
-    }
-}
+use crate::testing::Random;
 
 const PREFIX: std::ops::Range<usize> = 8..20;
 
@@ -111,38 +92,38 @@ fn user_data(prefix: &[u8]) -> Vec<Vec<u8>> {
 
 /// A datagram that was changed in one of the ways that find faults in parsers.
 fn mutate(random: &mut Random, captured: &[Vec<u8>]) -> Vec<u8> {
-    let mut datagram = captured[random.below(captured.len())].clone();
-    match random.below(6) {
-        0 => datagram.truncate(random.below(datagram.len() + 1)),
+    let mut datagram = captured[random.index(captured.len())].clone();
+    match random.index(6) {
+        0 => datagram.truncate(random.index(datagram.len() + 1)),
         1 => {
-            let length = random.below(1500);
+            let length = random.index(1500);
             datagram = random.bytes(length);
         }
         2 => {
-            let length = random.below(200);
+            let length = random.index(200);
             datagram.truncate(20);
             datagram.extend(random.bytes(length));
         }
         3 => {
             // Lengths, counts and numbers at their limits.
-            let at = 20 + random.below(datagram.len().saturating_sub(24));
-            let extreme = [0, 0xff, 0x7f, 0x80][random.below(4)];
-            let end = (at + 1 + random.below(8)).min(datagram.len());
+            let at = 20 + random.index(datagram.len().saturating_sub(24));
+            let extreme = [0, 0xff, 0x7f, 0x80][random.index(4)];
+            let end = (at + 1 + random.index(8)).min(datagram.len());
             if let Some(bytes) = datagram.get_mut(at..end) {
                 bytes.fill(extreme);
             }
         }
         4 => {
-            let other = &captured[random.below(captured.len())];
-            let cut = 20 + random.below(datagram.len().saturating_sub(20));
+            let other = &captured[random.index(captured.len())];
+            let cut = 20 + random.index(datagram.len().saturating_sub(20));
             datagram.truncate(cut);
             datagram.extend_from_slice(other.get(20..).unwrap_or_default());
         }
         _ => {
-            for _ in 0..=random.below(8) {
-                let at = random.below(datagram.len());
+            for _ in 0..=random.index(8) {
+                let at = random.index(datagram.len());
                 if let Some(byte) = datagram.get_mut(at) {
-                    *byte = random.next().to_le_bytes()[0];
+                    *byte = random.byte();
                 }
             }
         }
@@ -153,7 +134,7 @@ fn mutate(random: &mut Random, captured: &[Vec<u8>]) -> Vec<u8> {
 /// Datagrams that make an unprotected RustDDS 0.15 allocate up to gigabytes each, in the name of every writer and reader
 /// of discovery that a participant has.
 fn bombs(prefix: &[u8], random: &mut Random) -> Vec<Vec<u8>> {
-    let little = random.below(2) == 0;
+    let little = random.index(2) == 0;
     let half = |value: u16| {
         if little {
             value.to_le_bytes()
@@ -262,8 +243,8 @@ fn attack() {
     let mut sent = 0_u64;
     while begin.elapsed() < Duration::from_secs(3) {
         let mut datagrams = vec![mutate(&mut random, &captured)];
-        if random.below(20) == 0 {
-            let prefix = &known[random.below(known.len())];
+        if random.index(20) == 0 {
+            let prefix = &known[random.index(known.len())];
             datagrams.extend(bombs(prefix, &mut random));
         }
         for (datagram, port) in datagrams

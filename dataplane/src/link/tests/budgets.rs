@@ -55,10 +55,7 @@ fn publish(sim: &mut Sim, to: &[usize], image: usize, milliseconds: u64) {
             let stream = u32::try_from(10 * to).unwrap();
             // Nobody takes them while the peer is down.
             if step % 5 == 0 {
-                let post = Post {
-                    keep_newest: 1,
-                    ..Post::large(stream, image)
-                };
+                let post = Post::large(stream, image).newest();
                 let _ = sim.publish(0, *to, post);
             }
             let _ = sim.publish(0, *to, Post::small(stream + 1));
@@ -103,11 +100,12 @@ fn cut(sim: &mut Sim) {
 fn after_an_outage_a_link_begins_low_and_with_what_is_small() {
     for needed in [0.0, 100_000.0] {
         let mut sim = Sim::new(1, Weather::delay(25), &["edge/a", "fog/b"]);
+        // Told before there is anything to follow.
+        let told = BTreeMap::from([(sim.id(1), needed)]);
+        sim.nodes[0].engine.set_needed(sim.now, &told);
         limit(&mut sim, &[], true);
         sim.run_ms(1_500);
         publish(&mut sim, &[1], 100_000, 3_000);
-        let told = BTreeMap::from([(sim.id(1), needed)]);
-        sim.nodes[0].engine.set_needed(sim.now, &told);
         assert_eq!(capacity(&sim).state, State::Unknown);
         cut(&mut sim);
         let begins = capacity(&sim);

@@ -5,13 +5,14 @@ use std::time::Duration;
 use blaze_domain::{DropReason, Priority};
 
 use super::super::event::{LaneId, LinkEvent};
-use super::super::sim::{Post, Random, Sim, Weather};
+use super::super::sim::{Post, Sim, Weather};
 use super::{bad_weather, seeds};
+use crate::testing::Random;
 
 #[test]
 fn reliable_messages_arrive_all_in_order_and_once() {
     for seed in seeds() {
-        let mut random = Random::new(seed);
+        let mut random = Random(seed);
         let weather = bad_weather(&mut random, 0.05);
         let mut sim = Sim::new(seed, weather, &["edge/a", "fog/b"]);
         sim.run_to(Duration::from_secs(2), "up", |sim| {
@@ -22,11 +23,7 @@ fn reliable_messages_arrive_all_in_order_and_once() {
             let stream = u32::try_from(random.below(4)).unwrap();
             let class = Priority::ALL[stream as usize % 3];
             let bytes = if random.chance(0.05) { 5_000 } else { 200 };
-            let post = Post {
-                class,
-                bytes,
-                ..Post::reliable(stream)
-            };
+            let post = Post::reliable(stream).class(class).bytes(bytes);
             sim.publish(0, 1, post).unwrap();
             counts[stream as usize] += 1;
             sim.run(random.duration(Duration::from_millis(10)));
@@ -53,7 +50,7 @@ fn reliable_messages_arrive_all_in_order_and_once() {
 #[test]
 fn best_effort_messages_arrive_in_order_and_once() {
     for seed in seeds() {
-        let mut random = Random::new(seed);
+        let mut random = Random(seed);
         let weather = Weather {
             jitter: Duration::from_millis(3),
             ..bad_weather(&mut random, 0.05)
@@ -79,7 +76,7 @@ fn best_effort_messages_arrive_in_order_and_once() {
 #[test]
 fn large_frames_are_repaired() {
     for seed in seeds().step_by(10) {
-        let mut random = Random::new(seed);
+        let mut random = Random(seed);
         let loss = 0.01 + 0.04 * random.share();
         let weather = Weather {
             delay: Duration::from_millis(25),
@@ -91,10 +88,7 @@ fn large_frames_are_repaired() {
         sim.nodes[0].rate = Some(12_500_000.0);
         sim.run_ms(1_000);
         for _ in 0..5 {
-            let post = Post {
-                lifespan: Some(Duration::from_secs(2)),
-                ..Post::large(1, 1_000_000)
-            };
+            let post = Post::large(1, 1_000_000).lifespan(Some(Duration::from_secs(2)));
             sim.publish(0, 1, post).unwrap();
             sim.publish(0, 1, Post::small(2)).unwrap();
             sim.run_ms(200);
@@ -168,7 +162,7 @@ fn the_last_message_is_repaired_by_a_probe() {
 #[test]
 fn an_outage_shorter_than_down_loses_nothing_reliable() {
     for seed in seeds().step_by(4) {
-        let mut random = Random::new(seed);
+        let mut random = Random(seed);
         // Without loss of Hello beside the outage, the peers are never down.
         let weather = bad_weather(&mut random, 0.0);
         let mut sim = Sim::new(seed, weather, &["edge/a", "fog/b"]);
@@ -179,15 +173,7 @@ fn an_outage_shorter_than_down_loses_nothing_reliable() {
                 sim.network.set_partition(&a, &b, true);
             }
             let bytes = if step % 7 == 0 { 6_000 } else { 100 };
-            sim.publish(
-                0,
-                1,
-                Post {
-                    bytes,
-                    ..Post::reliable(1)
-                },
-            )
-            .unwrap();
+            sim.publish(0, 1, Post::reliable(1).bytes(bytes)).unwrap();
             sim.run_ms(18);
             if step == 99 {
                 sim.network.set_partition(&a, &b, false);
@@ -216,10 +202,7 @@ fn an_outage_shorter_than_down_loses_nothing_reliable() {
 fn lifespan_ends_at_both_ends() {
     let mut sim = Sim::new(1, Weather::delay(40), &["edge/a", "fog/b"]);
     sim.run_ms(1_000);
-    let span = |milliseconds| Post {
-        lifespan: Some(Duration::from_millis(milliseconds)),
-        ..Post::reliable(1)
-    };
+    let span = |milliseconds| Post::reliable(1).lifespan(Some(Duration::from_millis(milliseconds)));
     // Too old on arrival.
     sim.publish(0, 1, span(30)).unwrap();
     sim.run_ms(300);
@@ -258,14 +241,11 @@ fn a_reliable_message_of_which_nothing_came_is_counted_once() {
     for lifespan in [None, Some(Duration::from_millis(300))] {
         let mut sim = Sim::new(1, Weather::delay(20), &["edge/a", "fog/b"]);
         sim.run_ms(1_500);
-        let post = Post {
-            lifespan,
-            ..Post::reliable(1)
-        };
+        let post = Post::reliable(1).lifespan(lifespan);
         sim.publish(0, 1, post).unwrap();
         sim.run_ms(200);
         lose_large_ones(&mut sim);
-        sim.publish(0, 1, Post { bytes: 700, ..post }).unwrap();
+        sim.publish(0, 1, post.bytes(700)).unwrap();
         sim.run_ms(1);
         sim.publish(0, 1, post).unwrap();
         // Others go on, so that the class is active.
@@ -300,15 +280,7 @@ fn a_repair_that_comes_after_all_does_not_make_a_message_out_that_was_given_up()
     sim.run_ms(1_500);
     lose_large_ones(&mut sim);
     let start = sim.now;
-    sim.publish(
-        0,
-        1,
-        Post {
-            bytes: 700,
-            ..Post::reliable(1)
-        },
-    )
-    .unwrap();
+    sim.publish(0, 1, Post::reliable(1).bytes(700)).unwrap();
     sim.run_ms(1);
     sim.publish(0, 1, Post::reliable(1)).unwrap();
     while sim.sequences(1, 1).is_empty() {
@@ -399,15 +371,7 @@ fn feedback_comes_as_often_as_agreed() {
         count.set(0);
         for _ in 0..1_000 / every {
             for _ in 0..posts {
-                sim.publish(
-                    0,
-                    1,
-                    Post {
-                        bytes: 1_000,
-                        ..Post::small(1)
-                    },
-                )
-                .unwrap();
+                sim.publish(0, 1, Post::small(1).bytes(1_000)).unwrap();
             }
             sim.run_ms(every);
         }

@@ -9,7 +9,8 @@ mod order;
 
 use std::time::Duration;
 
-use super::sim::{Random, Weather};
+use super::sim::Weather;
+use crate::testing::Random;
 
 /// Seeds that each property runs with.
 #[allow(clippy::disallowed_methods, reason = "how long a test runs is no configuration")]

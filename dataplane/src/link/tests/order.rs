@@ -4,9 +4,10 @@ use std::time::Duration;
 
 use blaze_domain::Priority;
 
-use super::super::sim::{Post, Random, Sim, Weather};
+use super::super::sim::{Post, Sim, Weather};
 use super::super::wire::{HEADER_BYTES, RECORD_BYTES};
 use super::seeds;
+use crate::testing::Random;
 
 /// Loses the first datagram of user messages from `edge`, of that class, with at least so many bytes.
 fn lose_first(sim: &mut Sim, wanted: Priority, at_least: usize) {
@@ -26,10 +27,7 @@ fn a_lost_packet_delays_only_its_own_stream() {
         let mut sim = Sim::new(1, Weather::delay(20), &["edge/a", "fog/b"]);
         sim.run_ms(1_500);
         lose_first(&mut sim, class, 0);
-        let post = |stream| Post {
-            class,
-            ..Post::reliable(stream)
-        };
+        let post = |stream| Post::reliable(stream).class(class);
         let start = sim.now;
         sim.publish(0, 1, post(1)).unwrap();
         sim.run_ms(1);
@@ -56,7 +54,7 @@ fn a_lost_packet_delays_only_its_own_stream() {
 #[test]
 fn a_control_message_waits_for_one_datagram_at_most() {
     for seed in seeds().step_by(10) {
-        let mut random = Random::new(seed);
+        let mut random = Random(seed);
         let mut sim = Sim::new(seed, Weather::delay(5), &["edge/a", "fog/b", "cloud/c"]);
         sim.run_ms(1_500);
         // A datagram takes 13 ms.
@@ -64,24 +62,13 @@ fn a_control_message_waits_for_one_datagram_at_most() {
         for to in [1, 2] {
             sim.publish(0, to, Post::large(1, 400_000)).unwrap();
             for _ in 0..50 {
-                sim.publish(
-                    0,
-                    to,
-                    Post {
-                        bytes: 1_000,
-                        ..Post::small(2)
-                    },
-                )
-                .unwrap();
+                sim.publish(0, to, Post::small(2).bytes(1_000)).unwrap();
             }
         }
         for _ in 0..10 {
             sim.run(Duration::from_millis(50) + random.duration(Duration::from_millis(50)));
             let at = sim.now;
-            let urgent = Post {
-                class: Priority::Control,
-                ..Post::reliable(3)
-            };
+            let urgent = Post::reliable(3).class(Priority::Control);
             sim.publish(0, 1, urgent).unwrap();
             sim.run_ms(60);
             let delivered = sim.nodes[1].delivered.iter().rev();
@@ -103,15 +90,7 @@ fn peers_of_one_class_take_turns() {
     sim.nodes[0].rate = Some(200_000.0);
     for to in [1, 2] {
         for _ in 0..40 {
-            sim.publish(
-                0,
-                to,
-                Post {
-                    bytes: 1_000,
-                    ..Post::small(1)
-                },
-            )
-            .unwrap();
+            sim.publish(0, to, Post::small(1).bytes(1_000)).unwrap();
         }
     }
     sim.run_ms(250);
@@ -152,15 +131,7 @@ fn a_chunked_message_does_not_wait_for_lost_best_effort_ones() {
     lose_first(&mut sim, Priority::State, 0);
     sim.publish(0, 1, Post::small(1)).unwrap();
     sim.run_ms(1);
-    sim.publish(
-        0,
-        1,
-        Post {
-            bytes: 5_000,
-            ..Post::small(1)
-        },
-    )
-    .unwrap();
+    sim.publish(0, 1, Post::small(1).bytes(5_000)).unwrap();
     sim.run_ms(25);
     assert_eq!(sim.sequences(1, 1), [2]);
 }

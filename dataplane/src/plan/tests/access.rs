@@ -3,22 +3,12 @@
 use blaze_domain::WhyCode;
 use serde_json::{Value, json};
 
-use super::worlds::{entry, id, offer, request, rules, topic, world};
-use crate::plan::{Destination, PlanRules, Target, TopicPlan, plan_topic};
+use super::worlds::{entry, id, list, offer, request, rows, rules, topic, ways, world};
+use crate::plan::{Destination, PlanRules, TopicPlan, plan_topic};
 use crate::world::{Source, World};
 
 fn plan(world: &World) -> TopicPlan {
     plan_topic(world, &topic(), &PlanRules::default(), None)
-}
-
-/// `node>layer`, `inter>node`, `node>cloud/c`: the bridges of a plan.
-fn ways(plan: &TopicPlan) -> Vec<String> {
-    let way = |bridge: &crate::plan::Bridge| match &bridge.to {
-        Target::Node { .. } => format!("{}>node", bridge.from),
-        Target::Layer => format!("{}>layer", bridge.from),
-        Target::Inter { receiver, .. } => format!("{}>{receiver}", bridge.from),
-    };
-    plan.bridges.iter().map(way).collect()
 }
 
 /// Flows, and layers, that the rules leave without the topic.
@@ -42,114 +32,38 @@ fn advertise_rule(deny: &[&str]) -> Value {
     json!({"advertise": {"deny": deny}})
 }
 
-/// A case: its name, the rules of the first flow, the flows, its bridges, whom the rules leave without the topic.
-type Row<'a> = (&'a str, Value, &'a [&'a str], &'a [&'a str], &'a [&'a str]);
-
-fn check(rows: &[Row<'_>]) {
-    for (name, rule, lines, expected, left) in rows {
-        let mut world = world(lines);
-        world.access = rules(rule.clone());
+/// Rows: the rule of the first flow | the flows | bridges of the first | whom the rule leaves without the topic | name.
+fn check(text: &str) {
+    for [rule, lines, expected, left, name] in rows(text) {
+        let words: Vec<&str> = rule.split(' ').collect();
+        let mut world = world(&list(lines));
+        world.access = rules(json!({words[0]: {words[1]: words[2..]}}));
         let plan = plan(&world);
-        assert_eq!(ways(&plan), *expected, "{name}: {lines:?}");
-        assert_eq!(denied(&plan), *left, "{name}: {lines:?} {:?}", plan.blocked);
+        assert_eq!(ways(&plan), list(expected), "{name}: {lines}");
+        assert_eq!(denied(&plan), list(left), "{name}: {lines} {:?}", plan.blocked);
     }
 }
 
+/// Leases of services are not announced: a rule that names a service fits none of another flow.
 #[test]
 fn requesters_of_other_flows_that_the_rules_refuse_are_not_served() {
-    check(&[
-        (
-            "a node of another layer",
-            request_rule(&["c"]),
-            &["e/a@1 node+", "c/b node-"],
-            &[],
-            &["c/b"],
-        ),
-        (
-            "services of another layer",
-            request_rule(&["c"]),
-            &["e/a node+", "c/b@1 layer-"],
-            &[],
-            &["c"],
-        ),
-        (
-            "one of two layers",
-            request_rule(&["c"]),
-            &["e/a node+", "c/b node-", "f/c node-"],
-            &["node>f/c"],
-            &["c/b"],
-        ),
-        (
-            "only one layer is allowed",
-            json!({"request": {"allow": ["f"]}}),
-            &["e/a node+", "c/b node-", "f/c node-"],
-            &["node>f/c"],
-            &["c/b"],
-        ),
-        (
-            "one of two nodes that share nothing",
-            request_rule(&["c/b"]),
-            &["e/a node+", "c/b node-", "c/d node-"],
-            &["node>c/d"],
-            &["c/b"],
-        ),
-        (
-            "one of two nodes that share a broker: the other one receives, and everybody there may read it",
-            request_rule(&["c/b"]),
-            &["e/a node+", "c/b@1 node-", "c/d@1 node-"],
-            &["node>c/d"],
-            &[],
-        ),
-        (
-            "what the layer publishes",
-            request_rule(&["c"]),
-            &["e/a@1 layer+", "c/b node-"],
-            &[],
-            &["c/b"],
-        ),
-        (
-            "a node of the own layer",
-            request_rule(&["e/b"]),
-            &["e/a@1 node+", "e/b@1 node-"],
-            &[],
-            &["e/b"],
-        ),
-        (
-            "a member that the gateway takes in for",
-            request_rule(&["e/b"]),
-            &["e/a@1", "e/b@1 member node-", "c/x node+"],
-            &[],
-            &["e/b"],
-        ),
-        (
-            "nobody tells services, so a rule against one of another flow fits none",
-            request_rule(&["c/b/spy"]),
-            &["e/a node+", "c/b node-"],
-            &["node>c/b"],
-            &[],
-        ),
-        (
-            "nor does one that allows a service",
-            json!({"request": {"allow": ["c/b/logger"]}}),
-            &["e/a node+", "c/b node-"],
-            &[],
-            &["c/b"],
-        ),
-        (
-            "a service of the own layer that another flow granted and this one did not",
-            request_rule(&["e/*/logger"]),
-            &["e/a@1 node+", "e/b@1 layer-"],
-            &[],
-            &["e"],
-        ),
-        (
-            "a service of the own layer that this one granted, too",
-            request_rule(&["e/*/logger"]),
-            &["e/a@1 node+ layer-", "e/b@1 layer-"],
-            &["node>layer"],
-            &[],
-        ),
-    ]);
+    check(
+        "
+        request deny c | e/a@1 node+, c/b node- | | c/b | a node of another layer
+        request deny c | e/a node+, c/b@1 layer- | | c | services of another layer
+        request deny c | e/a node+, c/b node-, f/c node- | node>f/c | c/b | one of two layers
+        request allow f | e/a node+, c/b node-, f/c node- | node>f/c | c/b | only one layer is allowed
+        request deny c/b | e/a node+, c/b node-, c/d node- | node>c/d | c/b | one of two nodes that share nothing
+        request deny c/b | e/a node+, c/b@1 node-, c/d@1 node- | node>c/d | | of one broker the other node receives
+        request deny c | e/a@1 layer+, c/b node- | | c/b | what the layer publishes
+        request deny e/b | e/a@1 node+, e/b@1 node- | | e/b | a node of the own layer
+        request deny e/b | e/a@1, e/b@1 member node-, c/x node+ | | e/b | a member behind the gateway
+        request deny c/b/spy | e/a node+, c/b node- | node>c/b | | a service of another flow
+        request allow c/b/logger | e/a node+, c/b node- | | c/b | an allowed service of another flow
+        request deny e/*/logger | e/a@1 node+, e/b@1 layer- | | e | a lease that only another flow granted
+        request deny e/*/logger | e/a@1 node+ layer-, e/b@1 layer- | node>layer | | one that this flow granted, too
+        ",
+    );
 }
 
 /// Others choose who receives without knowing the rules, so a refused requester still counts among those who could.
@@ -190,53 +104,19 @@ fn to_a_member_the_origin_of_requests_from_outside_is_unknown() {
     }
 }
 
+/// What a refused publisher sends all the same is dropped where it comes in.
 #[test]
 fn who_is_reached_by_none_but_refused_publishers_is_told() {
-    let allow = |service: &str| json!({"advertise": {"allow": [format!("*/*/{service}")]}});
-    check(&[
-        (
-            "a publisher of another layer; what it sends all the same is dropped where it comes in",
-            advertise_rule(&["c"]),
-            &["f/a node-", "c/x node+"],
-            &["inter>node"],
-            &["f/a"],
-        ),
-        (
-            "for services of the layer",
-            advertise_rule(&["c"]),
-            &["f/a@1 layer-", "c/x@1 layer+"],
-            &["inter>layer"],
-            &["f"],
-        ),
-        (
-            "one of two publishers",
-            advertise_rule(&["c"]),
-            &["f/a node-", "c/x node+", "e/y node+"],
-            &["inter>node"],
-            &[],
-        ),
-        (
-            "the own node publishes, too",
-            advertise_rule(&["c"]),
-            &["f/a node+ node-", "c/x node+"],
-            &["inter>node"],
-            &[],
-        ),
-        (
-            "a service that is allowed",
-            allow("driver"),
-            &["f/a node-", "c/x node+"],
-            &["inter>node"],
-            &[],
-        ),
-        (
-            "another one is allowed",
-            allow("joystick"),
-            &["f/a node-", "c/x node+"],
-            &["inter>node"],
-            &["f/a"],
-        ),
-    ]);
+    check(
+        "
+        advertise deny c | f/a node-, c/x node+ | inter>node | f/a | a publisher of another layer
+        advertise deny c | f/a@1 layer-, c/x@1 layer+ | inter>layer | f | for services of the layer
+        advertise deny c | f/a node-, c/x node+, e/y node+ | inter>node | | one of two publishers
+        advertise deny c | f/a node+ node-, c/x node+ | inter>node | | the own node publishes, too
+        advertise allow */*/driver | f/a node-, c/x node+ | inter>node | | a service that is allowed
+        advertise allow */*/joystick | f/a node-, c/x node+ | inter>node | f/a | another one is allowed
+        ",
+    );
 }
 
 #[test]

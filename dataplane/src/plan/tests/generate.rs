@@ -9,37 +9,12 @@ use crate::plan::Survey;
 use crate::plan::told::{told_inside, told_outside};
 
 use super::worlds::{advertise, flow, request, topic};
+use crate::testing::Random;
 use crate::world::{
     Advertise, FlowState, LayerScopeId, OriginFilter, Reach, Request, Role, ScopeEntry, Source, TopicEntry, World,
 };
 
 const SERVICES: [&str; 3] = ["driver", "filter", "logger"];
-
-/// SplitMix64: the same worlds everywhere for the same seed.
-pub(crate) struct Dice(pub(crate) u64);
-
-impl Dice {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
-    }
-
-    /// `0..count`
-    pub(crate) fn below(&mut self, count: usize) -> usize {
-        (self.next() % count as u64) as usize
-    }
-
-    pub(crate) fn percent(&mut self, chance: usize) -> bool {
-        self.below(100) < chance
-    }
-
-    pub(crate) fn pick<'a, T>(&mut self, from: &'a [T]) -> &'a T {
-        &from[self.below(from.len())]
-    }
-}
 
 /// A system: what all flows know, and who really publishes.
 #[derive(Clone)]
@@ -51,18 +26,18 @@ pub(crate) struct System {
 }
 
 impl System {
-    pub(crate) fn random(dice: &mut Dice) -> Self {
+    pub(crate) fn random(dice: &mut Random) -> Self {
         let mut flows = BTreeMap::new();
-        for l in 0..3 + dice.below(4) {
+        for l in 0..3 + dice.index(4) {
             let kind = *dice.pick(LayerKind::ALL);
             // Brokers of different layers may have one number; in one layer there may be two, or flows without.
-            let brokers: &[Option<u64>] = match dice.below(4) {
+            let brokers: &[Option<u64>] = match dice.index(4) {
                 0 => &[None],
                 1 => &[Some(1)],
                 2 => &[Some(1), Some(1), None],
                 _ => &[Some(1), Some(2), None],
             };
-            for n in 0..1 + dice.below(4) {
+            for n in 0..1 + dice.index(4) {
                 let mut view = flow(*dice.pick(brokers));
                 view.kind = kind;
                 let name: FlowId = format!("layer-{l}/n{l}{n}").parse().unwrap();
@@ -91,9 +66,9 @@ impl System {
 
     /// One with a group of more than 16 flows, where some flows of each group are not on the inter scope. Types and
     /// sources that are not named are left out: where a gateway tells of several scopes as of one, they match more than they do.
-    pub(crate) fn with_gateways(dice: &mut Dice) -> Self {
+    pub(crate) fn with_gateways(dice: &mut Random) -> Self {
         let mut system = Self::random(dice);
-        for n in 0..17 + dice.below(6) {
+        for n in 0..17 + dice.index(6) {
             let name: FlowId = format!("layer-9/n9{n}").parse().unwrap();
             system.nodes.push(name.node.to_string());
             system.world.flows.insert(name, flow(Some(1)));
@@ -169,37 +144,37 @@ impl System {
     }
 
     /// Something happens somewhere.
-    pub(crate) fn change(&mut self, dice: &mut Dice) {
+    pub(crate) fn change(&mut self, dice: &mut Random) {
         let id = dice.pick(&self.ids()).clone();
-        match dice.below(3) {
+        match dice.index(3) {
             0 => self.reroll_flow(dice, &id),
             1 => self.reroll_node(dice, &id),
             _ => self.reroll_layer(dice, &id),
         }
     }
 
-    fn reroll_flow(&mut self, dice: &mut Dice, id: &FlowId) {
+    fn reroll_flow(&mut self, dice: &mut Random, id: &FlowId) {
         let view = self.world.flows.get_mut(id).unwrap();
         view.node_scope = dice.percent(80);
-        view.state = match dice.below(12) {
+        view.state = match dice.index(12) {
             0 => FlowState::Starting,
             1 => FlowState::Draining,
             _ => FlowState::Ready,
         };
-        view.reach = match dice.below(12) {
+        view.reach = match dice.index(12) {
             0 => Reach::Down,
             1 => Reach::Suspect,
             _ => Reach::Up,
         };
     }
 
-    fn reroll_node(&mut self, dice: &mut Dice, id: &FlowId) {
+    fn reroll_node(&mut self, dice: &mut Random, id: &FlowId) {
         let entry = self.scope_entry(dice, Some(id.node.as_str()));
         self.entry(id).node = entry;
     }
 
     /// Flows that share a broker know the same of it.
-    fn reroll_layer(&mut self, dice: &mut Dice, id: &FlowId) {
+    fn reroll_layer(&mut self, dice: &mut Random, id: &FlowId) {
         let entry = self.scope_entry(dice, None);
         let broker = self.world.flows[id].layer_scope;
         for other in self.ids() {
@@ -214,15 +189,15 @@ impl System {
         self.world.flows.get_mut(id).unwrap().topics.entry(topic()).or_default()
     }
 
-    fn scope_entry(&self, dice: &mut Dice, node: Option<&str>) -> ScopeEntry {
+    fn scope_entry(&self, dice: &mut Random, node: Option<&str>) -> ScopeEntry {
         ScopeEntry {
             advertise: dice.percent(30).then(|| self.advertise(dice, node)),
             request: dice.percent(35).then(|| self.request(dice)),
         }
     }
 
-    fn advertise(&self, dice: &mut Dice, node: Option<&str>) -> Advertise {
-        let sources = 1 + dice.below(2);
+    fn advertise(&self, dice: &mut Random, node: Option<&str>) -> Advertise {
+        let sources = 1 + dice.index(2);
         let mut sources: Vec<Source> = (0..sources)
             .map(|_| Source {
                 node: match node {
@@ -243,16 +218,16 @@ impl System {
         }
     }
 
-    fn request(&self, dice: &mut Dice) -> Request {
-        let filters = if dice.percent(60) { 0 } else { 1 + dice.below(2) };
+    fn request(&self, dice: &mut Random) -> Request {
+        let filters = if dice.percent(60) { 0 } else { 1 + dice.index(2) };
         let from = (0..filters)
             .map(|_| OriginFilter {
-                layer: dice.percent(40).then(|| format!("layer-{}", dice.below(6))),
+                layer: dice.percent(40).then(|| format!("layer-{}", dice.index(6))),
                 node: dice.percent(30).then(|| dice.pick(&self.nodes).clone()),
                 service: dice.percent(40).then(|| (*dice.pick(&SERVICES)).to_owned()),
             })
             .collect();
-        let wish = dice.below(4);
+        let wish = dice.index(4);
         Request {
             from,
             type_name: type_name(dice),
@@ -283,8 +258,8 @@ impl System {
     }
 }
 
-fn type_name(dice: &mut Dice) -> String {
-    ["", "", "", "a/A", "b/B"][dice.below(5)].to_owned()
+fn type_name(dice: &mut Random) -> String {
+    ["", "", "", "a/A", "b/B"][dice.index(5)].to_owned()
 }
 
 /// Whether two flows use one layer broker.

@@ -5,10 +5,11 @@ use std::collections::BTreeMap;
 
 use blaze_domain::FlowId;
 
-use super::generate::{Dice, System};
+use super::generate::System;
 use super::simulate::{Intake, Simulation, is_live};
 use super::worlds::topic;
 use crate::plan::{PlanRules, Survey, Target, TopicPlan, plan_topic, plan_within};
+use crate::testing::Random;
 
 type Plans = BTreeMap<FlowId, TopicPlan>;
 
@@ -40,7 +41,7 @@ fn each_message_reaches_each_requester_once_over_one_path() {
     let mut carried = 0;
     let mut bridges = 0;
     for seed in 0..worlds() {
-        let system = System::random(&mut Dice(seed));
+        let system = System::random(&mut Random(seed));
         let plans = plans(&system, &Plans::new());
         for intake in [Intake::Bridges, Intake::Delivery] {
             let mut simulation = Simulation::new(&system, &plans, intake);
@@ -66,7 +67,7 @@ fn behind_gateways_each_message_reaches_each_requester_once_over_one_path() {
     let (mut carried, mut over_gateways) = (0, 0);
     let worlds = worlds() / 8;
     for seed in 0..worlds {
-        let mut dice = Dice(seed ^ 0x6A7E);
+        let mut dice = Random(seed ^ 0x6A7E);
         let mut system = System::with_gateways(&mut dice);
         let mut past = Plans::new();
         for step in 0..3 {
@@ -103,7 +104,7 @@ fn behind_gateways_each_message_reaches_each_requester_once_over_one_path() {
 #[test]
 fn it_stays_so_while_the_system_changes_and_receivers_stay() {
     for seed in 0..worlds() / 8 {
-        let mut dice = Dice(seed ^ 0xC0FFEE);
+        let mut dice = Random(seed ^ 0xC0FFEE);
         let mut system = System::random(&mut dice);
         let mut past = plans(&system, &Plans::new());
         for step in 0..8 {
@@ -121,7 +122,7 @@ fn it_stays_so_while_the_system_changes_and_receivers_stay() {
 fn nothing_moves_without_a_reason() {
     let mut kept = 0;
     for seed in 0..worlds() / 4 {
-        let mut dice = Dice(seed ^ 0xBEEF);
+        let mut dice = Random(seed ^ 0xBEEF);
         let mut system = System::random(&mut dice);
         let past = plans(&system, &Plans::new());
         assert_eq!(
@@ -160,9 +161,9 @@ fn nothing_moves_without_a_reason() {
 #[test]
 fn equal_worlds_give_equal_plans_in_one_order() {
     for seed in 0..200 {
-        let system = System::random(&mut Dice(seed));
+        let system = System::random(&mut Random(seed));
         let first = plans(&system, &Plans::new());
-        assert_eq!(first, plans(&System::random(&mut Dice(seed)), &Plans::new()));
+        assert_eq!(first, plans(&System::random(&mut Random(seed)), &Plans::new()));
         for plan in first.values() {
             let keys: Vec<_> = plan.bridges.iter().map(|bridge| (bridge.from, &bridge.to)).collect();
             assert!(keys.is_sorted() && keys.windows(2).all(|pair| pair[0] != pair[1]));
@@ -176,7 +177,7 @@ fn equal_worlds_give_equal_plans_in_one_order() {
 #[test]
 fn what_happens_elsewhere_changes_nothing() {
     for seed in 0..200 {
-        let mut dice = Dice(seed);
+        let mut dice = Random(seed);
         let mut system = System::random(&mut dice);
         let before = plans(&system, &Plans::new());
         let other = "other/topic".parse::<blaze_domain::TopicName>().unwrap();

@@ -3,7 +3,7 @@
 use blaze_domain::node_file::{TopicRule, TopicValues};
 use blaze_domain::{Durability, Priority, Reliability, Scope, WhyCode};
 
-use super::worlds::{ask, entry, filter, id, offer, topic, world};
+use super::worlds::{ask, entry, filter, id, list, offer, rows, topic, ways, world};
 use crate::plan::{Delivery, Destination, PlanRules, Target, TopicPlan, delivery, owner, plan_topic};
 use crate::world::{Reach, Source, World};
 
@@ -11,151 +11,43 @@ fn plan(world: &World) -> TopicPlan {
     plan_topic(world, &topic(), &PlanRules::default(), None)
 }
 
-/// `node>layer`, `inter>bare`, `node>cloud/c`: the bridges of a plan.
-fn ways(plan: &TopicPlan) -> Vec<String> {
-    let way = |bridge: &crate::plan::Bridge| match &bridge.to {
-        Target::Node { bare: false } => format!("{}>node", bridge.from),
-        Target::Node { bare: true } => format!("{}>bare", bridge.from),
-        Target::Layer => format!("{}>layer", bridge.from),
-        Target::Inter { layer, receiver } => {
-            assert_eq!(*layer, receiver.layer);
-            format!("{}>{receiver}", bridge.from)
-        }
-    };
-    plan.bridges.iter().map(way).collect()
-}
+/// Rows: a rule | flows | bridges of the first one.
+const RULES: &str = "
+    a pair on one node needs no bridge | e/a node+ node- |
+    a bare request on the same node gets a copy | e/a node+ node-b | node>bare
+    a pair on the layer scope needs no bridge | e/a@1 layer+ layer- |
+    an advertisement alone makes nothing | e/a@1 node+, c/b@1 |
+    a request alone makes nothing | e/a@1 node-, c/b@1 |
+    node to layer for a service there | e/a@1 node+ layer- | node>layer
+    node to layer for another node of the layer | e/a@1 node+, e/b@1 node- | node>layer
+    that node takes it from the layer | e/b@1 node-, e/a@1 node+ | layer>node
+    layer to node for what the layer publishes | e/a@1 layer+ node- | layer>node
+    bare from the layer | e/a@1 layer+ node-b | layer>bare
+    node to another layer | e/a@1 node+, c/b node- | node>c/b
+    that layer takes it to its node | c/b node-, e/a@1 node+ | inter>node
+    that layer takes it to its bare node | c/b node-b, e/a@1 node+ | inter>bare
+    that layer takes it to its layer scope | c/b@1 layer-, e/a@1 node+ | inter>layer
+    node and layer of the receiver | c/b@1 node- layer-, e/a node+ | inter>node, inter>layer
+    the layer publishes for another layer | e/a@1 layer+, c/b node- | layer>c/b
+    one copy per layer that asks | e/a node+, c/b@1 layer-, f/c node- | node>c/b, node>f/c
+    no layer broker in common: over the inter scope | e/a@1 node+, e/b@2 node- | node>e/b
+    no layer broker at all: over the inter scope | e/a node+, e/b node-, e/c node- | node>e/b, node>e/c
+    same broker number in another layer is another broker | e/a@1 node+, c/b@1 node- | node>c/b
+    a flow that is down receives nothing | e/a node+, c/b@1 down node- |
+    a suspect one stays a receiver | e/a node+, c/b@1 suspect node- | node>c/b
+    a starting one is no receiver | e/a node+, c/b@1 starting node- |
+    a draining one is no receiver | e/a node+, c/b@1 draining node- |
+    nothing while starting | e/a@1 starting node+ node-b layer-, c/b node- |
+    nothing while draining | e/a@1 draining node+ layer-, c/b node- node+ |
+    a draining publisher sends nothing to take in | c/b node-, e/a draining node+ |
+    what was told of oneself does not count | e/a down node+, c/b node- | node>c/b
+    a requester of the own layer is no way out | e/a@1 node-, e/b@1 layer-, c/c@1 layer- |
+";
 
 #[test]
 fn bridges_of_each_rule() {
-    let rows: &[(&str, &[&str], &[&str])] = &[
-        ("a pair on one node needs no bridge", &["e/a node+ node-"], &[]),
-        (
-            "a bare request on the same node gets a copy",
-            &["e/a node+ node-b"],
-            &["node>bare"],
-        ),
-        (
-            "a pair on the layer scope needs no bridge",
-            &["e/a@1 layer+ layer-"],
-            &[],
-        ),
-        ("an advertisement alone makes nothing", &["e/a@1 node+", "c/b@1"], &[]),
-        ("a request alone makes nothing", &["e/a@1 node-", "c/b@1"], &[]),
-        (
-            "node to layer for a service there",
-            &["e/a@1 node+ layer-"],
-            &["node>layer"],
-        ),
-        (
-            "node to layer for another node of the layer",
-            &["e/a@1 node+", "e/b@1 node-"],
-            &["node>layer"],
-        ),
-        (
-            "that node takes it from the layer",
-            &["e/b@1 node-", "e/a@1 node+"],
-            &["layer>node"],
-        ),
-        (
-            "layer to node for what the layer publishes",
-            &["e/a@1 layer+ node-"],
-            &["layer>node"],
-        ),
-        ("bare from the layer", &["e/a@1 layer+ node-b"], &["layer>bare"]),
-        ("node to another layer", &["e/a@1 node+", "c/b node-"], &["node>c/b"]),
-        (
-            "that layer takes it to its node",
-            &["c/b node-", "e/a@1 node+"],
-            &["inter>node"],
-        ),
-        (
-            "that layer takes it to its bare node",
-            &["c/b node-b", "e/a@1 node+"],
-            &["inter>bare"],
-        ),
-        (
-            "that layer takes it to its layer scope",
-            &["c/b@1 layer-", "e/a@1 node+"],
-            &["inter>layer"],
-        ),
-        (
-            "node and layer of the receiver",
-            &["c/b@1 node- layer-", "e/a node+"],
-            &["inter>node", "inter>layer"],
-        ),
-        (
-            "the layer publishes for another layer",
-            &["e/a@1 layer+", "c/b node-"],
-            &["layer>c/b"],
-        ),
-        (
-            "one copy per layer that asks",
-            &["e/a node+", "c/b@1 layer-", "f/c node-"],
-            &["node>c/b", "node>f/c"],
-        ),
-        (
-            "no layer broker in common: over the inter scope",
-            &["e/a@1 node+", "e/b@2 node-"],
-            &["node>e/b"],
-        ),
-        (
-            "no layer broker at all: over the inter scope",
-            &["e/a node+", "e/b node-", "e/c node-"],
-            &["node>e/b", "node>e/c"],
-        ),
-        (
-            "same broker number in another layer is another broker",
-            &["e/a@1 node+", "c/b@1 node-"],
-            &["node>c/b"],
-        ),
-        (
-            "a flow that is down receives nothing",
-            &["e/a node+", "c/b@1 down node-"],
-            &[],
-        ),
-        (
-            "a suspect one stays a receiver",
-            &["e/a node+", "c/b@1 suspect node-"],
-            &["node>c/b"],
-        ),
-        (
-            "a starting one is no receiver",
-            &["e/a node+", "c/b@1 starting node-"],
-            &[],
-        ),
-        (
-            "a draining one is no receiver",
-            &["e/a node+", "c/b@1 draining node-"],
-            &[],
-        ),
-        (
-            "nothing while starting",
-            &["e/a@1 starting node+ node-b layer-", "c/b node-"],
-            &[],
-        ),
-        (
-            "nothing while draining",
-            &["e/a@1 draining node+ layer-", "c/b node- node+"],
-            &[],
-        ),
-        (
-            "a draining publisher sends nothing to take in",
-            &["c/b node-", "e/a draining node+"],
-            &[],
-        ),
-        (
-            "what was told of oneself does not count",
-            &["e/a down node+", "c/b node-"],
-            &["node>c/b"],
-        ),
-        (
-            "a requester of the own layer is no way out",
-            &["e/a@1 node-", "e/b@1 layer-", "c/c@1 layer-"],
-            &[],
-        ),
-    ];
-    for (rule, lines, expected) in rows {
-        assert_eq!(ways(&plan(&world(lines))), *expected, "{rule}: {lines:?}");
+    for [rule, lines, expected] in rows(RULES) {
+        assert_eq!(ways(&plan(&world(&list(lines)))), list(expected), "{rule}: {lines}");
     }
 }
 

@@ -6,6 +6,7 @@ use blaze_domain::node_file::{AccessRules, AutoBool, NodeFile};
 use blaze_domain::{Durability, FlowId, LayerKind, Reliability, TopicName};
 use serde_json::{Value, json};
 
+use crate::plan::{Bridge, Target, TopicPlan};
 use crate::world::{
     Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, Role, ScopeEntry,
     Source, TopicEntry, World,
@@ -174,4 +175,32 @@ pub(crate) fn offer<'a>(world: &'a mut World, flow: &str, scope: &str) -> &'a mu
 
 pub(crate) fn ask<'a>(world: &'a mut World, flow: &str, scope: &str) -> &'a mut Request {
     entry(world, flow, scope).request.as_mut().unwrap()
+}
+
+/// `node>layer`, `inter>bare`, `node>cloud/c`: the bridges of a plan.
+pub(crate) fn ways(plan: &TopicPlan) -> Vec<String> {
+    let way = |bridge: &Bridge| match &bridge.to {
+        Target::Node { bare: false } => format!("{}>node", bridge.from),
+        Target::Node { bare: true } => format!("{}>bare", bridge.from),
+        Target::Layer => format!("{}>layer", bridge.from),
+        Target::Inter { layer, receiver } => {
+            assert_eq!(*layer, receiver.layer);
+            format!("{}>{receiver}", bridge.from)
+        }
+    };
+    plan.bridges.iter().map(way).collect()
+}
+
+/// The rows of a table: one per line, with `|` between its cells.
+pub(crate) fn rows<const CELLS: usize>(table: &str) -> impl Iterator<Item = [&str; CELLS]> {
+    let lines = table.lines().filter(|line| !line.trim().is_empty());
+    lines.map(|line| {
+        let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+        cells.try_into().expect(line)
+    })
+}
+
+/// The items of a cell, with commas between them.
+pub(crate) fn list(cell: &str) -> Vec<&str> {
+    cell.split(", ").filter(|item| !item.is_empty()).collect()
 }

@@ -360,31 +360,6 @@ fn one_of_several_replicas_answers() {
     assert!(answered.iter().all(|count| *count > 5), "{answered:?}");
 }
 
-#[test]
-fn leases_survive_as_the_messages_that_made_them() {
-    let now = Instant::now();
-    let mut first = registry(now);
-    send(
-        &mut first,
-        now,
-        Scope::Node,
-        &json!([
-            {"op": "advertise", "topic": "imu", "service": "a", "epoch": 9, "ttl_s": 0, "rate_hz": 50.5, "priority": "control"},
-            {"op": "request", "topic": "imu", "service": "b", "bare": true, "from": {"node": "robot-2"}, "depth": 3},
-        ]),
-    );
-    let messages: Vec<_> = first.leases().map(|lease| lease.to_message()).collect();
-    let mut second = registry(now);
-    for payload in ControlMessage::to_payloads(&messages) {
-        assert_eq!(second.control(now, Scope::Node, &payload).faults, 0);
-    }
-    assert_eq!(first.world(), second.world());
-    assert_eq!(second.local_advertisers(&topic("imu")).count(), 1);
-    let request = second.leases_of(&topic("imu")).nth(1).unwrap();
-    assert_eq!(request.expires_in(now), Some(Duration::from_secs(15)));
-    assert_eq!(request.quality().depth, 3);
-}
-
 /// The sum of two such rates is no number any more, and nothing would be left for others.
 #[test]
 fn what_nobody_can_publish_counts_as_the_most_that_one_can() {
@@ -565,20 +540,5 @@ fn ten_thousand_leases_of_one_topic_are_taken() {
     let entry = &registry.world().own().unwrap().topics[&topic("t")];
     assert!(entry.node.request.as_ref().unwrap().from.is_empty());
     assert_eq!(registry.expire(now + Duration::from_secs(15)).events.len(), 10_000);
-    assert_eq!(registry.lease_count(), 0);
-}
-
-#[test]
-fn messages_of_the_sdk_do_what_they_say() {
-    let now = Instant::now();
-    let mut registry = registry(now);
-    let common = |name: &str| (topic(name), "svc".parse().unwrap());
-    let (name, service) = common("a");
-    let advertise = ControlMessage::Advertise(AdvertiseMessage::new(name, service));
-    let (name, service) = common("a");
-    let withdraw = ControlMessage::Withdraw(WithdrawMessage::new(name, service));
-    send(&mut registry, now, Scope::Node, &advertise.to_json());
-    assert_eq!(registry.lease_count(), 1);
-    send(&mut registry, now, Scope::Node, &withdraw.to_json());
     assert_eq!(registry.lease_count(), 0);
 }

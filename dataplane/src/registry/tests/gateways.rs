@@ -206,19 +206,3 @@ fn what_goes_makes_room_for_what_comes_in_the_same_delta() {
     assert_eq!((changed.len(), faults.too_many_entries), (2, 0));
     assert!(topics.contains_key(&topic("a")) && topics.len() == MAX_ENTRIES);
 }
-
-#[test]
-fn how_long_to_wait_is_reckoned_only_where_something_is_to_be_asked_for() {
-    let mut remote = Remote::new();
-    let now = Instant::now();
-    let mut reckoned = 0;
-    let mut hello = |version, digest| {
-        remote.on_hello(now, version, digest, || {
-            reckoned += 1;
-            MS
-        });
-    };
-    (0..10).for_each(|_| hello(0, 0));
-    (0..10).for_each(|_| hello(1, 7));
-    assert_eq!(reckoned, 1);
-}

@@ -9,7 +9,7 @@ mod sync;
 use std::time::Duration;
 
 use blaze_domain::LayerKind;
-use blaze_domain::control::{AdvertiseMessage, ControlMessage, RequestMessage, WithdrawMessage};
+use blaze_domain::control::{AdvertiseMessage, ControlMessage, RequestMessage};
 use blaze_domain::node_file::AccessRules;
 use blaze_proto::link::link_control::{Hello, Kind, State};
 use serde_json::{Value, json};

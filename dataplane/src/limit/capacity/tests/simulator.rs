@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use super::super::{Capacity, Seen};
+use crate::testing::Random;
 
 /// Bytes of a datagram.
 pub(super) const DATAGRAM: usize = 1400;
@@ -11,33 +12,6 @@ pub(super) const DATAGRAM: usize = 1400;
 const PLACES: u64 = 1024;
 /// Milliseconds of one entry of the log.
 const ENTRY: u64 = 100;
-
-/// Random numbers from a seed (SplitMix64, public domain, Vigna).
-#[derive(Debug, Clone)]
-pub(super) struct Random(pub(super) u64);
-
-impl Random {
-    pub(super) fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
-    }
-
-    /// A number below `end`, which is not 0.
-    pub(super) fn below(&mut self, end: u64) -> u64 {
-        self.next() % end
-    }
-
-    /// From 0 to 1.
-    pub(super) fn share(&mut self) -> f64 {
-        (self.next() >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    pub(super) fn chance(&mut self, share: f64) -> bool {
-        self.share() < share
-    }
-}
 
 /// The path from the sender to the receiver.
 #[derive(Debug, Clone, Copy)]

@@ -157,64 +157,6 @@ fn what_has_become_too_old_is_not_compressed() {
 }
 
 #[test]
-fn without_a_pool_any_more_what_waits_is_dropped_and_the_rest_goes_as_it_is() {
-    let mut hands = Hands::new(vec![lane("cloud/c", true)]);
-    hands.publish_all(1, 1..=3, LARGE);
-    hands.publish(1, 4, 100);
-    hands.begin(Urgency::Long);
-    let Bench { core, link, now, .. } = &mut hands.bench;
-    core.stop_compression(*now, link);
-    assert_eq!(hands.dropped(0), [(DropReason::Shutdown, 2)]);
-    hands.publish(1, 5, LARGE);
-    assert!(!hands.bench.core.has_turns());
-    assert_eq!(hands.sent(), [], "one is being compressed");
-    hands.end(0);
-    hands.publish(1, 6, LARGE);
-    let raw: Vec<bool> = hands
-        .bench
-        .link
-        .submitted
-        .iter()
-        .map(|(.., frame)| !frame.is_compressed())
-        .collect();
-    assert_eq!(raw, [false, true, true, true]);
-    assert_eq!(hands.sent(), [(0, 1, 1), (0, 1, 4), (0, 1, 5), (0, 1, 6)]);
-    hands.check();
-}
-
-#[test]
-fn where_the_codec_fails_the_message_goes_as_it_is() {
-    let mut hands = Hands::new(vec![lane("cloud/c", true)]);
-    hands.publish_all(1, 1..=2, LARGE);
-    hands.begin(Urgency::Long);
-    hands.begin(Urgency::Long);
-    hands.end_with(0, Done::Failed);
-    hands.end_as(0, None, 1);
-    let sizes: Vec<usize> = hands
-        .bench
-        .link
-        .submitted
-        .iter()
-        .map(|(.., frame)| frame.payload().len())
-        .collect();
-    assert_eq!(sizes, [LARGE, LARGE]);
-    assert_eq!(hands.bench.core.press_counters().failed, 1);
-    hands.check();
-}
-
-#[test]
-fn only_the_same_writer_waits() {
-    let mut hands = Hands::new(vec![lane("cloud/c", true)]);
-    hands.publish(1, 1, LARGE);
-    hands.publish(2, 1, 100);
-    assert_eq!(hands.sent(), [(0, 2, 1)]);
-    hands.publish(1, 2, 100);
-    assert_eq!(hands.sent(), []);
-    hands.run();
-    assert_eq!(hands.sent(), [(0, 1, 1), (0, 1, 2)]);
-}
-
-#[test]
 fn a_receiver_that_does_not_decompress_gets_what_was_published() {
     let mut hands = Hands::new(vec![lane("cloud/c", true), lane("fog/f", true)]);
     let old = |name: &str| -> FlowId { name.parse().unwrap() };
