@@ -11,6 +11,7 @@ mod open;
 mod outbox;
 pub mod port;
 pub mod redis;
+pub mod retained;
 mod worker_side;
 
 pub use open::{OpenError, check_layer, open_layer, open_node};

@@ -85,6 +85,43 @@ pub struct BrokerStatus {
     pub since: Instant,
 }
 
+/// The status as an adapter tells it.
+#[derive(Debug)]
+pub(crate) struct StatusCell(watch::Sender<BrokerStatus>);
+
+impl StatusCell {
+    pub(crate) fn new(health: Health, detail: String) -> Self {
+        let since = Instant::now();
+        Self(watch::Sender::new(BrokerStatus { health, detail, since }))
+    }
+
+    /// Tells a change; a closed broker stays closed. Returns whether the health is another one.
+    pub(crate) fn set(&self, health: Health, detail: &str) -> bool {
+        let mut turned = false;
+        self.0.send_if_modified(|status| {
+            turned = status.health != health && status.health != Health::Closed;
+            let changes = turned || (status.health == health && status.detail != detail);
+            if changes {
+                status.health = health;
+                detail.clone_into(&mut status.detail);
+            }
+            if turned {
+                status.since = Instant::now();
+            }
+            changes
+        });
+        turned
+    }
+
+    pub(crate) fn borrow(&self) -> watch::Ref<'_, BrokerStatus> {
+        self.0.borrow()
+    }
+
+    pub(crate) fn subscribe(&self) -> watch::Receiver<BrokerStatus> {
+        self.0.subscribe()
+    }
+}
+
 /// Why a broker refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BrokerError {
@@ -137,6 +174,18 @@ pub enum Content {
 }
 
 impl Content {
+    /// What the bytes of one message are: on a reserved channel JSON, never a frame.
+    #[must_use]
+    pub fn of(is_reserved: bool, payload: Bytes) -> Self {
+        if is_reserved {
+            return Self::Bare {
+                payload,
+                identity: None,
+            };
+        }
+        Self::from_bytes(payload)
+    }
+
     /// What the bytes of one message are, on a broker that keeps frames as one value.
     #[must_use]
     pub fn from_bytes(bytes: Bytes) -> Self {
@@ -189,6 +238,16 @@ impl Received {
             broker_age_us: 0,
             kept: false,
             place: None,
+        }
+    }
+
+    /// A message that was retained for late joiners, on a server without places.
+    #[must_use]
+    pub fn kept(content: Content, at: Instant, broker_age_us: u64) -> Self {
+        Self {
+            broker_age_us,
+            kept: true,
+            ..Self::live(content, at)
         }
     }
 }

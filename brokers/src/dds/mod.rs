@@ -4,7 +4,7 @@
 //! ```text
 //! Participant ── Writer::write ──► RustDDS event loop ──► UDP
 //!             ── Reader (a thread of its own) ──► sink(participant, octets)
-//!             ── ReaderWatch (a thread of its own) ──► sink(all remote readers)
+//!             ── EndpointWatch (a thread of its own) ──► sink(all remote readers and writers)
 //! Relay       ── repeats the participant's announcement to hosts that multicast does not reach
 //! ```
 //!
@@ -36,7 +36,7 @@ pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile};
 pub use pulse::{Illness, Pulse};
 pub use reader::{Reader, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
-pub use watch::{EndpointWatch, Endpoints, FoundReader, FoundWriter, ReaderWatch, RemoteReader};
+pub use watch::{EndpointWatch, Endpoints, FoundReader, FoundWriter};
 pub use writer::{EndpointId, Writer, Written};
 
 /// The type of all samples, IDL `sequence<octet>`.

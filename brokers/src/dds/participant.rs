@@ -17,7 +17,7 @@ use super::filter::{self, Attached, FilterError, Samples, Shape};
 use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
-use super::watch::{EndpointWatch, Endpoints, ReaderWatch, RemoteReader};
+use super::watch::{EndpointWatch, Endpoints};
 use super::writer::Writer;
 use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, announcement_port, multicast_port};
 
@@ -261,25 +261,6 @@ impl Participant {
     /// [`DdsError`] when RustDDS refuses or has died.
     pub fn reader(&self, topic: &str, profile: Profile, sink: SampleSink) -> Result<Reader, DdsError> {
         Reader::start(self.raw_reader(topic, profile)?, sink, Arc::clone(&self.failed))
-    }
-
-    /// Calls `sink` with all readers of other participants whose topics begin with `topics`, whenever one comes or
-    /// goes, and once a second.
-    ///
-    /// # Errors
-    /// [`DdsError`] when there is no thread for it.
-    pub fn watch_readers(
-        &self,
-        topics: &str,
-        sink: Box<dyn Fn(Vec<RemoteReader>) + Send>,
-    ) -> Result<ReaderWatch, DdsError> {
-        ReaderWatch::start(
-            self.dds.clone(),
-            self.prefix,
-            topics.to_owned(),
-            sink,
-            Arc::clone(&self.failed),
-        )
     }
 
     /// Calls `sink` with the readers and writers of other participants, whenever one comes or goes, and once a second.

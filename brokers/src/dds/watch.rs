@@ -1,7 +1,7 @@
 //! Which readers and writers other participants have.
 
 use std::collections::HashSet;
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,17 +19,6 @@ use super::{DdsError, GuidPrefix};
 
 /// RustDDS drops events when its queue of 2048 is full, so all readers are looked at once in this time.
 const RECONCILE: Duration = Duration::from_secs(1);
-
-/// A reader of another participant.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RemoteReader {
-    /// Its participant.
-    pub participant: GuidPrefix,
-    /// Its topic.
-    pub topic: String,
-    /// Where it takes data.
-    pub addresses: Vec<IpAddr>,
-}
 
 /// A reader of another participant, of any topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -114,33 +103,6 @@ impl EndpointWatch {
     }
 }
 
-/// Watches until it is dropped.
-pub struct ReaderWatch {
-    _thread: StoppableThread,
-}
-
-impl ReaderWatch {
-    pub(super) fn start(
-        participant: DomainParticipant,
-        own: GuidPrefix,
-        topics: String,
-        sink: Box<dyn Fn(Vec<RemoteReader>) + Send>,
-        failed: Arc<AtomicBool>,
-    ) -> Result<Self, DdsError> {
-        let thread = StoppableThread::start("dds-watch", failed, move |stop| {
-            watch(
-                &participant,
-                stop,
-                |_| {},
-                || {
-                    sink(remote_readers(&participant, own, &topics));
-                },
-            );
-        })?;
-        Ok(Self { _thread: thread })
-    }
-}
-
 fn watch(participant: &DomainParticipant, stop: &AtomicBool, mut note: impl FnMut(&Event), look: impl Fn()) {
     let listener = participant.status_listener();
     let mut events = listener.as_async_status_stream();
@@ -172,26 +134,6 @@ fn watch(participant: &DomainParticipant, stop: &AtomicBool, mut note: impl FnMu
             thread::park_timeout(next_look - now);
         }
     }
-}
-
-fn remote_readers(participant: &DomainParticipant, own: GuidPrefix, topics: &str) -> Vec<RemoteReader> {
-    participant
-        .discovered_readers()
-        .iter()
-        .filter(|reader| reader.subscription_topic_data.topic_name().starts_with(topics))
-        .map(|reader| RemoteReader {
-            participant: prefix_of(reader.reader_proxy.remote_reader_guid),
-            topic: reader.subscription_topic_data.topic_name().clone(),
-            addresses: reader
-                .reader_proxy
-                .unicast_locator_list
-                .iter()
-                .filter(|locator| locator.is_udp())
-                .map(|locator| SocketAddr::from(*locator).ip())
-                .collect(),
-        })
-        .filter(|reader| reader.participant != own)
-        .collect()
 }
 
 fn endpoints(participant: &DomainParticipant, own: GuidPrefix) -> Endpoints {

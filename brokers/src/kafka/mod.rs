@@ -53,7 +53,7 @@ use crate::open::OpenError;
 use crate::outbox::{Body, Lane};
 use crate::port::{
     Begin, Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome, Publisher,
-    PublisherOptions, Role, SubscribeOptions, Subscription,
+    PublisherOptions, Role, StatusCell, SubscribeOptions, Subscription,
 };
 use crate::worker_side::WorkerSide;
 pub use group_lease::{GroupHeld, GroupLease, GroupLeaseOptions};
@@ -113,11 +113,7 @@ impl KafkaBroker {
                 (flow.layer.to_string(), Some(Arc::new(state)), None)
             }
         };
-        let connecting = BrokerStatus {
-            health: Health::Connecting,
-            detail: format!("connecting to {}", section.bootstrap.join(", ")),
-            since: Instant::now(),
-        };
+        let connecting = format!("connecting to {}", section.bootstrap.join(", "));
         let inner = Arc::new(Inner {
             probe: names.reserved(ChannelName::control().as_str()),
             shared,
@@ -130,7 +126,7 @@ impl KafkaBroker {
             worker,
             admin: Mutex::default(),
             cluster: OnceLock::new(),
-            status: watch::Sender::new(connecting),
+            status: StatusCell::new(Health::Connecting, connecting),
             was_up: AtomicBool::new(false),
             logged_absence: AtomicBool::new(false),
             closed: AtomicBool::new(false),

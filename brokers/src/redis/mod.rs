@@ -43,7 +43,6 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 pub use gate::MAX_QUEUE_BYTES;
-pub use kept::{MAX_KEPT_BYTES, MAX_KEPT_WRITERS};
 pub use keys::{KeyChange, KeyError, Record, RedisKeys};
 pub use leases::MAX_LEASES;
 pub use lock::{RedisHeld, RedisLock};

@@ -163,9 +163,11 @@ impl Batch {
             written_ns: unix_time_ns(),
             head: head.clone(),
             payload: frame.payload().clone(),
+            line: keeper.line,
+            publisher: Arc::downgrade(to),
         };
         let mut mirror = keeper.mirror.lock();
-        if let Some(field) = mirror.keep(&key, newest, kept.depth, keeper.line, Arc::downgrade(to)) {
+        if let Some(field) = mirror.keep(&key, newest, kept.depth) {
             let size = field.size();
             self.add(hset_command(&kept.hash, &frame.writer().to_string(), field, size), size);
         }

@@ -133,12 +133,9 @@ fn kept_messages(fields: Vec<(Vec<u8>, Vec<u8>)>, hash: &str, now_ns: u64, now: 
     });
     found
         .into_iter()
-        .map(|(written_ns, frame)| Received {
-            content: Content::Frame(frame),
-            at: now,
-            broker_age_us: now_ns.saturating_sub(written_ns) / 1_000,
-            kept: true,
-            place: None,
+        .map(|(written_ns, frame)| {
+            let age_us = now_ns.saturating_sub(written_ns) / 1_000;
+            Received::kept(Content::Frame(frame), now, age_us)
         })
         .collect()
 }

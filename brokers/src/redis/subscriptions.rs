@@ -237,15 +237,7 @@ impl Subscriptions {
         if channel.stage == Stage::Asked || channel.readers.is_empty() {
             return;
         }
-        let content = if channel.reserved {
-            Content::Bare {
-                payload,
-                identity: None,
-            }
-        } else {
-            Content::from_bytes(payload)
-        };
-        let message = Received::live(content, at);
+        let message = Received::live(Content::of(channel.reserved, payload), at);
         channel.readers.retain_mut(|reader| reader.offer(message.clone()));
         if channel.readers.is_empty() {
             channels.changed.push(Arc::from(name));

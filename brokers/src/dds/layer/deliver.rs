@@ -83,15 +83,7 @@ pub(super) fn deliver(
     } else if own || is_old || !since_opened {
         return;
     }
-    let bytes = sample.into_value().0;
-    let content = if channel.is_reserved {
-        Content::Bare {
-            payload: bytes,
-            identity: None,
-        }
-    } else {
-        Content::from_bytes(bytes)
-    };
+    let content = Content::of(channel.is_reserved, sample.into_value().0);
     let at = Instant::now();
     let mut received = Received::live(content, at);
     match moment {

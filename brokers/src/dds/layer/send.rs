@@ -268,11 +268,7 @@ fn attempt(shared: &Shared, waiting: &Waiting<Target>, now: Instant) -> Option<F
 fn content(waiting: &Waiting<Target>, now: Instant, is_reserved: bool) -> Content {
     match &waiting.body {
         Body::Frame(frame) => Content::Frame(Waiting::<Target>::aged(frame, waiting.since, now)),
-        Body::Bare(payload) if is_reserved => Content::Bare {
-            payload: payload.clone(),
-            identity: None,
-        },
-        Body::Bare(payload) => Content::from_bytes(payload.clone()),
+        Body::Bare(payload) => Content::of(is_reserved, payload.clone()),
     }
 }
 

@@ -6,10 +6,11 @@ use std::sync::Arc;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::thread::Thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use parking_lot::{Mutex, RwLock};
-use tokio::sync::watch;
+#[cfg(feature = "fault-injection")]
+use parking_lot::Mutex;
+use parking_lot::RwLock;
 
 use super::DdsCounts;
 use super::channel::Channels;
@@ -19,7 +20,7 @@ use super::slot::Slots;
 use crate::dds::EndpointId;
 use crate::dds::writer::participant_of;
 use crate::outbox::{Outbox, OutboxLimits};
-use crate::port::{BrokerError, BrokerStatus, Health};
+use crate::port::{BrokerError, Health, StatusCell};
 
 /// Most bytes that wait for the network, of one publisher and of all together.
 pub const MAX_QUEUE_BYTES: usize = 64 * 1024 * 1024;
@@ -70,7 +71,7 @@ impl Counters {
 pub(super) struct Shared {
     pub(super) domain: u16,
     pub(super) address: Ipv4Addr,
-    pub(super) status: watch::Sender<BrokerStatus>,
+    pub(super) status: StatusCell,
     was_up: AtomicBool,
     pub(super) outbox: Arc<Outbox<Target>>,
     /// Messages that the sender holds, because their writer cannot take them now.
@@ -88,21 +89,14 @@ pub(super) struct Shared {
     pub(super) lifecycle: OnceLock<Thread>,
     #[cfg(feature = "fault-injection")]
     pub(super) fault: Mutex<Option<crate::dds::Fault>>,
-    /// Guards changes of the status: once closed, it stays so.
-    changing: Mutex<()>,
 }
 
 impl Shared {
     pub(super) fn new(domain: u16, address: Ipv4Addr) -> Arc<Self> {
-        let status = BrokerStatus {
-            health: Health::Connecting,
-            detail: String::new(),
-            since: Instant::now(),
-        };
         Arc::new(Self {
             domain,
             address,
-            status: watch::Sender::new(status),
+            status: StatusCell::new(Health::Connecting, String::new()),
             was_up: AtomicBool::new(false),
             outbox: Outbox::new(LIMITS),
             held: AtomicUsize::new(0),
@@ -117,7 +111,6 @@ impl Shared {
             lifecycle: OnceLock::new(),
             #[cfg(feature = "fault-injection")]
             fault: Mutex::default(),
-            changing: Mutex::default(),
         })
     }
 
@@ -140,21 +133,9 @@ impl Shared {
     }
 
     pub(super) fn set_status(&self, health: Health, detail: &str) {
-        let _changing = self.changing.lock();
-        self.status.send_if_modified(|status| {
-            let changes = status.health != Health::Closed && (status.health != health || status.detail != detail);
-            if changes {
-                if status.health != health {
-                    status.since = Instant::now();
-                }
-                if health == Health::Up {
-                    self.was_up.store(true, Ordering::Relaxed);
-                }
-                status.health = health;
-                detail.clone_into(&mut status.detail);
-            }
-            changes
-        });
+        if self.status.set(health, detail) && health == Health::Up {
+            self.was_up.store(true, Ordering::Relaxed);
+        }
     }
 
     pub(super) fn is_up(&self) -> bool {

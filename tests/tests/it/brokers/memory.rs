@@ -153,32 +153,4 @@ async fn kept_messages_tell_how_long_they_lay_there() {
     subscription.receive(&mut batch, 1).await;
     let age = u128::from(batch[0].broker_age_us);
     assert!((5_000..=before.elapsed().as_micros()).contains(&age), "{age}");
-    hub.forget_writer(&channel("t"), WriterId([1; 16]));
-    assert_eq!(hub.stats().kept_messages, 0);
-}
-
-#[tokio::test]
-async fn a_late_joiner_gets_all_that_is_kept_though_it_is_more_than_may_wait() {
-    const WRITERS: u64 = 50;
-    let hub = MemoryHub::new("crowd");
-    let broker = hub.broker();
-    let options = PublisherOptions {
-        depth: 1,
-        ..PublisherOptions::default()
-    };
-    let publisher = broker.publisher(&channel("t"), options).unwrap();
-    for sequence in 1..=WRITERS {
-        let writer = WriterId([u8::try_from(sequence).unwrap(); 16]);
-        let header = Header::new("t", Origin::default(), writer, sequence, 0);
-        publisher.publish(&Frame::new(&header, Bytes::new()).unwrap(), None);
-    }
-    let options = SubscribeOptions {
-        with_kept: true,
-        max_messages: 10,
-        ..SubscribeOptions::default()
-    };
-    let mut subscription = broker.subscribe(&channel("t"), options).await.unwrap();
-    let mut batch = Vec::new();
-    subscription.receive(&mut batch, 100).await;
-    assert_eq!((batch.len() as u64, subscription.take_dropped()), (WRITERS, 0));
 }
