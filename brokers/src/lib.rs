@@ -9,6 +9,8 @@ pub mod memory;
 mod open;
 #[allow(dead_code, reason = "each adapter uses its part, and a build may lack one")]
 mod outbox;
+#[allow(dead_code, reason = "each adapter uses its part, and a build may lack one")]
+mod pending;
 pub mod port;
 pub mod redis;
 pub mod retained;
@@ -19,4 +21,4 @@ pub use port::{
     Begin, Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, Place, PublishOutcome,
     Publisher, PublisherOptions, Received, Role, SubscribeOptions, Subscription, SubscriptionSender, subscription,
 };
-pub use worker_side::{KeyedMessage, WorkerSide, WriteError};
+pub use worker_side::{Held, KeyedMessage, WorkerSide, WriteError};

@@ -504,6 +504,13 @@ struct More {
     bytes: usize,
 }
 
+impl More {
+    fn raise(&mut self, bytes: usize) {
+        self.messages = self.messages.saturating_add(1).min(MAX_KEPT_MESSAGES);
+        self.bytes = self.bytes.saturating_add(bytes).min(MAX_KEPT_BYTES);
+    }
+}
+
 impl RingState {
     /// Takes a message in. Returns how many gave way.
     fn push(&mut self, message: Received, options: &SubscribeOptions) -> u64 {
@@ -577,36 +584,30 @@ pub fn subscription(options: SubscribeOptions) -> (SubscriptionSender, Subscript
 impl SubscriptionSender {
     /// Hands a message to the reader. Returns whether the subscription still lives.
     pub fn send(&self, message: Received) -> bool {
-        let lost = {
-            let mut state = self.ring.queue.lock();
-            if state.closed {
-                return false;
-            }
-            state.push(message, &self.ring.options)
-        };
-        self.note_lost(lost);
-        self.ring.readable.notify_one();
-        true
+        self.hand_over([message], false)
     }
 
     /// Hands messages to the reader that were kept for late joiners, at once. They raise the bounds until it has taken as
     /// many, because it cannot read while they are collected: at most by [`MAX_KEPT_MESSAGES`] and [`MAX_KEPT_BYTES`].
     /// Returns whether the subscription still lives.
     pub fn send_kept(&self, kept: impl IntoIterator<Item = Received>) -> bool {
-        let lost = {
+        self.hand_over(kept, true)
+    }
+
+    fn hand_over(&self, messages: impl IntoIterator<Item = Received>, raise_bounds: bool) -> bool {
+        let mut lost = 0;
+        {
             let mut state = self.ring.queue.lock();
             if state.closed {
                 return false;
             }
-            let mut lost = 0;
-            for message in kept {
-                let size = message.content.size();
-                state.more.messages = state.more.messages.saturating_add(1).min(MAX_KEPT_MESSAGES);
-                state.more.bytes = state.more.bytes.saturating_add(size).min(MAX_KEPT_BYTES);
+            for message in messages {
+                if raise_bounds {
+                    state.more.raise(message.content.size());
+                }
                 lost += state.push(message, &self.ring.options);
             }
-            lost
-        };
+        }
         self.note_lost(lost);
         self.ring.readable.notify_one();
         true

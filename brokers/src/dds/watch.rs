@@ -74,20 +74,7 @@ impl EndpointWatch {
         let returned = Arc::<AtomicBool>::default();
         let tell = Arc::clone(&returned);
         let thread = StoppableThread::start("dds-watch", failed, move |stop| {
-            let mut lost = HashSet::new();
-            let note = |event: &Event| match event {
-                Event::ParticipantLost { id, .. } => {
-                    if lost.len() >= MAX_LOST {
-                        lost.clear();
-                    }
-                    lost.insert(*id);
-                }
-                Event::ParticipantDiscovered { dpd } if lost.remove(&dpd.guid.prefix) => {
-                    tell.store(true, Ordering::Relaxed);
-                }
-                _ => {}
-            };
-            watch(&participant, stop, note, || sink(endpoints(&participant, own)));
+            watch(&participant, stop, &tell, || sink(endpoints(&participant, own)));
         })?;
         Ok(Self {
             _thread: thread,
@@ -103,23 +90,32 @@ impl EndpointWatch {
     }
 }
 
-fn watch(participant: &DomainParticipant, stop: &AtomicBool, mut note: impl FnMut(&Event), look: impl Fn()) {
+fn watch(participant: &DomainParticipant, stop: &AtomicBool, returned: &AtomicBool, look: impl Fn()) {
     let listener = participant.status_listener();
     let mut events = listener.as_async_status_stream();
     let waker = unpark_waker();
     let mut context = Context::from_waker(&waker);
     let mut next_look = Instant::now();
+    let mut lost = HashSet::new();
     while !stop.load(Ordering::Relaxed) {
         let mut changed = false;
         while let Poll::Ready(event) = Pin::new(&mut events).poll_next(&mut context) {
-            event.iter().for_each(&mut note);
             match event {
+                Some(Event::ParticipantLost { id, .. }) => {
+                    if lost.len() >= MAX_LOST {
+                        lost.clear();
+                    }
+                    lost.insert(id);
+                    changed = true;
+                }
+                Some(Event::ParticipantDiscovered { dpd }) if lost.remove(&dpd.guid.prefix) => {
+                    returned.store(true, Ordering::Relaxed);
+                }
                 Some(
                     Event::ReaderDetected { .. }
                     | Event::ReaderLost { .. }
                     | Event::WriterDetected { .. }
-                    | Event::WriterLost { .. }
-                    | Event::ParticipantLost { .. },
+                    | Event::WriterLost { .. },
                 ) => changed = true,
                 Some(_) => {}
                 // Both threads of RustDDS have gone; whoever watches the participant sees that too.

@@ -27,7 +27,6 @@ use super::settings::{Lot, Settings};
 use super::topic_creator::TopicCreator;
 use super::topics::Topics;
 use super::waker::ThreadWaker;
-use super::worker_side::WorkerState;
 use crate::port::{Begin, BrokerError, Health, Received, StatusCell, SubscribeOptions, Subscription, subscription};
 
 /// Channels that one client reads at most, and a worker makes.
@@ -83,7 +82,8 @@ pub(super) struct Inner {
     pub(super) topics: Topics,
     pub(super) clients: Mutex<Clients>,
     pub(super) flow: Option<Arc<FlowState>>,
-    pub(super) worker: Option<Arc<WorkerState>>,
+    /// Of a worker.
+    pub(super) worker: Option<Arc<TopicCreator>>,
     pub(super) cluster: OnceLock<String>,
     pub(super) admin: Mutex<Option<Arc<Admin>>>,
     pub(super) status: StatusCell,
@@ -102,7 +102,7 @@ impl Inner {
     /// Creates topics, where this client does: it must know all that there are.
     pub(super) fn creator(&self) -> Option<&TopicCreator> {
         let flow = self.flow.as_ref().map(|flow| &flow.creator);
-        flow.or_else(|| self.worker.as_ref().map(|worker| &worker.creator))
+        flow.or(self.worker.as_deref())
     }
 
     /// The client that makes topics and asks for their settings, made at first use.

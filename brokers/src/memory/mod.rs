@@ -98,12 +98,6 @@ impl MemoryHub {
         }
     }
 
-    /// The hub's name.
-    #[must_use]
-    pub fn name(&self) -> &str {
-        &self.shared.name
-    }
-
     /// A new client of this hub.
     #[must_use]
     pub fn broker(&self) -> MemoryBroker {

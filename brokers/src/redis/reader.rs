@@ -91,18 +91,7 @@ fn check(result: RedisResult<()>) -> Result<(), Failure> {
 
 /// What is kept of a channel for late joiners, in the order of publishing as far as the times tell.
 pub(super) async fn read_kept(mut connection: MultiplexedConnection, hash: &str) -> Result<Vec<Received>, BrokerError> {
-    let mut command = redis::cmd("HGETALL");
-    command.arg(hash);
-    let answer = tokio::time::timeout(READ_KEPT, command.query_async(&mut connection)).await;
-    let fields = match answer {
-        Ok(Ok(fields)) => fields,
-        Ok(Err(error)) => return Err(BrokerError::Away(error.to_string())),
-        Err(_) => {
-            return Err(BrokerError::Away(
-                "what is kept for late joiners was not read in time".to_owned(),
-            ));
-        }
-    };
+    let fields = server::fields(&mut connection, hash, READ_KEPT).await?;
     Ok(kept_messages(fields, hash, unix_time_ns(), Instant::now()))
 }
 

@@ -24,7 +24,7 @@ use tokio::sync::{Notify, oneshot};
 use crate::port::{BrokerError, Content, Received, SubscribeOptions, Subscription, SubscriptionSender, subscription};
 
 /// Channels that one broker reads at most, over all its connections.
-pub const MAX_CHANNELS: usize = 10_000;
+const MAX_CHANNELS: usize = 10_000;
 /// Channels of one SUBSCRIBE or UNSUBSCRIBE.
 const PER_COMMAND: usize = 500;
 

@@ -115,7 +115,6 @@ impl Target {
         }
         if origins.len() >= MAX_ORIGINS {
             origins.pop_lru();
-            shared.counters.writers_forgotten.fetch_add(1, Ordering::Relaxed);
         }
         let slot = shared.slots.get(SlotKey {
             origin: Some(origin),

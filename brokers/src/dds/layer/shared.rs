@@ -4,13 +4,11 @@ use std::collections::{HashMap, HashSet};
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::sync::OnceLock;
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread::Thread;
 use std::time::Duration;
 
-#[cfg(feature = "fault-injection")]
-use parking_lot::Mutex;
-use parking_lot::RwLock;
+use parking_lot::{Mutex, RwLock};
 
 use super::DdsCounts;
 use super::channel::Channels;
@@ -45,29 +43,6 @@ pub(super) struct WriterFacts {
     pub(super) signs: bool,
 }
 
-/// Counters of [`DdsCounts`].
-#[derive(Debug, Default)]
-pub(super) struct Counters {
-    pub(super) malformed: AtomicU64,
-    pub(super) rebuilds: AtomicU64,
-    pub(super) expelled: AtomicU64,
-    pub(super) writers_forgotten: AtomicU64,
-    pub(super) overrun: AtomicU64,
-}
-
-impl Counters {
-    pub(super) fn read(&self) -> DdsCounts {
-        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        DdsCounts {
-            malformed: get(&self.malformed),
-            rebuilds: get(&self.rebuilds),
-            expelled: get(&self.expelled),
-            writers_forgotten: get(&self.writers_forgotten),
-            overrun: get(&self.overrun),
-        }
-    }
-}
-
 pub(super) struct Shared {
     pub(super) domain: u16,
     pub(super) address: Ipv4Addr,
@@ -83,7 +58,7 @@ pub(super) struct Shared {
     /// Topics with a best-effort writer of another participant.
     pub(super) best_effort: RwLock<HashSet<String>>,
     pub(super) clocks: RwLock<Clocks>,
-    pub(super) counters: Counters,
+    pub(super) counts: Mutex<DdsCounts>,
     pub(super) closing: AtomicBool,
     pub(super) stop: AtomicBool,
     pub(super) lifecycle: OnceLock<Thread>,
@@ -105,7 +80,7 @@ impl Shared {
             writers: RwLock::default(),
             best_effort: RwLock::default(),
             clocks: RwLock::default(),
-            counters: Counters::default(),
+            counts: Mutex::default(),
             closing: AtomicBool::new(false),
             stop: AtomicBool::new(false),
             lifecycle: OnceLock::new(),
