@@ -9,8 +9,11 @@ pub mod memory;
 mod open;
 #[allow(dead_code, reason = "each adapter uses its part, and a build may lack one")]
 mod outbox;
+#[allow(dead_code, reason = "each adapter uses its part, and a build may lack one")]
+mod pending;
 pub mod port;
 pub mod redis;
+pub mod retained;
 mod worker_side;
 
 pub use open::{OpenError, check_layer, open_layer, open_node};
@@ -18,4 +21,4 @@ pub use port::{
     Begin, Broker, BrokerError, BrokerKind, BrokerStatus, Content, FlowSide, Health, Later, Place, PublishOutcome,
     Publisher, PublisherOptions, Received, Role, SubscribeOptions, Subscription, SubscriptionSender, subscription,
 };
-pub use worker_side::{KeyedMessage, WorkerSide, WriteError};
+pub use worker_side::{Held, KeyedMessage, WorkerSide, WriteError};

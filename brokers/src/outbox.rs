@@ -10,7 +10,6 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use blaze_domain::DropReason;
@@ -58,35 +57,18 @@ impl Body {
 
 /// Counters of one lane.
 #[derive(Debug, Default)]
-struct Counts {
-    queued: AtomicU64,
-    queue_full: AtomicU64,
-    lifespan: AtomicU64,
-    too_large: AtomicU64,
-    broker_error: AtomicU64,
-}
+struct Counts(Mutex<Later>);
 
 impl Counts {
     fn settle(&self, fate: Fate) {
+        let mut later = self.0.lock();
+        later.queued -= 1;
         match fate {
-            Fate::Delivered => None,
-            Fate::Dropped(DropReason::QueueFull) => Some(&self.queue_full),
-            Fate::Dropped(DropReason::Lifespan) => Some(&self.lifespan),
-            Fate::Dropped(DropReason::TooLarge) => Some(&self.too_large),
-            Fate::Dropped(_) => Some(&self.broker_error),
-        }
-        .map(|counter| counter.fetch_add(1, Ordering::Relaxed));
-        self.queued.fetch_sub(1, Ordering::Relaxed);
-    }
-
-    fn later(&self) -> Later {
-        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        Later {
-            queued: get(&self.queued),
-            queue_full: get(&self.queue_full),
-            lifespan: get(&self.lifespan),
-            too_large: get(&self.too_large),
-            broker_error: get(&self.broker_error),
+            Fate::Delivered => {}
+            Fate::Dropped(DropReason::QueueFull) => later.queue_full += 1,
+            Fate::Dropped(DropReason::Lifespan) => later.lifespan += 1,
+            Fate::Dropped(DropReason::TooLarge) => later.too_large += 1,
+            Fate::Dropped(_) => later.broker_error += 1,
         }
     }
 }
@@ -100,7 +82,7 @@ pub(crate) enum Fate {
     Dropped(DropReason),
 }
 
-/// A message that was taken out of its lane. Dropping it without [`Waiting::settle`] counts it as `broker_error`.
+/// A message that was taken out of its lane, and the duty to settle it.
 #[derive(Debug)]
 pub(crate) struct Waiting<C> {
     /// What is to be written.
@@ -111,7 +93,7 @@ pub(crate) struct Waiting<C> {
     pub(crate) since: Instant,
     /// When it is of no use any more, and what it then counts as.
     pub(crate) expires: Option<(Instant, DropReason)>,
-    counts: Option<Arc<Counts>>,
+    receipt: Receipt,
 }
 
 impl<C> Waiting<C> {
@@ -129,27 +111,17 @@ impl<C> Waiting<C> {
     }
 
     /// Ends its story.
-    pub(crate) fn settle(mut self, fate: Fate) {
-        if let Some(counts) = self.counts.take() {
-            counts.settle(fate);
-        }
+    pub(crate) fn settle(self, fate: Fate) {
+        self.receipt.settle(fate);
     }
 
     /// Leaves the bytes and keeps the duty to settle.
-    pub(crate) fn into_receipt(mut self) -> Receipt {
-        Receipt(self.counts.take())
+    pub(crate) fn into_receipt(self) -> Receipt {
+        self.receipt
     }
 }
 
-impl<C> Drop for Waiting<C> {
-    fn drop(&mut self) {
-        if let Some(counts) = self.counts.take() {
-            counts.settle(Fate::Dropped(DropReason::BrokerError));
-        }
-    }
-}
-
-/// The duty to settle a message whose bytes are with the server's client already. Dropped unsettled it counts as
+/// The duty to settle a message whose bytes may be with the server's client already. Dropped unsettled it counts as
 /// `broker_error`.
 #[derive(Debug)]
 pub(crate) struct Receipt(Option<Arc<Counts>>);
@@ -157,6 +129,10 @@ pub(crate) struct Receipt(Option<Arc<Counts>>);
 impl Receipt {
     /// Ends the message's story.
     pub(crate) fn settle(mut self, fate: Fate) {
+        self.end(fate);
+    }
+
+    fn end(&mut self, fate: Fate) {
         if let Some(counts) = self.0.take() {
             counts.settle(fate);
         }
@@ -165,9 +141,7 @@ impl Receipt {
 
 impl Drop for Receipt {
     fn drop(&mut self) {
-        if let Some(counts) = self.0.take() {
-            counts.settle(Fate::Dropped(DropReason::BrokerError));
-        }
+        self.end(Fate::Dropped(DropReason::BrokerError));
     }
 }
 
@@ -335,13 +309,8 @@ impl<C> Outbox<C> {
             let mut full = false;
             let mut of_lane = 0_usize;
             for _ in 0..TURN {
+                state.bytes -= queue.drop_overdue(now);
                 let Some(entry) = queue.entries.front() else { break };
-                if let Some((at, reason)) = entry.expires
-                    && at <= now
-                {
-                    state.bytes -= queue.drop_oldest(reason);
-                    continue;
-                }
                 let size = entry.body.size();
                 if of_lane > 0 && of_lane.saturating_add(size) > allowed {
                     break;
@@ -361,7 +330,7 @@ impl<C> Outbox<C> {
                     to: Arc::clone(&queue.to),
                     since: entry.since,
                     expires: entry.expires,
-                    counts: Some(Arc::clone(&queue.counts)),
+                    receipt: Receipt(Some(Arc::clone(&queue.counts))),
                 });
             }
             if full {
@@ -436,7 +405,7 @@ impl<C> Lane<C> {
             }
             if state.bytes + size > limits.total_bytes && state.bytes > 0 {
                 // Others hold the room, and this lane has nothing older to give.
-                self.counts.queue_full.fetch_add(1, Ordering::Relaxed);
+                self.counts.0.lock().queue_full += 1;
                 return PublishOutcome::Taken;
             }
             if !queue.has_turn {
@@ -446,7 +415,7 @@ impl<C> Lane<C> {
             queue.bytes += size;
             state.bytes += size;
             queue.entries.push_back(Entry { body, since, expires });
-            self.counts.queued.fetch_add(1, Ordering::Relaxed);
+            self.counts.0.lock().queued += 1;
         }
         self.outbox.filled.notify_one();
         PublishOutcome::Taken
@@ -454,7 +423,7 @@ impl<C> Lane<C> {
 
     /// What became of what was pushed.
     pub(crate) fn later(&self) -> Later {
-        self.counts.later()
+        *self.counts.0.lock()
     }
 }
 

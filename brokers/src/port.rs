@@ -85,6 +85,43 @@ pub struct BrokerStatus {
     pub since: Instant,
 }
 
+/// The status as an adapter tells it.
+#[derive(Debug)]
+pub(crate) struct StatusCell(watch::Sender<BrokerStatus>);
+
+impl StatusCell {
+    pub(crate) fn new(health: Health, detail: String) -> Self {
+        let since = Instant::now();
+        Self(watch::Sender::new(BrokerStatus { health, detail, since }))
+    }
+
+    /// Tells a change; a closed broker stays closed. Returns whether the health is another one.
+    pub(crate) fn set(&self, health: Health, detail: &str) -> bool {
+        let mut turned = false;
+        self.0.send_if_modified(|status| {
+            turned = status.health != health && status.health != Health::Closed;
+            let changes = turned || (status.health == health && status.detail != detail);
+            if changes {
+                status.health = health;
+                detail.clone_into(&mut status.detail);
+            }
+            if turned {
+                status.since = Instant::now();
+            }
+            changes
+        });
+        turned
+    }
+
+    pub(crate) fn borrow(&self) -> watch::Ref<'_, BrokerStatus> {
+        self.0.borrow()
+    }
+
+    pub(crate) fn subscribe(&self) -> watch::Receiver<BrokerStatus> {
+        self.0.subscribe()
+    }
+}
+
 /// Why a broker refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BrokerError {
@@ -137,6 +174,18 @@ pub enum Content {
 }
 
 impl Content {
+    /// What the bytes of one message are: on a reserved channel JSON, never a frame.
+    #[must_use]
+    pub fn of(is_reserved: bool, payload: Bytes) -> Self {
+        if is_reserved {
+            return Self::Bare {
+                payload,
+                identity: None,
+            };
+        }
+        Self::from_bytes(payload)
+    }
+
     /// What the bytes of one message are, on a broker that keeps frames as one value.
     #[must_use]
     pub fn from_bytes(bytes: Bytes) -> Self {
@@ -189,6 +238,16 @@ impl Received {
             broker_age_us: 0,
             kept: false,
             place: None,
+        }
+    }
+
+    /// A message that was retained for late joiners, on a server without places.
+    #[must_use]
+    pub fn kept(content: Content, at: Instant, broker_age_us: u64) -> Self {
+        Self {
+            broker_age_us,
+            kept: true,
+            ..Self::live(content, at)
         }
     }
 }
@@ -445,6 +504,13 @@ struct More {
     bytes: usize,
 }
 
+impl More {
+    fn raise(&mut self, bytes: usize) {
+        self.messages = self.messages.saturating_add(1).min(MAX_KEPT_MESSAGES);
+        self.bytes = self.bytes.saturating_add(bytes).min(MAX_KEPT_BYTES);
+    }
+}
+
 impl RingState {
     /// Takes a message in. Returns how many gave way.
     fn push(&mut self, message: Received, options: &SubscribeOptions) -> u64 {
@@ -518,36 +584,30 @@ pub fn subscription(options: SubscribeOptions) -> (SubscriptionSender, Subscript
 impl SubscriptionSender {
     /// Hands a message to the reader. Returns whether the subscription still lives.
     pub fn send(&self, message: Received) -> bool {
-        let lost = {
-            let mut state = self.ring.queue.lock();
-            if state.closed {
-                return false;
-            }
-            state.push(message, &self.ring.options)
-        };
-        self.note_lost(lost);
-        self.ring.readable.notify_one();
-        true
+        self.hand_over([message], false)
     }
 
     /// Hands messages to the reader that were kept for late joiners, at once. They raise the bounds until it has taken as
     /// many, because it cannot read while they are collected: at most by [`MAX_KEPT_MESSAGES`] and [`MAX_KEPT_BYTES`].
     /// Returns whether the subscription still lives.
     pub fn send_kept(&self, kept: impl IntoIterator<Item = Received>) -> bool {
-        let lost = {
+        self.hand_over(kept, true)
+    }
+
+    fn hand_over(&self, messages: impl IntoIterator<Item = Received>, raise_bounds: bool) -> bool {
+        let mut lost = 0;
+        {
             let mut state = self.ring.queue.lock();
             if state.closed {
                 return false;
             }
-            let mut lost = 0;
-            for message in kept {
-                let size = message.content.size();
-                state.more.messages = state.more.messages.saturating_add(1).min(MAX_KEPT_MESSAGES);
-                state.more.bytes = state.more.bytes.saturating_add(size).min(MAX_KEPT_BYTES);
+            for message in messages {
+                if raise_bounds {
+                    state.more.raise(message.content.size());
+                }
                 lost += state.push(message, &self.ring.options);
             }
-            lost
-        };
+        }
         self.note_lost(lost);
         self.ring.readable.notify_one();
         true

@@ -45,6 +45,15 @@ pub enum WriteError {
     },
 }
 
+/// What became of asking for a lease.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Held {
+    /// Whether the one that asked has it.
+    pub is_held: bool,
+    /// What the last owner that left a note has left.
+    pub note: Option<String>,
+}
+
 /// What only a worker does on a broker where channels are set up beforehand.
 #[async_trait]
 pub trait WorkerSide: Send + Sync {

@@ -297,6 +297,12 @@ impl Frame {
         self.text(&self.index.type_hash)
     }
 
+    /// W3C trace context, or empty.
+    #[must_use]
+    pub fn traceparent(&self) -> &str {
+        self.text(&self.index.traceparent)
+    }
+
     /// Publisher.
     #[must_use]
     pub fn writer(&self) -> WriterId {

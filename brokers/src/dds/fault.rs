@@ -21,12 +21,8 @@ pub enum Fault {
 struct Trap(Fault);
 
 impl Wake for Trap {
-    fn wake(self: Arc<Self>) {
-        self.wake_by_ref();
-    }
-
     #[allow(clippy::panic, reason = "the panic is what the caller asked for")]
-    fn wake_by_ref(self: &Arc<Self>) {
+    fn wake(self: Arc<Self>) {
         match self.0 {
             Fault::Panic => panic!("injected into the event loop"),
             Fault::Hang => thread::sleep(Duration::from_secs(60)),

@@ -4,7 +4,7 @@
 //! ```text
 //! Participant ── Writer::write ──► RustDDS event loop ──► UDP
 //!             ── Reader (a thread of its own) ──► sink(participant, octets)
-//!             ── ReaderWatch (a thread of its own) ──► sink(all remote readers)
+//!             ── EndpointWatch (a thread of its own) ──► sink(all remote readers and writers)
 //! Relay       ── repeats the participant's announcement to hosts that multicast does not reach
 //! ```
 //!
@@ -26,7 +26,7 @@ mod sample;
 mod watch;
 mod writer;
 
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv4Addr};
 
 use blaze_domain::node_file::MAX_DDS_DOMAIN;
 
@@ -36,7 +36,7 @@ pub use participant::{GuidPrefix, Participant, ParticipantConfig, Profile};
 pub use pulse::{Illness, Pulse};
 pub use reader::{Reader, SampleSink};
 pub use relay::{Relay, RelayConfig, RelayStatus};
-pub use watch::{EndpointWatch, Endpoints, FoundReader, FoundWriter, ReaderWatch, RemoteReader};
+pub use watch::{EndpointWatch, Endpoints, FoundReader, FoundWriter};
 pub use writer::{EndpointId, Writer, Written};
 
 /// The type of all samples, IDL `sequence<octet>`.
@@ -83,6 +83,18 @@ pub enum DdsError {
     /// A panic inside RustDDS.
     #[error("RustDDS failed while making a {0}")]
     Panicked(&'static str),
+}
+
+/// Whether participants of a domain can be on the interface with an address, as far as that shows without the system.
+///
+/// # Errors
+/// [`DdsError::Domain`] and [`DdsError::Address`].
+pub fn check(domain: u16, address: IpAddr) -> Result<Ipv4Addr, DdsError> {
+    match address {
+        _ if domain > MAX_DDS_DOMAIN => Err(DdsError::Domain(domain)),
+        IpAddr::V4(one) if !(one.is_unspecified() || one.is_multicast() || one.is_broadcast()) => Ok(one),
+        _ => Err(DdsError::Address(address)),
+    }
 }
 
 fn create_error(what: &'static str) -> impl FnOnce(std::io::Error) -> DdsError {

@@ -6,7 +6,6 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use blaze_domain::node_file::MAX_DDS_DOMAIN;
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{
     DomainParticipant, DomainParticipantBuilder, Duration, Publisher, QosPolicies, QosPolicyBuilder, RTPSEntity,
@@ -17,8 +16,8 @@ use super::filter::{self, Attached, FilterError, Samples, Shape};
 use super::pulse::port_is_free;
 use super::reader::{Reader, SampleSink};
 use super::sample::{Octets, OctetsAdapter};
-use super::watch::{EndpointWatch, Endpoints, ReaderWatch, RemoteReader};
-use super::writer::Writer;
+use super::watch::{EndpointWatch, Endpoints};
+use super::writer::{Writer, endpoint_of, participant_of};
 use super::{DdsError, FRAME_TYPE, LOCAL_SLOTS, announcement_port, multicast_port};
 
 /// Identity of one participant on the wire; a rebuilt one has a new identity.
@@ -41,14 +40,12 @@ impl fmt::Debug for GuidPrefix {
 /// Where a participant lives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ParticipantConfig {
-    /// DDS domain, 0 to [`MAX_DDS_DOMAIN`].
+    /// DDS domain.
     pub domain: u16,
     /// Address of the one interface that it announces. Never unspecified.
     pub address: Ipv4Addr,
     /// Send buffer of the socket in bytes: what can queue in the system behind the application's pacing.
     pub send_buffer_bytes: usize,
-    /// Receive buffer of each socket in bytes; the system caps it (`net.core.rmem_max`).
-    pub receive_buffer_bytes: usize,
     /// Bytes of the largest sample that comes in fragments. RustDDS takes memory for a whole sample when the first
     /// fragment comes, from any sender, so larger ones (than the next power of two) are dropped before it sees them.
     pub largest_sample: u32,
@@ -64,7 +61,6 @@ impl ParticipantConfig {
             domain,
             address,
             send_buffer_bytes: 64 * 1024,
-            receive_buffer_bytes: DomainParticipantBuilder::DEFAULT_SOCKET_RECEIVE_BUFFER_SIZE,
             largest_sample: 64 * 1024,
             repairs_fragments: false,
         }
@@ -78,13 +74,8 @@ impl ParticipantConfig {
     }
 
     fn check(&self) -> Result<(), DdsError> {
-        if self.domain > MAX_DDS_DOMAIN {
-            return Err(DdsError::Domain(self.domain));
-        }
         let address = IpAddr::V4(self.address);
-        if self.address.is_unspecified() || self.address.is_multicast() || self.address.is_broadcast() {
-            return Err(DdsError::Address(address));
-        }
+        super::check(self.domain, address)?;
         // RustDDS would announce no address at all and stay invisible.
         match UdpSocket::bind((self.address, 0)) {
             Ok(_) => Ok(()),
@@ -183,7 +174,6 @@ impl Participant {
             let dds = DomainParticipantBuilder::new(config.domain)
                 .with_only_networks([IpAddr::V4(config.address)])
                 .socket_send_buffer_size(config.send_buffer_bytes)
-                .socket_receive_buffer_size(config.receive_buffer_bytes)
                 .build()?;
             let publisher = dds.create_publisher(&qos)?;
             let subscriber = dds.create_subscriber(&qos)?;
@@ -261,25 +251,6 @@ impl Participant {
     /// [`DdsError`] when RustDDS refuses or has died.
     pub fn reader(&self, topic: &str, profile: Profile, sink: SampleSink) -> Result<Reader, DdsError> {
         Reader::start(self.raw_reader(topic, profile)?, sink, Arc::clone(&self.failed))
-    }
-
-    /// Calls `sink` with all readers of other participants whose topics begin with `topics`, whenever one comes or
-    /// goes, and once a second.
-    ///
-    /// # Errors
-    /// [`DdsError`] when there is no thread for it.
-    pub fn watch_readers(
-        &self,
-        topics: &str,
-        sink: Box<dyn Fn(Vec<RemoteReader>) + Send>,
-    ) -> Result<ReaderWatch, DdsError> {
-        ReaderWatch::start(
-            self.dds.clone(),
-            self.prefix,
-            topics.to_owned(),
-            sink,
-            Arc::clone(&self.failed),
-        )
     }
 
     /// Calls `sink` with the readers and writers of other participants, whenever one comes or goes, and once a second.
@@ -371,7 +342,5 @@ fn contain<T>(what: &'static str, make: impl FnOnce() -> rustdds::dds::CreateRes
 }
 
 pub(super) fn prefix_of(guid: rustdds::GUID) -> GuidPrefix {
-    let mut prefix = [0; 12];
-    prefix.copy_from_slice(&guid.to_bytes()[..12]);
-    GuidPrefix(prefix)
+    participant_of(&endpoint_of(guid))
 }

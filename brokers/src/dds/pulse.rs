@@ -56,9 +56,6 @@ struct Count(Arc<AtomicU64>);
 
 impl Wake for Count {
     fn wake(self: Arc<Self>) {
-        self.wake_by_ref();
-    }
-    fn wake_by_ref(self: &Arc<Self>) {
         self.0.fetch_add(1, Ordering::Relaxed);
     }
 }

@@ -13,7 +13,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use blaze_domain::node_file::MAX_DDS_DOMAIN;
 use parking_lot::Mutex;
 
 use super::announcement::Announcement;
@@ -54,10 +53,6 @@ pub struct RelayStatus {
     pub announces_multicast: bool,
     /// Addresses that are known.
     pub addresses: usize,
-    /// Announcements that were sent.
-    pub sent: u64,
-    /// Announcements that the system refused to send.
-    pub refused: u64,
     /// Addresses that were forgotten to make room for others.
     pub forgotten: u64,
     /// Names that do not resolve.
@@ -87,12 +82,8 @@ impl Relay {
     /// missed and the next comes ten seconds later.
     ///
     /// # Errors
-    /// [`DdsError`] when the domain is out of range or there is no thread for it. Ports that are taken are no error:
-    /// they are tried again each second.
+    /// [`DdsError`] when there is no thread for it. Ports that are taken are no error: they are tried again each second.
     pub fn start(config: RelayConfig) -> Result<Self, DdsError> {
-        if config.domain > MAX_DDS_DOMAIN {
-            return Err(DdsError::Domain(config.domain));
-        }
         let state = Arc::<Mutex<State>>::default();
         let config = Arc::new(config);
         let mut ports = Ports::default();
@@ -332,18 +323,12 @@ fn announce(config: &RelayConfig, state: &Mutex<State>, sender: &UdpSocket, repe
         state.told.extend(&targets);
         (datagram, targets)
     };
-    let (mut sent, mut refused) = (0, 0);
     for address in targets {
         for slot in 0..config.slots.min(LOCAL_SLOTS) {
-            match sender.send_to(&datagram, (address, announcement_port(config.domain, slot))) {
-                Ok(_) => sent += 1,
-                Err(_) => refused += 1,
-            }
+            // What the system refuses is repeated.
+            let _ = sender.send_to(&datagram, (address, announcement_port(config.domain, slot)));
         }
     }
-    let status = &mut state.lock().status;
-    status.sent += sent;
-    status.refused += refused;
 }
 
 #[cfg(test)]

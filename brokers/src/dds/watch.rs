@@ -1,7 +1,7 @@
 //! Which readers and writers other participants have.
 
 use std::collections::HashSet;
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,17 +19,6 @@ use super::{DdsError, GuidPrefix};
 
 /// RustDDS drops events when its queue of 2048 is full, so all readers are looked at once in this time.
 const RECONCILE: Duration = Duration::from_secs(1);
-
-/// A reader of another participant.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RemoteReader {
-    /// Its participant.
-    pub participant: GuidPrefix,
-    /// Its topic.
-    pub topic: String,
-    /// Where it takes data.
-    pub addresses: Vec<IpAddr>,
-}
 
 /// A reader of another participant, of any topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -85,20 +74,7 @@ impl EndpointWatch {
         let returned = Arc::<AtomicBool>::default();
         let tell = Arc::clone(&returned);
         let thread = StoppableThread::start("dds-watch", failed, move |stop| {
-            let mut lost = HashSet::new();
-            let note = |event: &Event| match event {
-                Event::ParticipantLost { id, .. } => {
-                    if lost.len() >= MAX_LOST {
-                        lost.clear();
-                    }
-                    lost.insert(*id);
-                }
-                Event::ParticipantDiscovered { dpd } if lost.remove(&dpd.guid.prefix) => {
-                    tell.store(true, Ordering::Relaxed);
-                }
-                _ => {}
-            };
-            watch(&participant, stop, note, || sink(endpoints(&participant, own)));
+            watch(&participant, stop, &tell, || sink(endpoints(&participant, own)));
         })?;
         Ok(Self {
             _thread: thread,
@@ -114,50 +90,32 @@ impl EndpointWatch {
     }
 }
 
-/// Watches until it is dropped.
-pub struct ReaderWatch {
-    _thread: StoppableThread,
-}
-
-impl ReaderWatch {
-    pub(super) fn start(
-        participant: DomainParticipant,
-        own: GuidPrefix,
-        topics: String,
-        sink: Box<dyn Fn(Vec<RemoteReader>) + Send>,
-        failed: Arc<AtomicBool>,
-    ) -> Result<Self, DdsError> {
-        let thread = StoppableThread::start("dds-watch", failed, move |stop| {
-            watch(
-                &participant,
-                stop,
-                |_| {},
-                || {
-                    sink(remote_readers(&participant, own, &topics));
-                },
-            );
-        })?;
-        Ok(Self { _thread: thread })
-    }
-}
-
-fn watch(participant: &DomainParticipant, stop: &AtomicBool, mut note: impl FnMut(&Event), look: impl Fn()) {
+fn watch(participant: &DomainParticipant, stop: &AtomicBool, returned: &AtomicBool, look: impl Fn()) {
     let listener = participant.status_listener();
     let mut events = listener.as_async_status_stream();
     let waker = unpark_waker();
     let mut context = Context::from_waker(&waker);
     let mut next_look = Instant::now();
+    let mut lost = HashSet::new();
     while !stop.load(Ordering::Relaxed) {
         let mut changed = false;
         while let Poll::Ready(event) = Pin::new(&mut events).poll_next(&mut context) {
-            event.iter().for_each(&mut note);
             match event {
+                Some(Event::ParticipantLost { id, .. }) => {
+                    if lost.len() >= MAX_LOST {
+                        lost.clear();
+                    }
+                    lost.insert(id);
+                    changed = true;
+                }
+                Some(Event::ParticipantDiscovered { dpd }) if lost.remove(&dpd.guid.prefix) => {
+                    returned.store(true, Ordering::Relaxed);
+                }
                 Some(
                     Event::ReaderDetected { .. }
                     | Event::ReaderLost { .. }
                     | Event::WriterDetected { .. }
-                    | Event::WriterLost { .. }
-                    | Event::ParticipantLost { .. },
+                    | Event::WriterLost { .. },
                 ) => changed = true,
                 Some(_) => {}
                 // Both threads of RustDDS have gone; whoever watches the participant sees that too.
@@ -172,26 +130,6 @@ fn watch(participant: &DomainParticipant, stop: &AtomicBool, mut note: impl FnMu
             thread::park_timeout(next_look - now);
         }
     }
-}
-
-fn remote_readers(participant: &DomainParticipant, own: GuidPrefix, topics: &str) -> Vec<RemoteReader> {
-    participant
-        .discovered_readers()
-        .iter()
-        .filter(|reader| reader.subscription_topic_data.topic_name().starts_with(topics))
-        .map(|reader| RemoteReader {
-            participant: prefix_of(reader.reader_proxy.remote_reader_guid),
-            topic: reader.subscription_topic_data.topic_name().clone(),
-            addresses: reader
-                .reader_proxy
-                .unicast_locator_list
-                .iter()
-                .filter(|locator| locator.is_udp())
-                .map(|locator| SocketAddr::from(*locator).ip())
-                .collect(),
-        })
-        .filter(|reader| reader.participant != own)
-        .collect()
 }
 
 fn endpoints(participant: &DomainParticipant, own: GuidPrefix) -> Endpoints {

@@ -67,16 +67,13 @@ impl Writer {
         }
     }
 
-    /// Hands a sample to RustDDS. Returns whether it was taken: not without a reader, unless it is kept for late joiners,
-    /// and not into the full window of a reliable writer. Best effort lets the oldest that still wait give way.
+    /// Hands a sample to RustDDS. Returns whether it was taken, as [`write_at`](Self::write_at) tells.
     pub fn write(&self, octets: Bytes) -> bool {
-        self.contain(|| {
-            ((self.is_matched_now() || self.keeps) && self.writer.write(Octets(octets), None).is_ok()).then_some(())
-        })
-        .is_some()
+        self.write_at(octets, None) == Written::Taken
     }
 
-    /// As [`write`](Self::write), and tells why it was not taken. `written` travels with the sample.
+    /// Hands a sample to RustDDS: not without a reader, unless it is kept for late joiners, and not into the full window of
+    /// a reliable writer. Best effort lets the oldest that still wait give way. `written` travels with the sample.
     pub fn write_at(&self, octets: Bytes, written: Option<Timestamp>) -> Written {
         self.contain(|| {
             if !(self.is_matched_now() || self.keeps) {

@@ -4,15 +4,13 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use rdkafka::ClientContext;
 use rdkafka::admin::{
     AdminClient, AdminOptions, AlterConfig, ConfigResource, ConfigSource, NewTopic, OwnedResourceSpecifier,
     ResourceSpecifier, TopicReplication,
 };
-use rdkafka::config::RDKafkaLogLevel;
 use rdkafka::error::{KafkaError, RDKafkaErrorCode};
 
-use super::context::{self, LastError};
+use super::context::{LastError, ReadContext};
 use super::settings::Settings;
 use super::waker::block_on;
 
@@ -65,24 +63,12 @@ impl Purpose {
     }
 }
 
-struct AdminContext(Arc<LastError>);
-
-impl ClientContext for AdminContext {
-    fn log(&self, level: RDKafkaLogLevel, facility: &str, line: &str) {
-        context::log(level, facility, line);
-    }
-
-    fn error(&self, error: KafkaError, reason: &str) {
-        self.0.note(format!("{error}: {reason}"));
-    }
-}
-
 /// The client that makes topics.
-pub(super) struct Admin(AdminClient<AdminContext>);
+pub(super) struct Admin(AdminClient<ReadContext>);
 
 impl Admin {
     pub(super) fn new(settings: &Settings, last_error: &Arc<LastError>) -> Result<Self, KafkaError> {
-        let context = AdminContext(Arc::clone(last_error));
+        let context = ReadContext::new(&Arc::default(), last_error);
         settings.admin().create_with_context(context).map(Self)
     }
 

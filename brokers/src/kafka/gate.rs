@@ -35,16 +35,3 @@ impl Gate {
         stays_open || !self.is_stood_back()
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_gate_lets_only_the_meeting_place_through_while_the_scope_is_anothers() {
-        let gate = Gate::default();
-        assert!(gate.lets(false) && !gate.is_open());
-        gate.set_stood_back(true);
-        assert!(!gate.lets(false) && gate.lets(true));
-    }
-}

@@ -30,6 +30,7 @@ use super::admin::{Admin, Purpose};
 use super::context::{self, LastError};
 use super::settings::Settings;
 use crate::open::OpenError;
+use crate::worker_side::Held;
 
 /// Between two looks at the group, while nobody asks.
 const TURN: Duration = Duration::from_millis(50);
@@ -45,15 +46,6 @@ const QUEUE: usize = 4;
 const PARTITION: i32 = 0;
 const GIVEN_UP: &str = "the lease was given up";
 
-/// What became of asking for the lease.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct GroupHeld {
-    /// Whether this member has it.
-    pub is_held: bool,
-    /// What the last holder that left a note has left.
-    pub note: Option<String>,
-}
-
 /// Which lease.
 #[derive(Debug, Clone)]
 pub struct GroupLeaseOptions {
@@ -68,7 +60,7 @@ pub struct GroupLeaseOptions {
 enum Question {
     Hold {
         note: Option<String>,
-        answer: oneshot::Sender<Result<GroupHeld, String>>,
+        answer: oneshot::Sender<Result<Held, String>>,
     },
     Release(oneshot::Sender<()>),
 }
@@ -121,7 +113,7 @@ impl GroupLease {
     ///
     /// # Errors
     /// For people: nobody knows.
-    pub async fn hold(&self, note: Option<&str>) -> Result<GroupHeld, String> {
+    pub async fn hold(&self, note: Option<&str>) -> Result<Held, String> {
         let (answer, answered) = oneshot::channel();
         let question = Question::Hold {
             note: note.map(str::to_owned),
@@ -287,7 +279,7 @@ impl Member {
         }
     }
 
-    fn hold(&mut self, note: Option<String>) -> Result<GroupHeld, String> {
+    fn hold(&mut self, note: Option<String>) -> Result<Held, String> {
         let now = Instant::now();
         self.asked = Some(now);
         if self.consumer.is_none() {
@@ -306,7 +298,7 @@ impl Member {
         held.map_err(|error| error.to_string())
     }
 
-    fn ask(&mut self, consumer: &BaseConsumer<Context>, note: Option<String>, now: Instant) -> KafkaResult<GroupHeld> {
+    fn ask(&mut self, consumer: &BaseConsumer<Context>, note: Option<String>, now: Instant) -> KafkaResult<Held> {
         let is_own = || {
             let is_assigned = consumer.assignment().is_ok_and(|assigned| assigned.count() > 0);
             is_assigned && !consumer.assignment_lost()
@@ -327,7 +319,7 @@ impl Member {
         if is_held {
             *consumer.context().promised.lock() = Some(now + self.options.time);
         }
-        Ok(GroupHeld {
+        Ok(Held {
             is_held,
             note: self.note.clone(),
         })

@@ -9,7 +9,6 @@ use blaze_domain::names::ChannelName;
 use blaze_runtime::supervisor::Supervisor;
 use parking_lot::Mutex;
 use rdkafka::message::Message as _;
-use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 use super::admin::Admin;
@@ -28,8 +27,7 @@ use super::settings::{Lot, Settings};
 use super::topic_creator::TopicCreator;
 use super::topics::Topics;
 use super::waker::ThreadWaker;
-use super::worker_side::WorkerState;
-use crate::port::{Begin, BrokerError, BrokerStatus, Health, Received, SubscribeOptions, Subscription, subscription};
+use crate::port::{Begin, BrokerError, Health, Received, StatusCell, SubscribeOptions, Subscription, subscription};
 
 /// Channels that one client reads at most, and a worker makes.
 pub(super) const MAX_CHANNELS: usize = 10_000;
@@ -84,10 +82,11 @@ pub(super) struct Inner {
     pub(super) topics: Topics,
     pub(super) clients: Mutex<Clients>,
     pub(super) flow: Option<Arc<FlowState>>,
-    pub(super) worker: Option<Arc<WorkerState>>,
+    /// Of a worker.
+    pub(super) worker: Option<Arc<TopicCreator>>,
     pub(super) cluster: OnceLock<String>,
     pub(super) admin: Mutex<Option<Arc<Admin>>>,
-    pub(super) status: watch::Sender<BrokerStatus>,
+    pub(super) status: StatusCell,
     pub(super) was_up: AtomicBool,
     /// Whether it is in the log that the server did not answer from the beginning.
     pub(super) logged_absence: AtomicBool,
@@ -103,7 +102,7 @@ impl Inner {
     /// Creates topics, where this client does: it must know all that there are.
     pub(super) fn creator(&self) -> Option<&TopicCreator> {
         let flow = self.flow.as_ref().map(|flow| &flow.creator);
-        flow.or_else(|| self.worker.as_ref().map(|worker| &worker.creator))
+        flow.or(self.worker.as_deref())
     }
 
     /// The client that makes topics and asks for their settings, made at first use.
@@ -178,29 +177,11 @@ impl Inner {
         let (health, detail) = match (answers, taken) {
             (true, None) => (Health::Up, detail),
             (true, Some(whom)) => (Health::InUse, format!("scope_in_use: {whom}")),
+            // Down is what was up before.
+            (false, _) if self.status.borrow().health == Health::Connecting => (Health::Connecting, detail),
             (false, _) => (Health::Down, detail),
         };
-        self.set_status(health, detail);
-    }
-
-    fn set_status(&self, health: Health, detail: String) {
-        self.status.send_if_modified(|status| {
-            // Down is what was up before.
-            let health = match (status.health, health) {
-                (Health::Connecting, Health::Down) => Health::Connecting,
-                (_, health) => health,
-            };
-            if status.health == Health::Closed || (status.health == health && status.detail == detail) {
-                return false;
-            }
-            let since = if status.health == health {
-                status.since
-            } else {
-                Instant::now()
-            };
-            *status = BrokerStatus { health, detail, since };
-            true
-        });
+        self.status.set(health, &detail);
     }
 
     /// Another flow was first, or has gone.
@@ -369,7 +350,7 @@ impl Inner {
         for producer in self.producers() {
             producer.end();
         }
-        self.set_status(Health::Closed, "closed".to_owned());
+        self.status.set(Health::Closed, "closed");
     }
 }
 

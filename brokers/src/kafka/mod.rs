@@ -53,10 +53,10 @@ use crate::open::OpenError;
 use crate::outbox::{Body, Lane};
 use crate::port::{
     Begin, Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome, Publisher,
-    PublisherOptions, Role, SubscribeOptions, Subscription,
+    PublisherOptions, Role, StatusCell, SubscribeOptions, Subscription,
 };
 use crate::worker_side::WorkerSide;
-pub use group_lease::{GroupHeld, GroupLease, GroupLeaseOptions};
+pub use group_lease::{GroupLease, GroupLeaseOptions};
 
 use directory::Directory;
 use flow_side::{FlowState, KafkaFlowSide};
@@ -66,7 +66,7 @@ use producer::{Keying, Target};
 use settings::{Lot, Settings};
 use topics::Topics;
 use waker::ThreadWaker;
-use worker_side::{KafkaWorkerSide, WorkerState};
+use worker_side::KafkaWorkerSide;
 
 /// How long closing waits for what was taken while the server is known not to answer.
 const DRAIN: Duration = Duration::from_secs(1);
@@ -107,17 +107,13 @@ impl KafkaBroker {
         let topics = Topics::default();
         let (layer, flow, worker) = match role {
             Role::Service => (String::new(), None, None),
-            Role::Worker => (String::new(), None, Some(Arc::new(WorkerState::new(&names)))),
+            Role::Worker => (String::new(), None, Some(Arc::new(worker_side::creator(&names)))),
             Role::Flow { flow, .. } => {
                 let state = FlowState::new(&names, &topics);
                 (flow.layer.to_string(), Some(Arc::new(state)), None)
             }
         };
-        let connecting = BrokerStatus {
-            health: Health::Connecting,
-            detail: format!("connecting to {}", section.bootstrap.join(", ")),
-            since: Instant::now(),
-        };
+        let connecting = format!("connecting to {}", section.bootstrap.join(", "));
         let inner = Arc::new(Inner {
             probe: names.reserved(ChannelName::control().as_str()),
             shared,
@@ -130,7 +126,7 @@ impl KafkaBroker {
             worker,
             admin: Mutex::default(),
             cluster: OnceLock::new(),
-            status: watch::Sender::new(connecting),
+            status: StatusCell::new(Health::Connecting, connecting),
             was_up: AtomicBool::new(false),
             logged_absence: AtomicBool::new(false),
             closed: AtomicBool::new(false),
@@ -241,10 +237,10 @@ impl Broker for KafkaBroker {
     }
 
     fn worker_side(&self) -> Option<Arc<dyn WorkerSide>> {
-        let state = Arc::clone(self.inner.worker.as_ref()?);
+        let creator = Arc::clone(self.inner.worker.as_ref()?);
         Some(Arc::new(KafkaWorkerSide {
             inner: Arc::clone(&self.inner),
-            state,
+            creator,
         }))
     }
 

@@ -4,7 +4,6 @@ use std::fmt::Write as _;
 
 use blaze_domain::names::ChannelName;
 use blaze_domain::{MAX_PAYLOAD_BYTES, Origin, Priority, WriterId};
-use blaze_proto::frame::PREFIX_BYTES;
 use blaze_proto::{Frame, FrameError, Header};
 use bytes::Bytes;
 use rdkafka::message::OwnedHeaders;
@@ -14,8 +13,6 @@ use crate::port::Content;
 const VERSION: &str = "1";
 /// Longest text that a header may have, in bytes: none of those that are written here is near it.
 const MAX_TEXT_BYTES: usize = 1024;
-/// Number of `traceparent` in the encoded header.
-const TRACEPARENT_TAG: u64 = 14;
 
 /// What a record says in its headers. The value `None` is a header without one.
 pub(super) type RawHeader<'a> = (&'a str, Option<&'a [u8]>);
@@ -181,8 +178,8 @@ pub(super) fn write(frame: &Frame, scratch: &mut String, mut add: impl FnMut(&'s
     if !frame.type_hash().is_empty() {
         put("blaze-type-hash", format_args!("{}", frame.type_hash()));
     }
-    if let Some(traceparent) = traceparent(&frame.head()[PREFIX_BYTES..]) {
-        put("traceparent", format_args!("{traceparent}"));
+    if !frame.traceparent().is_empty() {
+        put("traceparent", format_args!("{}", frame.traceparent()));
     }
 }
 
@@ -198,42 +195,6 @@ pub(super) fn headers(frame: &Frame, scratch: &mut String) -> OwnedHeaders {
         });
     });
     headers.unwrap_or_default()
-}
-
-/// What the frame says of its trace, which it carries without looking at it.
-fn traceparent(mut header: &[u8]) -> Option<&str> {
-    while !header.is_empty() {
-        let key = varint(&mut header)?;
-        let length = match key & 7 {
-            0 => {
-                varint(&mut header)?;
-                continue;
-            }
-            1 => 8,
-            2 => usize::try_from(varint(&mut header)?).ok()?,
-            5 => 4,
-            _ => return None,
-        };
-        let (value, rest) = header.split_at_checked(length)?;
-        header = rest;
-        if key >> 3 == TRACEPARENT_TAG {
-            return std::str::from_utf8(value).ok().filter(|text| !text.is_empty());
-        }
-    }
-    None
-}
-
-fn varint(bytes: &mut &[u8]) -> Option<u64> {
-    let mut value = 0;
-    for shift in (0..64).step_by(7) {
-        let (first, rest) = bytes.split_first()?;
-        *bytes = rest;
-        value |= u64::from(first & 0x7f) << shift;
-        if first & 0x80 == 0 {
-            return Some(value);
-        }
-    }
-    None
 }
 
 /// The key of a record: those of one writer stay in order, and a compacted topic keeps the last `depth` of each.

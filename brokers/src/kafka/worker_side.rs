@@ -23,26 +23,16 @@ use crate::outbox::Fate;
 use crate::port::BrokerError;
 use crate::worker_side::{KeyedMessage, WorkerSide, WriteError};
 
-/// The worker's part of a broker.
-pub(super) struct WorkerState {
-    pub(super) creator: TopicCreator,
-}
-
-impl WorkerState {
-    pub(super) fn new(names: &Names) -> Self {
-        let needed = OF_WORKER
-            .iter()
-            .map(|channel| (names.reserved(channel), Purpose::Messages));
-        Self {
-            creator: TopicCreator::new(needed),
-        }
-    }
+/// Makes the topics of a worker.
+pub(super) fn creator(names: &Names) -> TopicCreator {
+    let needed = OF_WORKER.iter();
+    TopicCreator::new(needed.map(|channel| (names.reserved(channel), Purpose::Messages)))
 }
 
 /// What the worker is given.
 pub(super) struct KafkaWorkerSide {
     pub(super) inner: Arc<Inner>,
-    pub(super) state: Arc<WorkerState>,
+    pub(super) creator: Arc<TopicCreator>,
 }
 
 impl KafkaWorkerSide {
@@ -62,7 +52,6 @@ impl KafkaWorkerSide {
             })
         };
         let known = self
-            .state
             .creator
             .with(&name, |prepared| Some((prepared.topic.clone()?, prepared.refusal())));
         match known.flatten() {
@@ -96,16 +85,15 @@ fn too_large(message: &KeyedMessage) -> WriteError {
 #[async_trait]
 impl WorkerSide for KafkaWorkerSide {
     fn prepare(&self, channel: &ChannelName) -> Result<(), BrokerError> {
-        let creator = &self.state.creator;
-        if creator.count() >= MAX_CHANNELS {
+        if self.creator.count() >= MAX_CHANNELS {
             return Err(BrokerError::TooManyChannels(MAX_CHANNELS));
         }
-        creator.prepare(&self.inner, channel, Purpose::Notices, 1)
+        self.creator.prepare(&self.inner, channel, Purpose::Notices, 1)
     }
 
     fn release(&self, channel: &ChannelName) {
         if let Ok(name) = self.inner.names.topic(channel) {
-            self.state.creator.release(&name);
+            self.creator.release(&name);
         }
     }
 

@@ -15,7 +15,7 @@ use tokio::sync::watch;
 use super::{Channel, MemoryHub};
 use crate::port::{
     Broker, BrokerError, BrokerKind, BrokerStatus, Content, Health, Later, PublishOutcome, Publisher, PublisherOptions,
-    SubscribeOptions, Subscription, SubscriptionSender,
+    StatusCell, SubscribeOptions, Subscription, SubscriptionSender,
 };
 
 /// A client of a [`MemoryHub`]; made by [`MemoryHub::broker`].
@@ -27,34 +27,23 @@ pub struct MemoryBroker {
 /// What a client's publishers share with it.
 pub(super) struct Client {
     closed: AtomicBool,
-    status: watch::Sender<BrokerStatus>,
+    status: StatusCell,
     /// To close them; those that ended are forgotten when the list has doubled.
     subscriptions: Mutex<Vec<SubscriptionSender>>,
 }
 
 impl Client {
     pub(super) fn new(health: Health, detail: String) -> Self {
-        let since = Instant::now();
         Self {
             closed: AtomicBool::new(false),
-            status: watch::Sender::new(BrokerStatus { health, detail, since }),
+            status: StatusCell::new(health, detail),
             subscriptions: Mutex::default(),
         }
     }
 
-    /// Tells a change of the hub; a closed client stays closed.
+    /// Tells a change of the hub.
     pub(super) fn set_health(&self, health: Health, detail: &str) {
-        self.status.send_if_modified(|status| {
-            let changes = status.health != health && status.health != Health::Closed;
-            if changes {
-                *status = BrokerStatus {
-                    health,
-                    detail: detail.to_owned(),
-                    since: Instant::now(),
-                };
-            }
-            changes
-        });
+        self.status.set(health, detail);
     }
 
     fn is_closed(&self) -> bool {
@@ -90,12 +79,6 @@ impl Client {
 impl MemoryBroker {
     pub(super) fn new(hub: MemoryHub, client: Arc<Client>) -> Self {
         Self { hub, client }
-    }
-
-    /// The hub that it is a client of.
-    #[must_use]
-    pub fn hub(&self) -> &MemoryHub {
-        &self.hub
     }
 }
 
@@ -182,14 +165,7 @@ impl Publisher for MemoryPublisher {
         if let Some(refusal) = self.refusal(payload) {
             return refusal;
         }
-        let content = if self.channel.name.is_reserved() {
-            Content::Bare {
-                payload: payload.clone(),
-                identity: None,
-            }
-        } else {
-            Content::from_bytes(payload.clone())
-        };
+        let content = Content::of(self.channel.name.is_reserved(), payload.clone());
         self.hub.deliver(&self.channel, content, self.depth);
         PublishOutcome::Taken
     }

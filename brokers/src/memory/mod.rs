@@ -4,7 +4,7 @@
 //! MemoryBroker (client) ─ publisher ─┐                       ┌─ ring ─ Subscription
 //! MemoryBroker (client) ─ publisher ─┴─► MemoryHub: channel ─┼─ ring ─ Subscription
 //!                                           │                └─ ring ─ Subscription
-//!                                           └─► kept: last `depth` frames per (channel, writer)
+//!                                           └─► retained: last `depth` frames per (channel, writer)
 //! ```
 //!
 //! A [`MemoryHub`] is the server, a [`MemoryBroker`] one client of it; a client also sees what it publishes itself, as on
@@ -12,7 +12,6 @@
 //! it back, so that what follows an outage can be tried without a server.
 
 mod broker;
-mod kept;
 
 use std::collections::HashMap;
 use std::fmt;
@@ -22,17 +21,25 @@ use std::time::Instant;
 
 use blaze_domain::WriterId;
 use blaze_domain::names::ChannelName;
+use blaze_proto::Frame;
 use parking_lot::Mutex;
 
 pub use broker::MemoryBroker;
-pub use kept::{MAX_KEPT_BYTES, MAX_KEPT_WRITERS};
 
 use crate::port::{BrokerError, Content, Health, Received, SubscribeOptions, Subscription, SubscriptionSender};
+use crate::retained::{RetainedBounds, RetainedCache};
 use broker::Client;
-use kept::Kept;
 
 /// Channels that one hub holds at most.
 pub const MAX_CHANNELS: usize = 65_536;
+/// What one hub retains: 65,536 pairs of channel and writer, 64 MiB.
+const RETAINED: RetainedBounds = RetainedBounds {
+    writers: 65_536,
+    bytes: 64 * 1024 * 1024,
+    bytes_of_writer: 64 * 1024 * 1024,
+};
+/// Allowance for what a retained message takes beside its bytes: index entries and the parsed header.
+const OVERHEAD_BYTES: usize = 512;
 
 /// A named space of channels: the server of the memory broker. Cheap to clone; all clones are the same hub.
 #[derive(Clone)]
@@ -40,28 +47,21 @@ pub struct MemoryHub {
     shared: Arc<Shared>,
 }
 
-/// What a hub holds now, and what it had to give up.
+/// What a hub holds now.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct MemoryHubStats {
     /// Channels that are known.
     pub channels: usize,
     /// Subscriptions that live.
     pub subscriptions: usize,
-    /// Pairs of channel and writer of which messages are kept for late joiners.
-    pub kept_writers: usize,
-    /// Messages kept for late joiners.
-    pub kept_messages: usize,
-    /// Bytes kept for late joiners, with an allowance for each message's own administration.
-    pub kept_bytes: usize,
-    /// Messages that were kept and gave way to newer ones because the hub was at its bounds, not because of `depth`.
-    pub kept_dropped: u64,
 }
 
 struct Shared {
     name: String,
     up: AtomicBool,
     channels: Mutex<Channels>,
-    kept: Mutex<Kept>,
+    /// Frames and when they came.
+    retained: Mutex<RetainedCache<(ChannelName, WriterId), (Frame, Instant)>>,
     clients: Mutex<Vec<Weak<Client>>>,
 }
 
@@ -92,16 +92,10 @@ impl MemoryHub {
                     by_name: HashMap::new(),
                     sweep_at: FIRST_SWEEP,
                 }),
-                kept: Mutex::default(),
+                retained: Mutex::new(RetainedCache::new(RETAINED)),
                 clients: Mutex::default(),
             }),
         }
-    }
-
-    /// The hub's name.
-    #[must_use]
-    pub fn name(&self) -> &str {
-        &self.shared.name
     }
 
     /// A new client of this hub.
@@ -126,9 +120,9 @@ impl MemoryHub {
         self.set_up(true);
     }
 
-    /// Forgets what is kept of a writer of a channel, as when its lease lapsed.
+    /// Forgets what is retained of a writer of a channel, as when its lease lapsed.
     pub fn forget_writer(&self, channel: &ChannelName, writer: WriterId) {
-        self.shared.kept.lock().forget(channel, writer);
+        self.shared.retained.lock().forget(&(channel.clone(), writer));
     }
 
     /// What the hub holds now.
@@ -136,14 +130,9 @@ impl MemoryHub {
     pub fn stats(&self) -> MemoryHubStats {
         let channels: Vec<Arc<Channel>> = self.shared.channels.lock().by_name.values().cloned().collect();
         let subscriptions = channels.iter().map(|channel| channel.count_readers()).sum();
-        let kept = self.shared.kept.lock();
         MemoryHubStats {
             channels: channels.len(),
             subscriptions,
-            kept_writers: kept.writers(),
-            kept_messages: kept.messages(),
-            kept_bytes: kept.bytes(),
-            kept_dropped: kept.dropped(),
         }
     }
 
@@ -205,36 +194,43 @@ impl MemoryHub {
         let mut readers = channel.readers.lock();
         readers.retain(|reader| !reader.is_closed());
         if options.with_kept {
-            let kept = self.shared.kept.lock().of_channel(&channel.name);
             let now = Instant::now();
-            let received = |(frame, since)| Received {
-                content: Content::Frame(frame),
-                at: now,
-                broker_age_us: u64::try_from(now.saturating_duration_since(since).as_micros()).unwrap_or(u64::MAX),
-                kept: true,
-                place: None,
+            let received = |(frame, since)| {
+                let age = now.saturating_duration_since(since).as_micros();
+                Received::kept(Content::Frame(frame), now, u64::try_from(age).unwrap_or(u64::MAX))
             };
-            sender.send_kept(kept.into_iter().map(received));
+            sender.send_kept(self.retained_of(&channel.name).into_iter().map(received));
         }
         readers.push(sender.clone());
         Ok((sender, subscription))
     }
 
+    /// All that is retained of a channel, in the order of arrival.
+    fn retained_of(&self, channel: &ChannelName) -> Vec<(Frame, Instant)> {
+        let retained = self.shared.retained.lock();
+        let of_channel = retained.iter().filter(|((name, _), ..)| name == channel);
+        let mut found: Vec<_> = of_channel
+            .flat_map(|(.., of_writer)| of_writer.iter().cloned())
+            .collect();
+        // Stable, and the times of one writer ascend.
+        found.sort_by_key(|(_, since)| *since);
+        found
+    }
+
     /// Hands a message to all readers of a channel, and keeps the last `depth` frames of its writer.
     fn deliver(&self, channel: &Channel, content: Content, depth: u32) {
-        let message = Received {
-            content,
-            at: Instant::now(),
-            broker_age_us: 0,
-            kept: false,
-            place: None,
-        };
+        let message = Received::live(content, Instant::now());
         let mut readers = channel.readers.lock();
         if depth > 0
             && let Content::Frame(frame) = &message.content
         {
-            let mut kept = self.shared.kept.lock();
-            kept.keep(&channel.name, frame.clone(), depth, message.at);
+            let writer = (channel.name.clone(), frame.writer());
+            let (size, depth) = (
+                frame.wire_len() + OVERHEAD_BYTES,
+                usize::try_from(depth).unwrap_or(usize::MAX),
+            );
+            let mut retained = self.shared.retained.lock();
+            retained.keep(writer, (frame.clone(), message.at), size, depth);
         }
         readers.retain(|reader| reader.send(message.clone()));
     }
@@ -259,7 +255,7 @@ impl Channel {
 }
 
 impl Channels {
-    /// Forgets channels that nobody reads and no publisher holds. Kept messages are found by name, not through the
+    /// Forgets channels that nobody reads and no publisher holds. Retained messages are found by name, not through the
     /// channel. The bound doubles, so that sweeping costs a constant per channel made.
     fn sweep(&mut self) {
         self.by_name

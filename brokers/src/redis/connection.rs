@@ -85,8 +85,8 @@ impl Pushes {
 pub(super) async fn keep(shared: Arc<Shared>, line: Line) {
     // Also where this task is aborted, nobody holds the connection any longer.
     let _vacate = Vacate(&shared, line);
+    let mut pause = FIRST_PAUSE;
     let attempts = async {
-        let mut pause = FIRST_PAUSE;
         loop {
             let began = Instant::now();
             let failure = attempt(&shared, line).await;
@@ -103,11 +103,7 @@ pub(super) async fn keep(shared: Arc<Shared>, line: Line) {
             pause = (2 * pause).min(LONGEST_PAUSE);
         }
     };
-    tokio::select! {
-        biased;
-        () = shared.stop.cancelled() => {}
-        () = attempts => {}
-    }
+    shared.stop.run_until_cancelled(attempts).await;
 }
 
 /// Connects and serves; returns when there is no connection any more.

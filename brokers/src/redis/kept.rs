@@ -7,18 +7,18 @@ use blaze_domain::WriterId;
 use blaze_proto::Frame;
 use blaze_proto::frame::MAX_FRAME_BYTES;
 use bytes::{Buf, Bytes};
-use lru::LruCache;
 use redis::{RedisWrite, ToRedisArgs};
 
 use super::publisher::Target;
 use super::state::Line;
+use crate::retained::{Retained, RetainedBounds, RetainedCache};
 
-/// Writers of which one client keeps frames at most; the one that was silent longest gives way.
-pub const MAX_KEPT_WRITERS: usize = 65_536;
-/// Bytes that one client keeps at most (64 MiB).
-pub const MAX_KEPT_BYTES: usize = 64 * 1024 * 1024;
-/// Bytes of one field at most; its oldest frames give way, but one frame always fits. Each message writes the whole field.
-const MAX_FIELD_BYTES: usize = 32 * 1024 * 1024;
+/// What one client keeps. Each message writes the whole field.
+const BOUNDS: RetainedBounds = RetainedBounds {
+    writers: 65_536,
+    bytes: 64 * 1024 * 1024,
+    bytes_of_writer: 32 * 1024 * 1024,
+};
 /// Length and time before each frame.
 const ENTRY_HEAD_BYTES: usize = 12;
 /// Allowance for what a frame takes beside its bytes.
@@ -31,15 +31,15 @@ pub(super) struct KeptFrame {
     pub(super) written_ns: u64,
     pub(super) head: Bytes,
     pub(super) payload: Bytes,
+    /// Which connection wrote it.
+    pub(super) line: Line,
+    /// Gone with the publisher, once all that waited in its queue is written.
+    pub(super) publisher: Weak<Target>,
 }
 
 impl KeptFrame {
     fn length(&self) -> usize {
         self.head.len() + self.payload.len()
-    }
-
-    fn cost(&self) -> usize {
-        self.length() + ENTRY_HEAD_BYTES + OVERHEAD_BYTES
     }
 }
 
@@ -47,32 +47,20 @@ impl KeptFrame {
 ///
 /// Each is a length (u32, little-endian), the time of publishing (u64, little-endian, nanoseconds since 1970, the clock of
 /// the host of the publisher) and the frame.
-pub(super) struct Field {
-    frames: VecDeque<KeptFrame>,
-    bytes: usize,
-    line: Line,
-    /// Gone with the publisher, once all that waited in its queue is written.
-    publisher: Weak<Target>,
-}
+pub(super) struct Field<'a>(&'a Retained<KeptFrame>);
 
-impl Field {
-    fn pop(&mut self) -> usize {
-        let cost = self.frames.pop_front().map_or(0, |frame| frame.cost());
-        self.bytes -= cost;
-        cost
-    }
-
+impl Field<'_> {
     /// Bytes of the value at most.
     pub(super) fn size(&self) -> usize {
-        self.bytes
+        self.0.bytes()
     }
 }
 
-impl ToRedisArgs for &Field {
+impl ToRedisArgs for Field<'_> {
     fn write_redis_args<W: ?Sized + RedisWrite>(&self, out: &mut W) {
         use std::io::Write as _;
         let mut value = out.writer_for_next_arg();
-        for frame in &self.frames {
+        for frame in self.0.iter() {
             // Writing to memory cannot fail; a frame has less than 2^32 bytes.
             let length = u32::try_from(frame.length()).unwrap_or(u32::MAX);
             let _ = value.write_all(&length.to_le_bytes());
@@ -113,98 +101,52 @@ pub(super) type FieldKey = (Arc<str>, WriterId);
 
 /// The last frames of each writer that this client publishes, as the server has them.
 pub(super) struct Mirror {
-    fields: LruCache<FieldKey, Field>,
-    bytes: usize,
-    max_writers: usize,
-    max_bytes: usize,
+    fields: RetainedCache<FieldKey, KeptFrame>,
     /// Fields that the server has lost, by the connection that wrote them.
     rewrite: HashMap<Line, VecDeque<FieldKey>>,
 }
 
 impl Default for Mirror {
     fn default() -> Self {
-        Self::with_bounds(MAX_KEPT_WRITERS, MAX_KEPT_BYTES)
+        Self {
+            fields: RetainedCache::new(BOUNDS),
+            rewrite: HashMap::new(),
+        }
     }
 }
 
 impl Mirror {
-    fn with_bounds(max_writers: usize, max_bytes: usize) -> Self {
-        Self {
-            fields: LruCache::unbounded(),
-            bytes: 0,
-            max_writers,
-            max_bytes,
-            rewrite: HashMap::new(),
-        }
-    }
-
     /// Takes a frame in as the newest of its writer, and gives the field that is to be written before it is published.
-    pub(super) fn keep(
-        &mut self,
-        key: &FieldKey,
-        frame: KeptFrame,
-        depth: usize,
-        line: Line,
-        publisher: Weak<Target>,
-    ) -> Option<&Field> {
-        let field = self.fields.get_or_insert_mut(key.clone(), || Field {
-            frames: VecDeque::new(),
-            bytes: 0,
-            line,
-            publisher: Weak::new(),
-        });
-        (field.line, field.publisher) = (line, publisher);
-        let before = field.bytes;
-        field.bytes += frame.cost();
-        field.frames.push_back(frame);
-        let most = self.max_bytes.min(MAX_FIELD_BYTES);
-        while field.frames.len() > depth.max(1) || (field.bytes > most && field.frames.len() > 1) {
-            field.pop();
-        }
-        self.bytes = self.bytes - before + field.bytes;
-        // The field itself is the one used last, so it goes only when it is alone.
-        while self.fields.len() > self.max_writers || (self.bytes > self.max_bytes && self.fields.len() > 1) {
-            let Some((_, field)) = self.fields.pop_lru() else { break };
-            self.bytes -= field.bytes;
-        }
-        self.fields.peek(key)
+    pub(super) fn keep(&mut self, key: &FieldKey, frame: KeptFrame, depth: usize) -> Option<Field<'_>> {
+        let size = frame.length() + ENTRY_HEAD_BYTES + OVERHEAD_BYTES;
+        self.fields.keep(key.clone(), frame, size, depth);
+        self.fields.get(key).map(Field)
     }
 
     /// Forgets a writer.
     pub(super) fn forget(&mut self, key: &FieldKey) {
-        if let Some(field) = self.fields.pop(key) {
-            self.bytes -= field.bytes;
-        }
+        self.fields.forget(key);
     }
 
     /// Forgets what publishers wrote that are no more.
     pub(super) fn forget_orphans(&mut self) {
-        let orphans: Vec<FieldKey> = self
-            .fields
-            .iter()
-            .filter(|(_, field)| field.publisher.strong_count() == 0)
-            .map(|(key, _)| key.clone())
-            .collect();
-        for key in &orphans {
-            self.forget(key);
-        }
+        self.fields.forget_if(|_, newest| newest.publisher.strong_count() == 0);
     }
 
     /// The server has lost everything.
     pub(super) fn rewrite_all(&mut self) {
         self.rewrite.clear();
-        for (key, field) in &self.fields {
-            self.rewrite.entry(field.line).or_default().push_back(key.clone());
+        for (key, newest, _) in self.fields.iter() {
+            self.rewrite.entry(newest.line).or_default().push_back(key.clone());
         }
     }
 
     /// The next field that a connection has to write again.
-    pub(super) fn next_to_rewrite(&mut self, line: Line) -> Option<(FieldKey, &Field)> {
+    pub(super) fn next_to_rewrite(&mut self, line: Line) -> Option<(FieldKey, Field<'_>)> {
         let queue = self.rewrite.get_mut(&line)?;
         while let Some(key) = queue.pop_front() {
-            if self.fields.contains(&key) {
-                let field = self.fields.peek(&key)?;
-                return Some((key, field));
+            if let Some(field) = self.fields.get(&key) {
+                return Some((key, Field(field)));
             }
         }
         None
@@ -227,6 +169,8 @@ mod tests {
             written_ns,
             head: frame.head_to_write(),
             payload: frame.payload().clone(),
+            line: Line::PublishSmall,
+            publisher: Weak::new(),
         }
     }
 
@@ -236,21 +180,12 @@ mod tests {
 
     fn keep(mirror: &mut Mirror, writer: u8, sequence: u64, bytes: usize, depth: usize) {
         let frame = kept(&frame(writer, sequence, bytes), sequence);
-        mirror.keep(&key(writer), frame, depth, Line::PublishSmall, Weak::new());
+        mirror.keep(&key(writer), frame, depth);
     }
 
     fn value(mirror: &Mirror, writer: u8) -> Option<Bytes> {
-        let field = mirror.fields.peek(&key(writer))?;
+        let field = mirror.fields.get(&key(writer)).map(Field)?;
         field.to_redis_args().pop().map(Bytes::from)
-    }
-
-    fn sequences(mirror: &Mirror, writer: u8) -> Vec<u64> {
-        let Some(value) = value(mirror, writer) else {
-            return Vec::new();
-        };
-        let (frames, damaged) = read_field(value, WriterId([writer; 16]));
-        assert!(!damaged);
-        frames.iter().map(|(_, frame)| frame.sequence()).collect()
     }
 
     #[test]
@@ -291,32 +226,11 @@ mod tests {
         let mut mirror = Mirror::default();
         for (sequence, written_ns) in [(1, 50), (2, 20), (3, 60)] {
             let frame = kept(&frame(1, sequence, 1), written_ns);
-            mirror.keep(&key(1), frame, 3, Line::PublishSmall, Weak::new());
+            mirror.keep(&key(1), frame, 3);
         }
         let (frames, _) = read_field(value(&mirror, 1).unwrap(), WriterId([1; 16]));
         let found: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.sequence())).collect();
         assert_eq!(found, [(50, 1), (50, 2), (60, 3)]);
-    }
-
-    #[test]
-    fn the_mirror_is_bounded_and_the_longest_silent_give_way() {
-        let mut mirror = Mirror::with_bounds(2, usize::MAX);
-        for writer in 1..=3 {
-            keep(&mut mirror, writer, 1, 10, 5);
-        }
-        assert!(sequences(&mirror, 1).is_empty());
-        assert_eq!((sequences(&mirror, 2), sequences(&mirror, 3)), (vec![1], vec![1]));
-
-        let mut mirror = Mirror::with_bounds(100, 4_000);
-        for sequence in 1..=3 {
-            keep(&mut mirror, 1, sequence, 1_000, 5);
-        }
-        keep(&mut mirror, 2, 1, 1_000, 5);
-        assert!(sequences(&mirror, 1).is_empty());
-        keep(&mut mirror, 2, 2, 100_000, 5);
-        assert_eq!(sequences(&mirror, 2), [2], "one frame always fits");
-        mirror.forget(&key(2));
-        assert_eq!((mirror.bytes, mirror.fields.len()), (0, 0));
     }
 
     #[test]
@@ -335,6 +249,6 @@ mod tests {
         found.sort_unstable();
         assert_eq!(found, [1, 3]);
         mirror.forget_orphans();
-        assert_eq!(mirror.bytes, 0);
+        assert!(mirror.fields.iter().next().is_none());
     }
 }

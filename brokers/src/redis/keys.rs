@@ -17,7 +17,7 @@ use blaze_domain::node_file::RedisBroker as Section;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use redis::aio::MultiplexedConnection;
-use redis::{AsyncConnectionConfig, FromRedisValue, InfoDict, RedisError};
+use redis::{AsyncConnectionConfig, Cmd, FromRedisValue, InfoDict, RedisError, SetExpiry, SetOptions};
 
 use super::lock::Scripts;
 use super::settings::Settings;
@@ -205,15 +205,7 @@ impl RedisKeys {
     /// # Errors
     /// [`KeyError`].
     pub async fn get(&self, key: &str) -> Result<Option<Bytes>, KeyError> {
-        let key = self.settings.names.key(key);
-        let value = self
-            .call(|mut connection| async move {
-                redis::cmd("GET")
-                    .arg(key)
-                    .query_async::<Option<Vec<u8>>>(&mut connection)
-                    .await
-            })
-            .await?;
+        let value: Option<Vec<u8>> = self.ask(Cmd::get(self.settings.names.key(key))).await?;
         Ok(value.map(Bytes::from))
     }
 
@@ -222,14 +214,10 @@ impl RedisKeys {
     /// # Errors
     /// [`KeyError`].
     pub async fn put_for(&self, key: &str, value: &Bytes, expires: Duration) -> Result<(), KeyError> {
-        let key = self.settings.names.key(key);
-        let expires_ms = i64::try_from(expires.as_millis()).unwrap_or(i64::MAX).max(1);
-        self.call(|mut connection| async move {
-            let mut set = redis::cmd("SET");
-            set.arg(key).arg(value.as_ref()).arg("PX").arg(expires_ms);
-            set.query_async::<()>(&mut connection).await
-        })
-        .await
+        let expires_ms = u64::try_from(expires.as_millis()).unwrap_or(u64::MAX).max(1);
+        let options = SetOptions::default().with_expiration(SetExpiry::PX(expires_ms));
+        self.ask(Cmd::set_options(self.settings.names.key(key), value.as_ref(), options))
+            .await
     }
 
     /// There is no such record, if one member of it has this value.
@@ -248,15 +236,7 @@ impl RedisKeys {
     /// # Errors
     /// [`KeyError`].
     pub async fn record(&self, key: &str) -> Result<Option<Record>, KeyError> {
-        let key = self.settings.names.key(key);
-        let members = self
-            .call(|mut connection| async move {
-                redis::cmd("HGETALL")
-                    .arg(key)
-                    .query_async::<Record>(&mut connection)
-                    .await
-            })
-            .await?;
+        let members: Record = self.ask(Cmd::hgetall(self.settings.names.key(key))).await?;
         Ok((!members.is_empty()).then_some(members))
     }
 
@@ -312,13 +292,9 @@ impl RedisKeys {
         let mut keys: std::collections::BTreeSet<String> = std::collections::BTreeSet::new();
         let mut cursor = 0_u64;
         loop {
-            let (next, part) = self
-                .call(|mut connection| async move {
-                    let mut scan = redis::cmd("SCAN");
-                    scan.arg(cursor).arg("MATCH").arg(pattern).arg("COUNT").arg(SCAN);
-                    scan.query_async::<(u64, Vec<String>)>(&mut connection).await
-                })
-                .await?;
+            let mut scan = redis::cmd("SCAN");
+            scan.arg(cursor).arg("MATCH").arg(pattern).arg("COUNT").arg(SCAN);
+            let (next, part): (u64, Vec<String>) = self.ask(scan).await?;
             keys.extend(part);
             if next == 0 || keys.len() >= most {
                 return Ok(keys.into_iter().take(most).collect());
@@ -348,13 +324,15 @@ impl RedisKeys {
     /// # Errors
     /// [`KeyError`].
     pub async fn run_id(&self) -> Result<Option<String>, KeyError> {
-        let info = self
-            .call(|mut connection| async move {
-                let mut info = redis::cmd("INFO");
-                info.arg("server").query_async::<InfoDict>(&mut connection).await
-            })
-            .await?;
+        let mut info = redis::cmd("INFO");
+        info.arg("server");
+        let info: InfoDict = self.ask(info).await?;
         Ok(info.get("run_id"))
+    }
+
+    async fn ask<T: FromRedisValue>(&self, command: Cmd) -> Result<T, KeyError> {
+        self.call(|mut connection| async move { command.query_async(&mut connection).await })
+            .await
     }
 
     pub(super) async fn call<T, F>(&self, ask: impl FnOnce(MultiplexedConnection) -> F) -> Result<T, KeyError>

@@ -1,6 +1,6 @@
 //! The flow's leases on the server: an own copy, what is still to be written, and the task that writes it.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,17 +10,14 @@ use parking_lot::Mutex;
 use redis::Cmd;
 use tokio::sync::Notify;
 
-use super::Shared;
 use super::publisher::hset_command;
 use super::state::Scope;
+use super::{Shared, server};
+use crate::pending::Pending;
 use crate::port::BrokerError;
 
 /// Leases that are kept at most: a flow has 10,000, and some are on their way out.
-pub const MAX_LEASES: usize = 20_000;
-/// Leases that wait to be written one by one; beyond that all are written anew.
-const MAX_PENDING: usize = 2 * MAX_LEASES;
-/// Writers that wait to be forgotten; the oldest give way.
-const MAX_FORGOTTEN: usize = 65_536;
+const MAX_LEASES: usize = 20_000;
 /// Commands that are sent together.
 const PER_BATCH: usize = 500;
 /// After a refusal the server is left alone for this long.
@@ -28,130 +25,65 @@ const AFTER_REFUSAL: Duration = Duration::from_secs(1);
 /// Until the leases must have been read.
 const LOAD: Duration = Duration::from_secs(10);
 
-/// One change of the server's data.
-#[derive(Debug, Clone, PartialEq, Eq)]
-enum Change {
-    /// All leases go; those that live follow.
-    Clear,
-    Put(String, Bytes),
-    Remove(String),
-    Forget(Arc<str>, WriterId),
-}
+/// A field of a hash, and what it is to hold; `None`: there is no such field.
+type Change = ((Arc<str>, String), Option<Bytes>);
 
-/// The leases, and how far the server knows them. Changes of one lease that were not written yet become one.
-#[derive(Debug, Default)]
+/// The leases, and what the server does not know of them, and of writers that are to be forgotten.
+#[derive(Debug)]
 pub(super) struct Ledger {
+    /// Name of their hash.
+    hash: Arc<str>,
     kept: HashMap<String, Bytes>,
-    pending: VecDeque<String>,
-    is_pending: HashSet<String>,
-    /// Too much happened while the server was away.
-    clear_first: bool,
-    forgotten: VecDeque<(Arc<str>, WriterId)>,
-    /// Changes that the server has not confirmed.
-    under_way: bool,
+    pending: Pending<(Arc<str>, String), Option<Bytes>>,
 }
 
 impl Ledger {
+    fn new(hash: Arc<str>) -> Self {
+        Self {
+            hash,
+            kept: HashMap::new(),
+            pending: Pending::default(),
+        }
+    }
+
     /// Returns false where there are too many.
     fn put(&mut self, key: &str, value: Bytes) -> bool {
         if self.kept.len() >= MAX_LEASES && !self.kept.contains_key(key) {
             return false;
         }
-        self.kept.insert(key.to_owned(), value);
-        self.note(key);
+        self.kept.insert(key.to_owned(), value.clone());
+        self.pending.put(self.field(key), Some(value));
         true
     }
 
     fn remove(&mut self, key: &str) {
         self.kept.remove(key);
-        self.note(key);
+        self.pending.put(self.field(key), None);
     }
 
-    fn note(&mut self, key: &str) {
-        if self.is_pending.insert(key.to_owned()) {
-            self.pending.push_back(key.to_owned());
-        }
-        if self.pending.len() > MAX_PENDING {
-            self.clear_first = true;
-            self.rewrite_all();
-        }
+    fn field(&self, key: &str) -> (Arc<str>, String) {
+        (Arc::clone(&self.hash), key.to_owned())
     }
 
     /// The server may have lost everything.
     pub(super) fn rewrite_all(&mut self) {
-        let removed = self.pending.iter().filter(|key| !self.kept.contains_key(*key));
-        let mut all: VecDeque<String> = if self.clear_first {
-            VecDeque::new()
-        } else {
-            removed.cloned().collect()
-        };
-        all.extend(self.kept.keys().cloned());
-        self.is_pending = all.iter().cloned().collect();
-        self.pending = all;
-    }
-
-    fn forget(&mut self, hash: Arc<str>, writer: WriterId) {
-        if self.forgotten.len() >= MAX_FORGOTTEN {
-            self.forgotten.pop_front();
-        }
-        self.forgotten.push_back((hash, writer));
-    }
-
-    /// The next changes, in order.
-    fn take(&mut self, limit: usize) -> Vec<Change> {
-        let mut changes = Vec::new();
-        if std::mem::take(&mut self.clear_first) {
-            changes.push(Change::Clear);
-        }
-        while changes.len() < limit
-            && let Some(key) = self.pending.pop_front()
-        {
-            self.is_pending.remove(&key);
-            changes.push(match self.kept.get(&key) {
-                Some(value) => Change::Put(key, value.clone()),
-                None => Change::Remove(key),
-            });
-        }
-        while changes.len() < limit
-            && let Some((hash, writer)) = self.forgotten.pop_front()
-        {
-            changes.push(Change::Forget(hash, writer));
-        }
-        self.under_way = !changes.is_empty();
-        changes
-    }
-
-    fn is_settled(&self) -> bool {
-        !self.under_way && !self.clear_first && self.pending.is_empty() && self.forgotten.is_empty()
-    }
-
-    /// Changes that may not have reached the server are to be made first.
-    fn put_back(&mut self, changes: Vec<Change>) {
-        for change in changes.into_iter().rev() {
-            match change {
-                Change::Clear => self.clear_first = true,
-                Change::Put(key, _) | Change::Remove(key) => {
-                    if self.is_pending.insert(key.clone()) {
-                        self.pending.push_front(key);
-                    }
-                }
-                Change::Forget(hash, writer) => self.forgotten.push_front((hash, writer)),
-            }
+        for (key, value) in &self.kept {
+            self.pending
+                .put((Arc::clone(&self.hash), key.clone()), Some(value.clone()));
         }
     }
 
     /// Takes over what the server has, where nothing newer is known.
     fn merge(&mut self, loaded: &[(String, Bytes)]) {
         for (key, value) in loaded {
-            if self.kept.len() < MAX_LEASES && !self.is_pending.contains(key) {
+            if self.kept.len() < MAX_LEASES && !self.pending.contains(&self.field(key)) {
                 self.kept.entry(key.clone()).or_insert_with(|| value.clone());
             }
         }
     }
 }
 
-/// The ledger and its writer's bell.
-#[derive(Default)]
+/// The ledger and its writer's wake-ups.
 pub(super) struct Leases {
     pub(super) ledger: Mutex<Ledger>,
     changed: Notify,
@@ -159,6 +91,14 @@ pub(super) struct Leases {
 }
 
 impl Leases {
+    pub(super) fn new(hash: Arc<str>) -> Self {
+        Self {
+            ledger: Mutex::new(Ledger::new(hash)),
+            changed: Notify::new(),
+            settled: Notify::new(),
+        }
+    }
+
     pub(super) fn put(&self, key: &str, value: Bytes) {
         let taken = self.ledger.lock().put(key, value);
         if !taken {
@@ -176,8 +116,9 @@ impl Leases {
         self.wake();
     }
 
+    /// A writer's field of what is kept for late joiners goes.
     pub(super) fn forget(&self, hash: Arc<str>, writer: WriterId) {
-        self.ledger.lock().forget(hash, writer);
+        self.ledger.lock().pending.put((hash, writer.to_string()), None);
         self.wake();
     }
 
@@ -188,12 +129,7 @@ impl Leases {
 
 /// Writes changes in their order while the scope is ours, until the broker is closed.
 pub(super) async fn write(shared: Arc<Shared>, leases: Arc<Leases>) {
-    let stop = shared.stop.clone();
-    tokio::select! {
-        biased;
-        () = stop.cancelled() => {}
-        () = write_on(&shared, &leases) => {}
-    }
+    shared.stop.run_until_cancelled(write_on(&shared, &leases)).await;
 }
 
 async fn write_on(shared: &Shared, leases: &Leases) {
@@ -201,16 +137,16 @@ async fn write_on(shared: &Shared, leases: &Leases) {
         // An owner's claim rings, too, so nothing stays unwritten after an outage.
         leases.changed.notified().await;
         while is_owned(shared) {
-            let changes = leases.ledger.lock().take(PER_BATCH);
+            let changes = leases.ledger.lock().pending.take(PER_BATCH, |_| true);
             if changes.is_empty() {
                 leases.settled.notify_one();
                 break;
             }
             let mut connection = shared.commands().await;
-            let pipeline = pipeline(&changes, &shared.settings.names.leases());
+            let pipeline = pipeline(&changes);
             let answers = connection.send_packed_commands(&pipeline, 0, pipeline.len()).await;
             if let Err(why) = judge(answers) {
-                leases.ledger.lock().put_back(changes);
+                leases.ledger.lock().pending.put_back(changes);
                 if let Some(why) = why {
                     tracing::warn!(why, "redis refuses leases");
                 }
@@ -227,7 +163,7 @@ fn is_owned(shared: &Shared) -> bool {
 /// Waits until the server has all changes, if it takes any.
 pub(super) async fn drained(shared: &Shared, leases: &Leases, most: Duration) {
     let settled = async {
-        while is_owned(shared) && !leases.ledger.lock().is_settled() {
+        while is_owned(shared) && !leases.ledger.lock().pending.is_settled() {
             leases.settled.notified().await;
         }
     };
@@ -249,14 +185,12 @@ fn judge(answers: redis::RedisResult<Vec<redis::Value>>) -> Result<(), Option<St
     }
 }
 
-fn pipeline(changes: &[Change], hash: &str) -> redis::Pipeline {
+fn pipeline(changes: &[Change]) -> redis::Pipeline {
     let mut pipeline = redis::Pipeline::with_capacity(changes.len());
-    for change in changes {
-        pipeline.add_command(match change {
-            Change::Clear => command("DEL", &[hash]),
-            Change::Put(key, value) => hset_command(hash, key, &value[..], value.len()),
-            Change::Remove(key) => command("HDEL", &[hash, key]),
-            Change::Forget(hash, writer) => command("HDEL", &[hash, &writer.to_string()]),
+    for ((hash, field), value) in changes {
+        pipeline.add_command(match value {
+            Some(value) => hset_command(hash, field, &value[..], value.len()),
+            None => command("HDEL", &[hash, field]),
         });
     }
     pipeline
@@ -275,13 +209,7 @@ pub(super) async fn load(shared: &Shared, leases: &Leases) -> Result<Vec<(String
     }
     let mut connection = shared.commands().await;
     let hash = shared.settings.names.leases();
-    let command = command("HGETALL", &[&hash]);
-    let answer = tokio::time::timeout(LOAD, command.query_async::<Vec<(Vec<u8>, Vec<u8>)>>(&mut connection)).await;
-    let fields = match answer {
-        Ok(Ok(fields)) => fields,
-        Ok(Err(error)) => return Err(BrokerError::Away(error.to_string())),
-        Err(_) => return Err(BrokerError::Away("the leases were not read in time".to_owned())),
-    };
+    let fields = server::fields(&mut connection, &hash, LOAD).await?;
     let mut loaded: Vec<(String, Bytes)> = fields
         .into_iter()
         .filter_map(|(key, value)| Some((String::from_utf8(key).ok()?, Bytes::from(value))))
@@ -306,79 +234,43 @@ mod tests {
         Bytes::from_static(text.as_bytes())
     }
 
-    fn put(key: &str, text: &'static str) -> Change {
-        Change::Put(key.to_owned(), value(text))
+    fn take(ledger: &mut Ledger) -> Vec<(String, Option<Bytes>)> {
+        let taken = ledger.pending.take(usize::MAX, |_| true);
+        let mut all: Vec<_> = taken.into_iter().map(|((_, key), value)| (key, value)).collect();
+        all.sort();
+        all
     }
 
-    fn remove(key: &str) -> Change {
-        Change::Remove(key.to_owned())
-    }
-
-    #[test]
-    fn changes_are_written_in_order_and_the_last_of_a_lease_counts() {
-        let mut ledger = Ledger::default();
-        ledger.put("a", value("1"));
-        ledger.put("b", value("1"));
-        ledger.put("a", value("2"));
-        ledger.remove("c");
-        ledger.forget(Arc::from("h"), WriterId([1; 16]));
-        let forget = Change::Forget(Arc::from("h"), WriterId([1; 16]));
-        assert_eq!(ledger.take(2), [put("a", "2"), put("b", "1")]);
-        assert_eq!(ledger.take(9), [remove("c"), forget]);
-        assert!(ledger.take(9).is_empty());
-    }
-
-    #[test]
-    fn what_did_not_arrive_is_written_again_unless_it_is_out_of_date() {
-        let mut ledger = Ledger::default();
-        ledger.put("a", value("1"));
-        ledger.put("b", value("1"));
-        let lost = ledger.take(9);
-        ledger.put("c", value("1"));
-        ledger.remove("a");
-        ledger.put_back(lost);
-        assert_eq!(ledger.take(9), [put("b", "1"), put("c", "1"), remove("a")]);
+    fn changes(changes: &[(&str, Option<&'static str>)]) -> Vec<(String, Option<Bytes>)> {
+        changes
+            .iter()
+            .map(|(key, text)| ((*key).to_owned(), text.map(value)))
+            .collect()
     }
 
     #[test]
     fn a_server_that_lost_everything_gets_everything() {
-        let mut ledger = Ledger::default();
+        let mut ledger = Ledger::new(Arc::from("h"));
         ledger.put("a", value("1"));
         ledger.put("b", value("1"));
-        ledger.take(9);
+        take(&mut ledger);
         ledger.remove("b");
         ledger.rewrite_all();
-        assert_eq!(ledger.take(9), [remove("b"), put("a", "1")]);
+        assert_eq!(take(&mut ledger), changes(&[("a", Some("1")), ("b", None)]));
     }
 
     #[test]
     fn loading_overwrites_nothing_that_is_newer() {
-        let mut ledger = Ledger::default();
+        let mut ledger = Ledger::new(Arc::from("h"));
         ledger.put("a", value("new"));
         ledger.remove("b");
         ledger.merge(&["a", "b", "c"].map(|key| (key.to_owned(), value("old"))));
-        assert_eq!(ledger.take(9), [put("a", "new"), remove("b")]);
+        assert_eq!(take(&mut ledger), changes(&[("a", Some("new")), ("b", None)]));
         ledger.rewrite_all();
-        let mut all = ledger.take(9);
-        all.sort_by_key(|change| format!("{change:?}"));
-        assert_eq!(all, [put("a", "new"), put("c", "old")]);
-    }
-
-    #[test]
-    fn the_ledger_is_bounded() {
-        let mut ledger = Ledger::default();
+        assert_eq!(take(&mut ledger), changes(&[("a", Some("new")), ("c", Some("old"))]));
         for number in 0..=MAX_LEASES {
             ledger.put(&format!("key-{number}"), value("x"));
         }
         assert_eq!(ledger.kept.len(), MAX_LEASES);
-        for number in 0..MAX_PENDING {
-            ledger.remove(&format!("gone-{number}"));
-        }
-        assert!(ledger.pending.len() <= MAX_PENDING);
-        assert_eq!(ledger.take(1), [Change::Clear], "too much to tell: all is written anew");
-        for number in 0..=MAX_FORGOTTEN {
-            ledger.forget(Arc::from("h"), WriterId([u8::try_from(number % 200).unwrap(); 16]));
-        }
-        assert_eq!(ledger.forgotten.len(), MAX_FORGOTTEN);
     }
 }

@@ -12,6 +12,7 @@ use bytes::Bytes;
 use redis::Script;
 
 use super::keys::{KeyChange, KeyError, RedisKeys};
+use crate::worker_side::Held;
 
 /// How long a note stays that nobody repeats.
 const NOTE_KEPT: Duration = Duration::from_secs(24 * 60 * 60);
@@ -23,15 +24,6 @@ pub struct RedisLock {
     pub key: String,
     /// Who wants it; no two owners have the same name.
     pub owner: String,
-}
-
-/// What became of asking for a lock.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct RedisHeld {
-    /// Whether the owner has it.
-    pub is_held: bool,
-    /// What the last owner that left a note has left.
-    pub note: Option<String>,
 }
 
 /// What runs on the server, which has it after the first call.
@@ -93,7 +85,7 @@ impl RedisKeys {
     ///
     /// # Errors
     /// [`KeyError`]: then it may run out, or be had.
-    pub async fn hold(&self, lock: &RedisLock, time: Duration, note: Option<&str>) -> Result<RedisHeld, KeyError> {
+    pub async fn hold(&self, lock: &RedisLock, time: Duration, note: Option<&str>) -> Result<Held, KeyError> {
         let mut call = self.scripts.hold.key(self.settings.names.key(&lock.key));
         call.key(self.settings.names.key(&format!("{}:told", lock.key)))
             .arg(&lock.owner)
@@ -104,7 +96,7 @@ impl RedisKeys {
         let (is_held, note) = self
             .call(|mut connection| async move { call.invoke_async::<(bool, Option<String>)>(&mut connection).await })
             .await?;
-        Ok(RedisHeld { is_held, note })
+        Ok(Held { is_held, note })
     }
 
     /// Gives a lock up, if its owner has it.

@@ -43,11 +43,8 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
 pub use gate::MAX_QUEUE_BYTES;
-pub use kept::{MAX_KEPT_BYTES, MAX_KEPT_WRITERS};
 pub use keys::{KeyChange, KeyError, Record, RedisKeys};
-pub use leases::MAX_LEASES;
-pub use lock::{RedisHeld, RedisLock};
-pub use subscriptions::MAX_CHANNELS;
+pub use lock::RedisLock;
 
 use crate::open::OpenError;
 use crate::port::{
@@ -220,6 +217,7 @@ impl RedisBroker {
     /// [`OpenError`] where it can never work: a file that cannot be read, a URL that is none.
     pub fn open(section: &Section, role: &Role) -> Result<Self, OpenError> {
         let settings = Settings::read(section)?;
+        let leases = settings.names.leases();
         let runtime = tokio::runtime::Handle::try_current().map_err(|error| OpenError::Setting {
             key: "redis".to_owned(),
             reason: error.to_string(),
@@ -232,7 +230,7 @@ impl RedisBroker {
                 Role::Flow { flow, epoch } => Some(Flow {
                     flow: flow.clone(),
                     epoch: *epoch,
-                    leases: Arc::default(),
+                    leases: Arc::new(Leases::new(leases)),
                 }),
             },
             started: Default::default(),

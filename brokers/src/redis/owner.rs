@@ -112,11 +112,7 @@ impl Owner {
     /// Claims and renews until the broker is closed.
     pub(super) async fn run(mut self) {
         let stop = self.shared.stop.clone();
-        tokio::select! {
-            biased;
-            () = stop.cancelled() => {}
-            () = self.keep() => {}
-        }
+        stop.run_until_cancelled(self.keep()).await;
     }
 
     async fn keep(&mut self) {
@@ -226,33 +222,9 @@ pub(super) async fn release(shared: &Shared, flow: &str, epoch: u64) {
     let Some(mut connection) = shared.commands_now() else {
         return;
     };
-    let script = RELEASE_OURS.key(shared.settings.names.owner());
-    let released = async {
-        let mut script = script;
-        script
-            .arg(format!("{flow}/{epoch}"))
-            .invoke_async::<i64>(&mut connection)
-            .await
-    };
+    let mut script = RELEASE_OURS.key(shared.settings.names.owner());
+    script.arg(format!("{flow}/{epoch}"));
+    let released = script.invoke_async::<i64>(&mut connection);
     // Left behind, the key ends by itself.
     let _ = tokio::time::timeout(RELEASE, released).await;
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn answers_of_the_script_are_understood() {
-        let read = |answer| Claim::read(answer, "edge/robot-1");
-        assert_eq!(read("ours"), Claim::Ours);
-        assert_eq!(read("taken"), Claim::Ours);
-        assert_eq!(read("new"), Claim::New);
-        assert_eq!(read("held edge/robot-2/17"), Claim::Held("edge/robot-2".to_owned()));
-        assert_eq!(
-            read("held edge/robot-1/18"),
-            Claim::Held("edge/robot-1 with a newer epoch".to_owned())
-        );
-        assert_eq!(read("held nonsense"), Claim::Held("nonsense".to_owned()));
-    }
 }

@@ -163,9 +163,11 @@ impl Batch {
             written_ns: unix_time_ns(),
             head: head.clone(),
             payload: frame.payload().clone(),
+            line: keeper.line,
+            publisher: Arc::downgrade(to),
         };
         let mut mirror = keeper.mirror.lock();
-        if let Some(field) = mirror.keep(&key, newest, kept.depth, keeper.line, Arc::downgrade(to)) {
+        if let Some(field) = mirror.keep(&key, newest, kept.depth) {
             let size = field.size();
             self.add(hset_command(&kept.hash, &frame.writer().to_string(), field, size), size);
         }
@@ -225,6 +227,7 @@ mod tests {
     use super::*;
     use std::time::Duration;
 
+    use super::super::kept::read_field;
     use crate::outbox::{Outbox, OutboxLimits};
     use blaze_domain::{Origin, WriterId};
     use blaze_proto::Header;
@@ -290,6 +293,7 @@ mod tests {
     fn what_is_kept_is_written_before_the_message_and_answers_settle_the_right_ones() {
         let outbox = Outbox::new(LIMITS);
         let (keeping, plain) = (outbox.lane(target(2), None), outbox.lane(target(0), None));
+        let before = unix_time_ns();
         keeping.push(Body::Frame(frame(1)), None);
         plain.push(Body::Bare(Bytes::from_static(b"x")), None);
         let mut taken = Vec::new();
@@ -309,6 +313,12 @@ mod tests {
             .map(|command| arguments(command)[0].clone())
             .collect();
         assert_eq!(names, [b"HSET".to_vec(), b"PUBLISH".to_vec(), b"PUBLISH".to_vec()]);
+        let field = batch.pipeline.cmd_iter().next().map(arguments).unwrap()[3].clone();
+        let (kept, _) = read_field(Bytes::from(field), WriterId([1; 16]));
+        assert!(
+            (before..=unix_time_ns()).contains(&kept[0].0),
+            "late joiners sort by it"
+        );
         let no: redis::Value = redis::parse_redis_value(b"-NOPERM no\r\n").unwrap();
         let refusals = batch.settle(&[redis::Value::Int(1), redis::Value::Int(0), no]);
         assert_eq!(refusals.count, 1);

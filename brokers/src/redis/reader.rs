@@ -91,18 +91,7 @@ fn check(result: RedisResult<()>) -> Result<(), Failure> {
 
 /// What is kept of a channel for late joiners, in the order of publishing as far as the times tell.
 pub(super) async fn read_kept(mut connection: MultiplexedConnection, hash: &str) -> Result<Vec<Received>, BrokerError> {
-    let mut command = redis::cmd("HGETALL");
-    command.arg(hash);
-    let answer = tokio::time::timeout(READ_KEPT, command.query_async(&mut connection)).await;
-    let fields = match answer {
-        Ok(Ok(fields)) => fields,
-        Ok(Err(error)) => return Err(BrokerError::Away(error.to_string())),
-        Err(_) => {
-            return Err(BrokerError::Away(
-                "what is kept for late joiners was not read in time".to_owned(),
-            ));
-        }
-    };
+    let fields = server::fields(&mut connection, hash, READ_KEPT).await?;
     Ok(kept_messages(fields, hash, unix_time_ns(), Instant::now()))
 }
 
@@ -133,12 +122,9 @@ fn kept_messages(fields: Vec<(Vec<u8>, Vec<u8>)>, hash: &str, now_ns: u64, now: 
     });
     found
         .into_iter()
-        .map(|(written_ns, frame)| Received {
-            content: Content::Frame(frame),
-            at: now,
-            broker_age_us: now_ns.saturating_sub(written_ns) / 1_000,
-            kept: true,
-            place: None,
+        .map(|(written_ns, frame)| {
+            let age_us = now_ns.saturating_sub(written_ns) / 1_000;
+            Received::kept(Content::Frame(frame), now, age_us)
         })
         .collect()
 }

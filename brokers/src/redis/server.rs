@@ -1,9 +1,12 @@
 //! What the server says of itself, and how its answers are read.
 
 use std::collections::HashMap;
+use std::time::Duration;
 
 use redis::aio::MultiplexedConnection;
-use redis::{InfoDict, RedisResult};
+use redis::{Cmd, InfoDict, RedisError, RedisResult};
+
+use crate::port::BrokerError;
 
 /// A subscriber is cut off when this many bytes wait for it: room for a few of the largest messages is needed.
 const LEAST_HARD_LIMIT: u64 = 4 * 32 * 1024 * 1024;
@@ -89,8 +92,21 @@ pub(super) async fn buffer_limits(connection: &mut MultiplexedConnection) -> Red
     }
 }
 
+/// All fields of a hash, as far as they can be read within a time.
+pub(super) async fn fields(
+    connection: &mut MultiplexedConnection,
+    hash: &str,
+    longest: Duration,
+) -> Result<Vec<(Vec<u8>, Vec<u8>)>, BrokerError> {
+    let asked = Cmd::hgetall(hash);
+    match tokio::time::timeout(longest, asked.query_async(connection)).await {
+        Ok(fields) => fields.map_err(|error: RedisError| BrokerError::Away(error.to_string())),
+        Err(_) => Err(BrokerError::Away(format!("{hash} was not read in time"))),
+    }
+}
+
 /// Whether the server answered, and said no.
-pub(super) fn is_refusal(error: &redis::RedisError) -> bool {
+pub(super) fn is_refusal(error: &RedisError) -> bool {
     !error.is_io_error() && !error.is_connection_dropped() && !error.is_unrecoverable_error()
 }
 

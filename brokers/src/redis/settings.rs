@@ -154,8 +154,8 @@ impl Names {
     }
 
     /// Hash of the flow's leases.
-    pub(super) fn leases(&self) -> String {
-        format!("{}blaze:flow:leases", self.prefix)
+    pub(super) fn leases(&self) -> Arc<str> {
+        Arc::from(format!("{}blaze:flow:leases", self.prefix))
     }
 
     /// Key that says whose scope this is.
@@ -175,7 +175,7 @@ mod tests {
         let topic: ChannelName = "imu/data".parse().unwrap();
         assert_eq!(&*names.channel(&topic), "site:imu/data");
         assert_eq!(&*names.last(&topic), "site:blaze:last:imu/data");
-        assert_eq!(names.leases(), "site:blaze:flow:leases");
+        assert_eq!(&*names.leases(), "site:blaze:flow:leases");
         assert_eq!(names.owner(), "site:blaze:flow:owner");
     }
 }

@@ -8,13 +8,12 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
 
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
 use super::gate::Gate;
-use crate::port::{BrokerStatus, Health};
+use crate::port::{BrokerStatus, Health, StatusCell};
 
 /// One TCP connection. Large messages have connections of their own, so that small ones never stand behind them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -259,7 +258,7 @@ impl Conditions {
 /// The conditions, and what follows from them.
 pub(super) struct State {
     conditions: Mutex<Conditions>,
-    status: watch::Sender<BrokerStatus>,
+    status: StatusCell,
     /// Counts changes of the conditions.
     version: watch::Sender<u64>,
     gates: [Arc<Gate>; 2],
@@ -272,10 +271,9 @@ impl State {
     pub(super) fn new(scope: Scope, place: String, gates: [Arc<Gate>; 2]) -> Self {
         let conditions = Conditions::new(scope, place);
         let (health, detail) = conditions.health();
-        let since = Instant::now();
         Self {
             conditions: Mutex::new(conditions),
-            status: watch::Sender::new(BrokerStatus { health, detail, since }),
+            status: StatusCell::new(health, detail),
             version: watch::Sender::new(0),
             gates,
             delivers: AtomicBool::new(false),
@@ -330,23 +328,12 @@ impl State {
         if unreachable && !self.told.swap(true, Ordering::AcqRel) {
             tracing::warn!(detail, "redis cannot be reached, trying on");
         }
-        self.status.send_if_modified(|status| {
-            let turned = status.health != health;
-            if !turned && status.detail == detail {
-                return false;
-            }
-            match health {
-                Health::Up if turned => tracing::info!(detail, "redis is up"),
-                Health::Down | Health::InUse if turned => tracing::warn!(detail, "redis cannot be used"),
-                _ => tracing::debug!(?health, detail, "redis"),
-            }
-            status.health = health;
-            status.detail = detail;
-            if turned {
-                status.since = Instant::now();
-            }
-            true
-        });
+        let turned = self.status.set(health, &detail);
+        match health {
+            Health::Up if turned => tracing::info!(detail, "redis is up"),
+            Health::Down | Health::InUse if turned => tracing::warn!(detail, "redis cannot be used"),
+            _ => {}
+        }
     }
 
     /// Looks at the conditions.

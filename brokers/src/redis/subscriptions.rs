@@ -24,7 +24,7 @@ use tokio::sync::{Notify, oneshot};
 use crate::port::{BrokerError, Content, Received, SubscribeOptions, Subscription, SubscriptionSender, subscription};
 
 /// Channels that one broker reads at most, over all its connections.
-pub const MAX_CHANNELS: usize = 10_000;
+const MAX_CHANNELS: usize = 10_000;
 /// Channels of one SUBSCRIBE or UNSUBSCRIBE.
 const PER_COMMAND: usize = 500;
 
@@ -237,15 +237,7 @@ impl Subscriptions {
         if channel.stage == Stage::Asked || channel.readers.is_empty() {
             return;
         }
-        let content = if channel.reserved {
-            Content::Bare {
-                payload,
-                identity: None,
-            }
-        } else {
-            Content::from_bytes(payload)
-        };
-        let message = Received::live(content, at);
+        let message = Received::live(Content::of(channel.reserved, payload), at);
         channel.readers.retain_mut(|reader| reader.offer(message.clone()));
         if channel.readers.is_empty() {
             channels.changed.push(Arc::from(name));

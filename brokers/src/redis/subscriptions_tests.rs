@@ -206,22 +206,6 @@ fn a_late_joiner_gets_what_is_kept_first_and_nothing_twice() {
 }
 
 #[test]
-fn a_late_joiner_gets_all_that_is_kept_though_it_is_more_than_may_wait() {
-    let registry = registry();
-    let options = SubscribeOptions {
-        with_kept: true,
-        max_messages: 2,
-        ..SubscribeOptions::default()
-    };
-    let (mut late, added) = add_with(&registry, "a", options);
-    subscribe_all(&registry);
-    let kept = (1..=5).map(|writer| received(writer, 1)).collect();
-    registry.join(&Arc::from("a"), added.id, kept);
-    assert_eq!(waiting(&mut late), ["1:1", "2:1", "3:1", "4:1", "5:1"]);
-    assert_eq!(late.take_dropped(), 0);
-}
-
-#[test]
 fn what_is_held_for_a_late_joiner_is_bounded() {
     let registry = registry();
     let options = SubscribeOptions {

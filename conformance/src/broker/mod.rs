@@ -1,7 +1,7 @@
 //! What every adapter of the broker port must do, as tests that each adapter runs.
 //!
 //! ```text
-//! Fixture (one per adapter: clients, server away and back) ──► rules ──► Ok, or a Failure that names the rule
+//! Fixture (one per adapter: clients, server away and back) ──► rules ──► Ok, or what is wrong
 //! ```
 //!
 //! An adapter writes a [`Fixture`] and one line, [`broker_conformance_tests!`](crate::broker_conformance_tests), which makes a test of
@@ -14,7 +14,6 @@ mod outage;
 mod subscriptions;
 mod tools;
 
-use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -115,35 +114,15 @@ pub trait Fixture: Send + Sync {
     }
 }
 
-/// An adapter broke a rule.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Failure {
-    /// The rule: the name of its function.
-    pub rule: &'static str,
-    /// What was seen instead.
-    pub detail: String,
-}
-
-impl fmt::Display for Failure {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "rule `{}` is broken: {}", self.rule, self.detail)
-    }
-}
-
-impl std::error::Error for Failure {}
-
-/// One list of rules for [`RULES`], [`run_all`] and the tests of [`broker_conformance_tests!`](crate::broker_conformance_tests).
+/// One list of rules for [`run_all`] and the tests of [`broker_conformance_tests!`](crate::broker_conformance_tests).
 macro_rules! rules {
     ($d:tt $($rule:ident),+ $(,)?) => {
-        /// The names of all rules.
-        pub const RULES: &[&str] = &[$(stringify!($rule)),+];
-
         /// Tries all rules, one after the other, on one fixture. Returns those that are broken.
-        pub async fn run_all(fixture: &dyn Fixture) -> Vec<Failure> {
+        pub async fn run_all(fixture: &dyn Fixture) -> Vec<String> {
             let mut failures = Vec::new();
             $(
                 if let Err(detail) = $rule(fixture).await {
-                    failures.push(Failure { rule: stringify!($rule), detail });
+                    failures.push(format!("rule `{}` is broken: {detail}", stringify!($rule)));
                 }
             )+
             failures
@@ -159,7 +138,7 @@ macro_rules! rules {
                     async fn $rule() {
                         let fixture = $d fixture.await;
                         if let Err(detail) = $d crate::broker::$rule(&fixture).await {
-                            panic!("{}", $d crate::broker::Failure { rule: stringify!($rule), detail });
+                            panic!("rule `{}` is broken: {detail}", stringify!($rule));
                         }
                     }
                 )+

@@ -9,7 +9,7 @@ use super::tools::{
     DEADLINE, Outcome, Reader, channel, connected, describe, eventually_within, frame, numbered, open_publisher,
     publish, tracked, wait_for_health, within, writer,
 };
-use blaze_brokers::port::{Content, Health, PublishOutcome};
+use blaze_brokers::port::{BrokerError, Content, Health, PublishOutcome, SubscribeOptions};
 
 /// The status goes down and up again; what is published meanwhile is dropped or delivered, never reordered nor delivered
 /// twice; afterwards the same subscription and publisher work as before.
@@ -41,6 +41,13 @@ pub async fn server_away_and_back(fixture: &dyn Fixture) -> Outcome {
         for client in &clients {
             wait_for_health(client.as_ref(), Health::Down).await?;
         }
+        let newcomer = fixture.broker().await?;
+        if !capabilities.keeps_while_away {
+            let refused = clients[0].subscribe(&channel, SubscribeOptions::default()).await;
+            if !matches!(refused, Err(BrokerError::Away(_))) {
+                return Err("a reader was let in though the server is away".to_owned());
+            }
+        }
         let dropped_before = publisher.later().dropped();
         for _ in 0..20 {
             sequence += 1;
@@ -49,7 +56,7 @@ pub async fn server_away_and_back(fixture: &dyn Fixture) -> Outcome {
             }
         }
         fixture.start_server().await?;
-        for client in &clients {
+        for client in clients.iter().chain([&newcomer]) {
             wait_for_health(client.as_ref(), Health::Up).await?;
         }
         // The adapter may subscribe again only a moment after it is up: until one arrives, publish on.

@@ -3,10 +3,11 @@
 //! A broker keeps them for those who subscribe to it; a bridge that begins while the topic is being read already gets them
 //! from here, and so does a flow that comes back.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
 use std::time::{Duration, Instant};
 
+use blaze_brokers::retained::{RetainedBounds, RetainedCache};
 use blaze_domain::{Origin, Scope, WriterId};
 use blaze_proto::Frame;
 use lru::LruCache;
@@ -19,6 +20,11 @@ use crate::world::OriginFilter;
 const MAX_WRITERS: usize = 16_384;
 /// Bytes that are kept at most (64 MiB), of all writers; one message always fits.
 const MAX_BYTES: usize = 64 * 1024 * 1024;
+const BOUNDS: RetainedBounds = RetainedBounds {
+    writers: MAX_WRITERS,
+    bytes: MAX_BYTES,
+    bytes_of_writer: MAX_BYTES,
+};
 /// Messages of one writer that are kept at most, whatever depth it names.
 const MAX_DEPTH: usize = 10_000;
 
@@ -30,6 +36,7 @@ const MAX_SUPERSEDED: usize = 16_384;
 /// One message as it came.
 #[derive(Clone)]
 struct Kept {
+    from: Scope,
     frame: Frame,
     hops: u32,
     born_here: bool,
@@ -51,17 +58,9 @@ impl Kept {
     }
 }
 
-struct Writer {
-    from: Scope,
-    messages: VecDeque<Kept>,
-}
-
 /// What is kept, per topic and writer.
 pub(super) struct KeptMessages {
-    writers: LruCache<(TopicId, WriterId), Writer>,
-    bytes: usize,
-    /// Messages that gave way to those of other writers.
-    pub(super) evicted: u64,
+    writers: RetainedCache<(TopicId, WriterId), Kept>,
     /// Writers of earlier lives of their services, which are to be forgotten by the brokers, too.
     pub(super) superseded: Vec<(TopicId, WriterId)>,
     /// Writers that were forgotten because nobody advertised for them, and when.
@@ -71,9 +70,7 @@ pub(super) struct KeptMessages {
 impl Default for KeptMessages {
     fn default() -> Self {
         Self {
-            writers: LruCache::new(NonZeroUsize::new(MAX_WRITERS).unwrap_or(NonZeroUsize::MIN)),
-            bytes: 0,
-            evicted: 0,
+            writers: RetainedCache::new(BOUNDS),
             superseded: Vec::new(),
             forgotten: LruCache::new(NonZeroUsize::new(MAX_WRITERS).unwrap_or(NonZeroUsize::MIN)),
         }
@@ -90,39 +87,18 @@ impl KeptMessages {
             return;
         }
         let key = (topic, message.frame.writer());
-        if !self.writers.contains(&key) {
+        if self.writers.get(&key).is_none() {
             self.supersede(topic, &message.frame);
-            if self.writers.len() == self.writers.cap().get() {
-                self.evict();
-            }
         }
         let kept = Kept {
+            from,
             frame: message.frame.clone(),
             hops: message.hops,
             born_here: message.born_here,
             age_us: message.age_us,
             since: now,
         };
-        self.bytes += kept.frame.wire_len();
-        let writer = self.writers.get_or_insert_mut(key, || Writer {
-            from,
-            messages: VecDeque::new(),
-        });
-        writer.from = from;
-        writer.messages.push_back(kept);
-        while writer.messages.len() > depth {
-            self.bytes -= writer.messages.pop_front().map_or(0, |kept| kept.frame.wire_len());
-        }
-        while self.bytes > MAX_BYTES && self.writers.len() > 1 {
-            self.evict();
-        }
-        // One writer alone: its own oldest give way.
-        if let Some((_, writer)) = self.writers.iter_mut().next() {
-            while self.bytes > MAX_BYTES && writer.messages.len() > 1 {
-                self.bytes -= writer.messages.pop_front().map_or(0, |kept| kept.frame.wire_len());
-                self.evicted += 1;
-            }
-        }
+        self.writers.keep(key, kept, message.frame.wire_len(), depth);
     }
 
     /// A service has begun a new life: the writers of its earlier ones are no more.
@@ -132,28 +108,16 @@ impl KeptMessages {
         if life.service.is_empty() {
             return;
         }
-        let gone = self.remove(|(at, _), writer| {
-            let earlier = |kept: &Kept| {
-                let origin = kept.frame.origin();
-                let same = Origin {
-                    epoch: life.epoch,
-                    ..origin.clone()
-                };
-                origin.epoch < life.epoch && same == life
+        let gone = self.writers.forget_if(|(at, _), newest| {
+            let origin = newest.frame.origin();
+            let same = Origin {
+                epoch: life.epoch,
+                ..origin.clone()
             };
-            *at == topic && writer.messages.back().is_some_and(earlier)
+            *at == topic && origin.epoch < life.epoch && same == life
         });
         let room = MAX_SUPERSEDED.saturating_sub(self.superseded.len());
-        self.superseded
-            .extend(gone.into_iter().take(room).map(|writer| (topic, writer)));
-    }
-
-    /// Forgets the writer that was silent longest.
-    fn evict(&mut self) {
-        if let Some((_, writer)) = self.writers.pop_lru() {
-            self.evicted += writer.messages.len() as u64;
-            self.bytes -= bytes_of(&writer);
-        }
+        self.superseded.extend(gone.into_iter().take(room));
     }
 
     /// What is kept of a topic from one scope, in the order of each writer and otherwise as it came.
@@ -161,8 +125,8 @@ impl KeptMessages {
         let mut found: Vec<&Kept> = self
             .writers
             .iter()
-            .filter(|((of, _), writer)| *of == topic && writer.from == from)
-            .flat_map(|(_, writer)| &writer.messages)
+            .filter(|((of, _), newest, _)| *of == topic && newest.from == from)
+            .flat_map(|(.., of_writer)| of_writer.iter())
             .collect();
         // Stable, and the times of one writer ascend.
         found.sort_by_key(|kept| kept.since);
@@ -184,12 +148,11 @@ impl KeptMessages {
             };
             matches(of) && !but.iter().any(matches)
         };
-        let fits = |writer: &Writer| writer.messages.back().is_some_and(is_of);
-        let gone = self.remove(|(of, _), writer| *of == topic && fits(writer));
-        for writer in &gone {
-            self.forgotten.put((topic, *writer), now);
+        let gone = self.writers.forget_if(|(of, _), newest| *of == topic && is_of(newest));
+        for key in &gone {
+            self.forgotten.put(*key, now);
         }
-        gone
+        gone.into_iter().map(|(_, writer)| writer).collect()
     }
 
     /// Whether a writer was forgotten a while ago; it is asked once, when something of it comes again.
@@ -201,31 +164,12 @@ impl KeptMessages {
 
     /// Forgets topics.
     pub(super) fn forget_topics(&mut self, gone: impl Fn(TopicId) -> bool) {
-        self.remove(|(of, _), _| gone(*of));
+        self.writers.forget_if(|(of, _), _| gone(*of));
         let forgotten: Vec<_> = self.forgotten.iter().map(|(key, _)| *key).collect();
         for key in forgotten.into_iter().filter(|(topic, _)| gone(*topic)) {
             self.forgotten.pop(&key);
         }
     }
-
-    fn remove(&mut self, gone: impl Fn(&(TopicId, WriterId), &Writer) -> bool) -> Vec<WriterId> {
-        let keys: Vec<(TopicId, WriterId)> = self
-            .writers
-            .iter()
-            .filter(|(key, writer)| gone(key, writer))
-            .map(|(key, _)| *key)
-            .collect();
-        for key in &keys {
-            if let Some(writer) = self.writers.pop(key) {
-                self.bytes -= bytes_of(&writer);
-            }
-        }
-        keys.into_iter().map(|(_, writer)| writer).collect()
-    }
-}
-
-fn bytes_of(writer: &Writer) -> usize {
-    writer.messages.iter().map(|kept| kept.frame.wire_len()).sum()
 }
 
 #[cfg(test)]
@@ -299,27 +243,6 @@ mod tests {
         assert!(!kept.takes_again(now + AGAIN, TOPIC, WriterId([2; 16])), "once");
         assert_eq!(sequences(&kept, now), [(3, 1)]);
         kept.forget_topics(|_| true);
-        assert_eq!((kept.bytes, kept.writers.len()), (0, 0));
-    }
-
-    #[test]
-    fn what_is_kept_is_bounded() {
-        let (mut kept, now) = (KeptMessages::default(), Instant::now());
-        for writer in 0..100 {
-            kept.keep(
-                now,
-                TOPIC,
-                Scope::Node,
-                &message(writer, &format!("s{writer}"), 1, 1, 1_000_000),
-            );
-        }
-        assert!(kept.bytes <= MAX_BYTES, "{}", kept.bytes);
-        assert!(kept.evicted >= 33 && kept.writers.len() >= 60);
-        let mut alone = KeptMessages::default();
-        let mut last = message(1, "a", 1, 1, 16_000_000);
-        alone.keep(now, TOPIC, Scope::Node, &last);
-        last = message(1, "a", 1, 2, 16_000_000);
-        alone.keep(now, TOPIC, Scope::Node, &last);
-        assert_eq!(sequences(&alone, now), [(1, 1), (1, 2)]);
+        assert!(kept.writers.iter().next().is_none());
     }
 }

@@ -147,12 +147,7 @@ impl DdsTransport {
     /// # Errors
     /// [`DdsError`] when the configuration can never work, or there is no thread.
     pub fn start(config: DdsConfig) -> Result<Self, DdsError> {
-        let IpAddr::V4(address) = config.listen else {
-            return Err(DdsError::Address(config.listen));
-        };
-        if address.is_unspecified() || address.is_multicast() || address.is_broadcast() {
-            return Err(DdsError::Address(config.listen));
-        }
+        let address = blaze_brokers::dds::check(config.domain, config.listen)?;
         let relay = Relay::start(RelayConfig {
             domain: config.domain,
             address,

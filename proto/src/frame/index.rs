@@ -18,6 +18,7 @@ pub(super) struct Index {
     pub(super) instance: Range<u16>,
     pub(super) encoding: Range<u16>,
     pub(super) type_hash: Range<u16>,
+    pub(super) traceparent: Range<u16>,
     pub(super) origin_epoch: u64,
     pub(super) writer: WriterId,
     pub(super) sequence: u64,
@@ -150,9 +151,7 @@ impl Index {
                     index.encoded_age_us = value;
                     index.age_at = place_of(start, fields.at)?;
                 }
-                (14, Value::Bytes(place)) => {
-                    utf8(header, place, "traceparent")?;
-                }
+                (14, Value::Bytes(place)) => index.traceparent = utf8(header, place, "traceparent")?,
                 (15, Value::Varint(value)) => index.reliable = value != 0,
                 (16, Value::Varint(value)) => index.depth = u32::try_from(value).unwrap_or(u32::MAX),
                 (1..=16, _) => {

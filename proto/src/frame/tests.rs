@@ -44,6 +44,7 @@ fn every_field_survives() {
         (42, 1_700_000_000_000_000_000)
     );
     assert_eq!((frame.encoding(), frame.type_hash()), ("application/json", "RIHS01_00"));
+    assert_eq!(frame.traceparent(), "00-1-2-03");
     assert_eq!((frame.lifespan_ms(), frame.priority()), (500, Some(Priority::State)));
     assert_eq!((frame.reliable(), frame.depth()), (true, 3));
     assert_eq!((frame.hops(), frame.age_us()), (1, 77));

@@ -24,7 +24,7 @@ use crate::dds::{DdsError, EndpointId, Profile};
 use crate::port::{BrokerError, Content, Received, SubscribeOptions, SubscriptionSender};
 
 /// Channels that one broker reads at most.
-pub const MAX_CHANNELS: usize = 4096;
+pub(super) const MAX_CHANNELS: usize = 4096;
 /// Samples that one channel gives before the next has its turn.
 const TURN: usize = 256;
 /// A safety net only: RustDDS wakes the thread.
@@ -188,9 +188,7 @@ impl Channel {
             match reader.try_take_one() {
                 Ok(Some(sample)) => deliver(shared, self, kind, progress, sample),
                 Ok(None) => return false,
-                Err(_) => {
-                    shared.counters.malformed.fetch_add(1, Ordering::Relaxed);
-                }
+                Err(error) => tracing::debug!(topic = &*self.topic, %error, "a sample is no sequence of octets"),
             }
         }
         true
@@ -202,10 +200,6 @@ struct Bell(Weak<Channel>);
 
 impl Wake for Bell {
     fn wake(self: Arc<Self>) {
-        self.wake_by_ref();
-    }
-
-    fn wake_by_ref(self: &Arc<Self>) {
         if let Some(channel) = self.0.upgrade() {
             channel.note_samples();
         }

@@ -1,7 +1,6 @@
 //! From a DDS sample to the subscriptions of its channel.
 
 use std::collections::HashMap;
-use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use rustdds::Timestamp;
@@ -73,7 +72,6 @@ pub(super) fn deliver(
     let is_old = moment.is_some_and(|moment| moment.is_old(nanos(opened), own, seen));
     if missing > 0 && !own && !is_old && facts.is_some_and(|facts| facts.reliable) {
         // RustDDS acknowledges what it takes in, and drops the oldest that were not read in time.
-        shared.counters.overrun.fetch_add(missing, Ordering::Relaxed);
         channel.note_lost(missing);
     }
     if channel.with_kept {
@@ -83,15 +81,7 @@ pub(super) fn deliver(
     } else if own || is_old || !since_opened {
         return;
     }
-    let bytes = sample.into_value().0;
-    let content = if channel.is_reserved {
-        Content::Bare {
-            payload: bytes,
-            identity: None,
-        }
-    } else {
-        Content::from_bytes(bytes)
-    };
+    let content = Content::of(channel.is_reserved, sample.into_value().0);
     let at = Instant::now();
     let mut received = Received::live(content, at);
     match moment {

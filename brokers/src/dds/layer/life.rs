@@ -189,7 +189,7 @@ impl Lifecycle {
                 self.generation = Some(generation);
                 self.built = now;
                 if std::mem::replace(&mut self.had_life, true) {
-                    self.shared.counters.rebuilds.fetch_add(1, Ordering::Relaxed);
+                    self.shared.counts.lock().rebuilds += 1;
                 }
             }
             Err(error) => {

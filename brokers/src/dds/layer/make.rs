@@ -1,10 +1,8 @@
 //! One life of the participant, and the writers and readers that are made on it.
 
 use std::collections::{HashMap, HashSet};
-use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use blaze_domain::MAX_PAYLOAD_BYTES;
@@ -25,7 +23,7 @@ use crate::dds::participant::prefix_of;
 use crate::dds::writer::participant_of;
 use crate::dds::{
     DdsError, EndpointWatch, Endpoints, FoundWriter, GuidPrefix, Illness, Participant, ParticipantConfig, Profile,
-    Pulse, Writer,
+    Pulse, Writer, create_error,
 };
 
 /// Between two signs of life.
@@ -63,11 +61,7 @@ impl Generation {
         })?;
         let pulse = Pulse::start(&participant)?;
         let profile = Profile::best_effort(SIGNS);
-        let farewell =
-            Farewell::new(shared.address, participant.port()).map_err(|error: io::Error| DdsError::Create {
-                what: "socket",
-                error: error.to_string(),
-            })?;
+        let farewell = Farewell::new(shared.address, participant.port()).map_err(create_error("socket"))?;
         let near = Near::of_interface(shared.address);
         let presence = Arc::new(parking_lot::Mutex::new(Presence::new(near)));
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
@@ -185,7 +179,7 @@ impl Generation {
         dead.extend(given_up);
         for prefix in dead {
             tracing::warn!(participant = %prefix, domain = shared.domain, "a DDS participant is gone without a good-bye");
-            shared.counters.expelled.fetch_add(1, Ordering::Relaxed);
+            shared.counts.lock().expelled += 1;
             if let Err(error) = self.farewell.say(prefix) {
                 tracing::warn!(%error, "RustDDS cannot be told");
             }

@@ -26,7 +26,7 @@ mod shared;
 mod slot;
 mod worker_side;
 
-use std::net::{IpAddr, Ipv4Addr};
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -34,7 +34,7 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use blaze_domain::MAX_PAYLOAD_BYTES;
 use blaze_domain::names::ChannelName;
-use blaze_domain::node_file::{DdsLayerBroker as Section, MAX_DDS_DOMAIN};
+use blaze_domain::node_file::DdsLayerBroker as Section;
 use blaze_proto::Frame;
 use bytes::Bytes;
 use parking_lot::Mutex;
@@ -52,7 +52,6 @@ use send::Target;
 use shared::Shared;
 use worker_side::DdsWorkerSide;
 
-pub use channel::MAX_CHANNELS;
 pub use shared::MAX_QUEUE_BYTES;
 
 /// How long closing delivers what was taken.
@@ -71,17 +70,10 @@ const LOOK: Duration = Duration::from_millis(5);
 /// What a broker has counted since it was opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct DdsCounts {
-    /// Samples that were not a sequence of octets.
-    pub malformed: u64,
     /// How often RustDDS died and was built anew.
     pub rebuilds: u64,
     /// Participants to whom good-bye was said in their absence.
     pub expelled: u64,
-    /// Writers of transient_local origins that gave way to others.
-    pub writers_forgotten: u64,
-    /// Samples of reliable writers that were acknowledged and gave way before this process read them; each subscription counts
-    /// its own among those that it dropped.
-    pub overrun: u64,
 }
 
 /// A participant of the layer's DDS domain.
@@ -97,14 +89,7 @@ impl DdsBroker {
     /// # Errors
     /// [`DdsError`] where it can never work.
     pub fn check(section: &Section) -> Result<(), DdsError> {
-        let address: Ipv4Addr = section.interface;
-        if section.domain > MAX_DDS_DOMAIN {
-            return Err(DdsError::Domain(section.domain));
-        }
-        if address.is_unspecified() || address.is_multicast() || address.is_broadcast() {
-            return Err(DdsError::Address(IpAddr::V4(address)));
-        }
-        Ok(())
+        super::check(section.domain, IpAddr::V4(section.interface)).map(|_| ())
     }
 
     /// Starts in the background: the status tells how far it is. An interface that is missing is no error: it is looked
@@ -131,7 +116,7 @@ impl DdsBroker {
     /// What it has counted.
     #[must_use]
     pub fn counts(&self) -> DdsCounts {
-        self.shared.counters.read()
+        *self.shared.counts.lock()
     }
 
     /// Ends or blocks the event loop of RustDDS, for tests of what follows.

@@ -115,7 +115,6 @@ impl Target {
         }
         if origins.len() >= MAX_ORIGINS {
             origins.pop_lru();
-            shared.counters.writers_forgotten.fetch_add(1, Ordering::Relaxed);
         }
         let slot = shared.slots.get(SlotKey {
             origin: Some(origin),
@@ -268,11 +267,7 @@ fn attempt(shared: &Shared, waiting: &Waiting<Target>, now: Instant) -> Option<F
 fn content(waiting: &Waiting<Target>, now: Instant, is_reserved: bool) -> Content {
     match &waiting.body {
         Body::Frame(frame) => Content::Frame(Waiting::<Target>::aged(frame, waiting.since, now)),
-        Body::Bare(payload) if is_reserved => Content::Bare {
-            payload: payload.clone(),
-            identity: None,
-        },
-        Body::Bare(payload) => Content::from_bytes(payload.clone()),
+        Body::Bare(payload) => Content::of(is_reserved, payload.clone()),
     }
 }
 

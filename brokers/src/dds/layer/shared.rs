@@ -4,12 +4,11 @@ use std::collections::{HashMap, HashSet};
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::sync::OnceLock;
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::thread::Thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use parking_lot::{Mutex, RwLock};
-use tokio::sync::watch;
 
 use super::DdsCounts;
 use super::channel::Channels;
@@ -19,7 +18,7 @@ use super::slot::Slots;
 use crate::dds::EndpointId;
 use crate::dds::writer::participant_of;
 use crate::outbox::{Outbox, OutboxLimits};
-use crate::port::{BrokerError, BrokerStatus, Health};
+use crate::port::{BrokerError, Health, StatusCell};
 
 /// Most bytes that wait for the network, of one publisher and of all together.
 pub const MAX_QUEUE_BYTES: usize = 64 * 1024 * 1024;
@@ -44,33 +43,10 @@ pub(super) struct WriterFacts {
     pub(super) signs: bool,
 }
 
-/// Counters of [`DdsCounts`].
-#[derive(Debug, Default)]
-pub(super) struct Counters {
-    pub(super) malformed: AtomicU64,
-    pub(super) rebuilds: AtomicU64,
-    pub(super) expelled: AtomicU64,
-    pub(super) writers_forgotten: AtomicU64,
-    pub(super) overrun: AtomicU64,
-}
-
-impl Counters {
-    pub(super) fn read(&self) -> DdsCounts {
-        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        DdsCounts {
-            malformed: get(&self.malformed),
-            rebuilds: get(&self.rebuilds),
-            expelled: get(&self.expelled),
-            writers_forgotten: get(&self.writers_forgotten),
-            overrun: get(&self.overrun),
-        }
-    }
-}
-
 pub(super) struct Shared {
     pub(super) domain: u16,
     pub(super) address: Ipv4Addr,
-    pub(super) status: watch::Sender<BrokerStatus>,
+    pub(super) status: StatusCell,
     was_up: AtomicBool,
     pub(super) outbox: Arc<Outbox<Target>>,
     /// Messages that the sender holds, because their writer cannot take them now.
@@ -82,27 +58,20 @@ pub(super) struct Shared {
     /// Topics with a best-effort writer of another participant.
     pub(super) best_effort: RwLock<HashSet<String>>,
     pub(super) clocks: RwLock<Clocks>,
-    pub(super) counters: Counters,
+    pub(super) counts: Mutex<DdsCounts>,
     pub(super) closing: AtomicBool,
     pub(super) stop: AtomicBool,
     pub(super) lifecycle: OnceLock<Thread>,
     #[cfg(feature = "fault-injection")]
     pub(super) fault: Mutex<Option<crate::dds::Fault>>,
-    /// Guards changes of the status: once closed, it stays so.
-    changing: Mutex<()>,
 }
 
 impl Shared {
     pub(super) fn new(domain: u16, address: Ipv4Addr) -> Arc<Self> {
-        let status = BrokerStatus {
-            health: Health::Connecting,
-            detail: String::new(),
-            since: Instant::now(),
-        };
         Arc::new(Self {
             domain,
             address,
-            status: watch::Sender::new(status),
+            status: StatusCell::new(Health::Connecting, String::new()),
             was_up: AtomicBool::new(false),
             outbox: Outbox::new(LIMITS),
             held: AtomicUsize::new(0),
@@ -111,13 +80,12 @@ impl Shared {
             writers: RwLock::default(),
             best_effort: RwLock::default(),
             clocks: RwLock::default(),
-            counters: Counters::default(),
+            counts: Mutex::default(),
             closing: AtomicBool::new(false),
             stop: AtomicBool::new(false),
             lifecycle: OnceLock::new(),
             #[cfg(feature = "fault-injection")]
             fault: Mutex::default(),
-            changing: Mutex::default(),
         })
     }
 
@@ -140,21 +108,9 @@ impl Shared {
     }
 
     pub(super) fn set_status(&self, health: Health, detail: &str) {
-        let _changing = self.changing.lock();
-        self.status.send_if_modified(|status| {
-            let changes = status.health != Health::Closed && (status.health != health || status.detail != detail);
-            if changes {
-                if status.health != health {
-                    status.since = Instant::now();
-                }
-                if health == Health::Up {
-                    self.was_up.store(true, Ordering::Relaxed);
-                }
-                status.health = health;
-                detail.clone_into(&mut status.detail);
-            }
-            changes
-        });
+        if self.status.set(health, detail) && health == Health::Up {
+            self.was_up.store(true, Ordering::Relaxed);
+        }
     }
 
     pub(super) fn is_up(&self) -> bool {

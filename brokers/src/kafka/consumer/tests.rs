@@ -6,7 +6,6 @@ use std::task::{Context, Waker};
 use std::time::Instant;
 
 use blaze_domain::TopicName;
-use bytes::Bytes;
 use rdkafka::ClientConfig;
 use rdkafka::mocking::MockCluster;
 use rdkafka::producer::{BaseProducer, BaseRecord, DefaultProducerContext, Producer as _};
@@ -14,7 +13,7 @@ use rdkafka::producer::{BaseProducer, BaseRecord, DefaultProducerContext, Produc
 use super::*;
 use crate::kafka::directory::Marks;
 use crate::kafka::settings::tests::shared_at;
-use crate::port::{Content, Place, SubscribeOptions, Subscription, subscription};
+use crate::port::{SubscribeOptions, Subscription, subscription};
 
 const TOPIC: &str = "fog.imu.data";
 const INFO: TopicInfo = TopicInfo {
@@ -109,26 +108,6 @@ impl Bench {
         };
         self.consumer.follow(now, TOPIC, (&info, &[marks]), lost_position);
     }
-}
-
-#[test]
-fn a_reader_gets_all_that_is_kept_though_it_is_more_than_may_wait() {
-    let bench = Bench::new(1);
-    let kept_records = i64::try_from(SubscribeOptions::default().max_messages).unwrap() + 100;
-    let received = |offset: i64| Received {
-        place: Some(Place {
-            partition: 0,
-            offset,
-            appended_ms: None,
-        }),
-        kept: true,
-        ..Received::live(Content::from_bytes(Bytes::from_static(b"kept")), Instant::now())
-    };
-    let mut kept = || -> Vec<Received> { (0..kept_records).map(received).collect() };
-    let mut reader = bench.add(1, Join::AfterKept(&mut kept));
-    while reader.take().last() != Some(&(kept_records - 1)) {}
-    assert_eq!(reader.take(), (0..kept_records).collect::<Vec<i64>>());
-    assert_eq!(reader.subscription.take_dropped(), 0);
 }
 
 #[test]

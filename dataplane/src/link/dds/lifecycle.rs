@@ -10,11 +10,11 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
-    DdsError, GuidPrefix, Illness, Participant, ParticipantConfig, Pulse, Reader, ReaderWatch, RemoteReader,
+    DdsError, EndpointWatch, FoundReader, GuidPrefix, Illness, Participant, ParticipantConfig, Pulse, Reader,
 };
 use blaze_domain::Priority;
 
-use super::{CLASSES, MAX_HEARD, Shared, TOPIC_PREFIX, index, parse_topic, profile, topic};
+use super::{CLASSES, MAX_HEARD, Shared, index, parse_topic, profile, topic};
 use crate::link::transport::{Endpoint, TransportEvent};
 
 const TICK: Duration = Duration::from_millis(200);
@@ -36,7 +36,7 @@ pub(super) fn start(shared: Arc<Shared>) -> Result<JoinHandle<()>, DdsError> {
 
 /// One life of the participant. Fields drop in this order: users first, the participant last.
 struct Generation {
-    _watch: ReaderWatch,
+    _watch: EndpointWatch,
     readers: Vec<Reader>,
     pulse: Pulse,
     participant: Participant,
@@ -261,10 +261,9 @@ impl Generation {
             .collect::<Result<_, _>>()?;
         let (watcher, own) = (Arc::clone(shared), local.clone());
         let known = parking_lot::Mutex::new(BTreeMap::new());
-        let watch = participant.watch_readers(
-            TOPIC_PREFIX,
-            Box::new(move |readers| note_readers(&watcher, &own, &mut known.lock(), &readers)),
-        )?;
+        let watch = participant.watch_endpoints(Box::new(move |endpoints| {
+            note_readers(&watcher, &own, &mut known.lock(), &endpoints.readers);
+        }))?;
         Ok(Self {
             _watch: watch,
             readers,
@@ -316,7 +315,7 @@ fn note_heard(shared: &Shared, writer: GuidPrefix) {
 type Known = BTreeMap<Endpoint, (GuidPrefix, [bool; CLASSES])>;
 
 /// Compares all remote readers with those known before and tells the differences.
-fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[RemoteReader]) {
+fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[FoundReader]) {
     let mut homes: HashMap<GuidPrefix, Vec<Ipv4Addr>> = HashMap::new();
     let mut found = Known::new();
     for reader in readers {
@@ -324,11 +323,11 @@ fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[R
             continue;
         };
         let addresses = homes.entry(reader.participant).or_default();
-        for address in &reader.addresses {
-            if let IpAddr::V4(address) = address
-                && !addresses.contains(address)
+        for socket in &reader.sockets {
+            if let IpAddr::V4(address) = socket.ip()
+                && !addresses.contains(&address)
             {
-                addresses.push(*address);
+                addresses.push(address);
             }
         }
         // Another participant with this flow's name is a mistake of the operator; the engine tells it from Hello.

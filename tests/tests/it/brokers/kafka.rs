@@ -26,8 +26,9 @@ use blaze_tests::servers::{KafkaOptions, KafkaServer, unique_name};
 use bytes::Bytes;
 use tokio::sync::watch;
 
-/// Long, because it is only spent where something is broken.
-pub(crate) const DEADLINE: Duration = Duration::from_secs(40);
+use super::support::wait_for;
+pub(super) use super::support::{DEADLINE, WITH_KEPT};
+
 /// How long silence must last to count as silence.
 pub(crate) const SILENCE: Duration = Duration::from_millis(500);
 
@@ -58,12 +59,7 @@ pub(crate) fn open(server: &KafkaServer, role: &Role) -> KafkaBroker {
 /// Waits until a client says so; returns how long it took.
 pub(crate) async fn health(broker: &dyn Broker, health: Health) -> Duration {
     let start = Instant::now();
-    let mut status = broker.status();
-    let wait = status.wait_for(|status| status.health == health);
-    match tokio::time::timeout(DEADLINE, wait).await {
-        Ok(seen) => drop(seen.unwrap()),
-        Err(_) => panic!("not {health:?}: {:?}", broker.status().borrow().clone()),
-    }
+    wait_for(broker, health).await;
     start.elapsed()
 }
 

@@ -4,12 +4,14 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use blaze_brokers::memory::MemoryHub;
-use blaze_brokers::{Broker, BrokerError, Content, Health, PublishOutcome, PublisherOptions, SubscribeOptions};
+use blaze_brokers::{Broker, Content, PublishOutcome, PublisherOptions, SubscribeOptions};
 use blaze_conformance::broker::{Capabilities, Fixture};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Origin, WriterId};
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
+
+use super::support::WITH_KEPT;
 
 struct Memory {
     hub: MemoryHub,
@@ -94,28 +96,6 @@ async fn payloads_are_shared_not_copied() {
 }
 
 #[tokio::test]
-async fn an_outage_is_seen_by_every_client_and_refuses_new_readers() {
-    let hub = MemoryHub::new("outage");
-    let early = hub.broker();
-    hub.cut();
-    let late = hub.broker();
-    for broker in [&early, &late] {
-        assert_eq!(broker.status().borrow().health, Health::Down);
-        let refused = broker.subscribe(&channel("t"), SubscribeOptions::default()).await;
-        assert!(matches!(refused, Err(BrokerError::Away(_))));
-        let publisher = broker.publisher(&channel("t"), PublisherOptions::default()).unwrap();
-        assert_eq!(
-            publisher.publish_bare(&Bytes::from_static(b"x"), None),
-            PublishOutcome::Dropped
-        );
-    }
-    early.close().await;
-    hub.restore();
-    assert_eq!(early.status().borrow().health, Health::Closed);
-    assert_eq!(late.status().borrow().health, Health::Up);
-}
-
-#[tokio::test]
 async fn channels_that_nobody_uses_are_forgotten() {
     let hub = MemoryHub::new("churn");
     let broker = hub.broker();
@@ -144,41 +124,9 @@ async fn kept_messages_tell_how_long_they_lay_there() {
     while published.elapsed() < std::time::Duration::from_millis(5) {
         tokio::task::yield_now().await;
     }
-    let options = SubscribeOptions {
-        with_kept: true,
-        ..SubscribeOptions::default()
-    };
-    let mut subscription = broker.subscribe(&channel("t"), options).await.unwrap();
+    let mut subscription = broker.subscribe(&channel("t"), WITH_KEPT).await.unwrap();
     let mut batch = Vec::new();
     subscription.receive(&mut batch, 1).await;
     let age = u128::from(batch[0].broker_age_us);
     assert!((5_000..=before.elapsed().as_micros()).contains(&age), "{age}");
-    hub.forget_writer(&channel("t"), WriterId([1; 16]));
-    assert_eq!(hub.stats().kept_messages, 0);
-}
-
-#[tokio::test]
-async fn a_late_joiner_gets_all_that_is_kept_though_it_is_more_than_may_wait() {
-    const WRITERS: u64 = 50;
-    let hub = MemoryHub::new("crowd");
-    let broker = hub.broker();
-    let options = PublisherOptions {
-        depth: 1,
-        ..PublisherOptions::default()
-    };
-    let publisher = broker.publisher(&channel("t"), options).unwrap();
-    for sequence in 1..=WRITERS {
-        let writer = WriterId([u8::try_from(sequence).unwrap(); 16]);
-        let header = Header::new("t", Origin::default(), writer, sequence, 0);
-        publisher.publish(&Frame::new(&header, Bytes::new()).unwrap(), None);
-    }
-    let options = SubscribeOptions {
-        with_kept: true,
-        max_messages: 10,
-        ..SubscribeOptions::default()
-    };
-    let mut subscription = broker.subscribe(&channel("t"), options).await.unwrap();
-    let mut batch = Vec::new();
-    subscription.receive(&mut batch, 100).await;
-    assert_eq!((batch.len() as u64, subscription.take_dropped()), (WRITERS, 0));
 }

@@ -105,33 +105,6 @@ async fn a_participant_that_dies_is_built_anew_and_goes_on() {
     assert_eq!(other.counts().rebuilds, 0);
 }
 
-/// A best-effort writer is met by a reader that is made when it is found, since a reliable one does not match it.
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_best_effort_writer_that_starts_later_is_heard() {
-    let domain = Domain::start();
-    let listener = domain.open().await;
-    for round in 1..=6_u8 {
-        let topic = format!("late/t{round}").parse().unwrap();
-        let mut subscription = listener.subscribe(&topic, SubscribeOptions::default()).await.unwrap();
-        // Its writers are found while RustDDS is busy with a new participant.
-        let speaker = domain.open().await;
-        let publisher = speaker.publisher(&topic, PublisherOptions::default()).unwrap();
-        let mut sequence = 0;
-        let hears = async {
-            let mut batch = Vec::new();
-            while batch.is_empty() {
-                sequence += 1;
-                publisher.publish(&frame(&topic, round, sequence, 10), None);
-                let wait = subscription.receive(&mut batch, 64);
-                let _ = tokio::time::timeout(Duration::from_millis(20), wait).await;
-            }
-        };
-        let heard = tokio::time::timeout(DEADLINE, hears).await;
-        assert!(heard.is_ok(), "round {round}: nothing of {sequence} came");
-        speaker.close().await;
-    }
-}
-
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_is_published_while_it_is_built_anew_arrives() {
     const MESSAGES: u64 = 200;

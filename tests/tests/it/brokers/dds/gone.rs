@@ -65,7 +65,16 @@ impl Peer {
 
     /// Everything arrived, in order, once, and without a long gap.
     async fn has_all(&self, source: &Source) {
-        let report = self.has_all_sooner_or_later(source.sequence).await;
+        let last = source.sequence;
+        eventually(&format!("{} has message {last}: {}", self.name, self.report()), || {
+            (self.number("last") == last).then_some(())
+        })
+        .await;
+        let report = self.report();
+        let count = |field: &str| report[field].as_u64().unwrap();
+        let faults = (count("lost"), count("reordered"), count("malformed"));
+        assert_eq!(faults, (0, 0, 0), "{report}");
+        assert_eq!(count("received"), last + 1 - count("first"), "{report}");
         let gap = Duration::from_secs_f64(report["gap_ms"].as_f64().unwrap() / 1e3);
         let (pause, late) = (source.longest_pause, source.idler.latest());
         assert!(
@@ -73,24 +82,6 @@ impl Peer {
             "{}: {report}; the source paused for {pause:?}, the machine was late by {late:?}",
             self.name
         );
-    }
-
-    /// Everything arrived, in order, once.
-    async fn has_all_sooner_or_later(&self, last: u64) -> Value {
-        eventually(&format!("{} has message {last}: {}", self.name, self.report()), || {
-            (self.number("last") == last).then_some(())
-        })
-        .await;
-        let report = self.report();
-        println!("{}: {report}", self.name);
-        let count = |field: &str| report[field].as_u64().unwrap();
-        assert_eq!(
-            (count("lost"), count("reordered"), count("malformed")),
-            (0, 0, 0),
-            "{report}"
-        );
-        assert_eq!(count("received"), last + 1 - count("first"), "{report}");
-        report
     }
 }
 
@@ -236,29 +227,6 @@ async fn a_reader_that_starts_anew_receives_at_once() {
         println!("received after {:?}", start.elapsed());
         assert!(start.elapsed() < Duration::from_secs(5), "{:?}", start.elapsed());
         peer.signal(Signal::KILL);
-    }
-    assert_eq!(source.publisher.later().dropped(), 0);
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn large_messages_reach_other_processes() {
-    let domain = Domain::start();
-    let broker = domain.open().await;
-    let topic = topic("large");
-    let readers =
-        ["adapter reader", "plain reader"].map(|name| Peer::start(&domain, name, &topic, &["--reliable", "--large"]));
-    let options = PublisherOptions {
-        large: true,
-        ..RELIABLE
-    };
-    let mut source = Source::new(&broker, &topic, 5.0, 1_000, options);
-    source.meet(&[&readers[0], &readers[1]]).await;
-    for (bytes, time) in [(1_000_000, Duration::from_secs(4)), (8_000_000, Duration::from_secs(1))] {
-        source.bytes = bytes;
-        source.run(time).await;
-    }
-    for reader in &readers {
-        reader.has_all_sooner_or_later(source.sequence).await;
     }
     assert_eq!(source.publisher.later().dropped(), 0);
 }

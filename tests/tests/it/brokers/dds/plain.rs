@@ -8,14 +8,7 @@ use blaze_brokers::{Broker, Content, PublisherOptions, Received, SubscribeOption
 use bytes::Bytes;
 use rustdds::Timestamp;
 
-use super::support::{DEADLINE, Domain, eventually, frame};
-
-const WITH_KEPT: SubscribeOptions = SubscribeOptions {
-    max_messages: 4096,
-    max_bytes: 64 * 1024 * 1024,
-    large: false,
-    with_kept: true,
-};
+use super::support::{DEADLINE, Domain, WITH_KEPT, eventually, frame};
 
 /// Takes what has come.
 async fn drain(subscription: &mut Subscription, found: &mut Vec<Received>) {

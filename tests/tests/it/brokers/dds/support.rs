@@ -10,13 +10,10 @@ use blaze_brokers::{Broker, Health};
 use blaze_conformance::broker::{Capabilities, Fixture};
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::DdsLayerBroker as Section;
-use blaze_domain::{Origin, WriterId};
-use blaze_proto::{Frame, Header};
+use blaze_proto::Frame;
 use blaze_tests::flow::free_domain;
-use bytes::Bytes;
 
-/// How long a condition may take; spent only where a test fails.
-pub(super) const DEADLINE: Duration = Duration::from_secs(20);
+pub(super) use super::super::support::{DEADLINE, WITH_KEPT, eventually, wait_for};
 
 /// A DDS domain on loopback that no other test uses now.
 pub(super) struct Domain {
@@ -102,29 +99,6 @@ fn own_threads() -> Vec<String> {
         .collect()
 }
 
-/// Waits until a participant's health is as given, and gives its detail.
-pub(super) async fn wait_for(broker: &dyn Broker, health: Health) -> String {
-    let mut status = broker.status();
-    let waited = tokio::time::timeout(DEADLINE, status.wait_for(|status| status.health == health)).await;
-    match waited {
-        Ok(status) => status.unwrap().detail.clone(),
-        Err(_) => panic!("not {health:?} within {DEADLINE:?}: {:?}", broker.status().borrow()),
-    }
-}
-
-/// Waits until something holds.
-pub(super) async fn eventually<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
-    let until = Instant::now() + DEADLINE;
-    loop {
-        if let Some(found) = look() {
-            return found;
-        }
-        assert!(Instant::now() < until, "{what}: not within {DEADLINE:?}");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
-}
-
 pub(super) fn frame(channel: &ChannelName, writer: u8, sequence: u64, bytes: usize) -> Frame {
-    let header = Header::new(channel.as_str(), Origin::default(), WriterId([writer; 16]), sequence, 0);
-    Frame::new(&header, Bytes::from(vec![b'x'; bytes])).unwrap()
+    super::super::support::frame(channel.as_str(), writer, sequence, bytes)
 }

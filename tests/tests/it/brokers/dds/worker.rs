@@ -10,14 +10,7 @@ use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 use parking_lot::Mutex;
 
-use super::support::{DEADLINE, Domain, eventually};
-
-const WITH_KEPT: SubscribeOptions = SubscribeOptions {
-    max_messages: 4096,
-    max_bytes: 64 * 1024 * 1024,
-    large: false,
-    with_kept: true,
-};
+use super::support::{DEADLINE, Domain, WITH_KEPT, eventually};
 
 fn said(channel: &ChannelName, text: &str) -> KeyedMessage {
     KeyedMessage {

@@ -3,14 +3,14 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use blaze_brokers::{Content, PublishOutcome, Role, SubscribeOptions};
+use blaze_brokers::{Content, PublishOutcome, Role};
 use blaze_domain::WriterId;
 use blaze_domain::names::ChannelName;
 use blaze_tests::servers::unique_name;
 use sha2::{Digest as _, Sha256};
 
 use super::plain::{PlainProducer, delete_topic, make_topic, topic_uuid};
-use super::{Flow, eventually, frame, health, open, publish, publisher, reader, start_server, subscribe};
+use super::{Flow, WITH_KEPT, eventually, frame, health, open, publish, publisher, reader, start_server, subscribe};
 
 fn bare_writer(layer: &str, uuid: &str, partition: i32) -> WriterId {
     let hash = Sha256::digest(format!("kafka|{layer}|{uuid}|{partition}"));
@@ -88,43 +88,6 @@ async fn a_topic_made_anew_is_read_from_its_beginning() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn broken_headers_are_reported_and_what_follows_arrives() {
-    let server = start_server();
-    let flow = Flow::open(&server).await;
-    let channel = flow.channel("hostile", 0).await;
-    let mut reader = reader(&flow.broker, &channel).await;
-    let plain = PlainProducer::new(&server);
-    let writer: &[u8] = b"abababababababababababababababab";
-    for headers in [
-        &[("blaze-writer", &b"\xff\xfe"[..]), ("blaze-sequence", b"1")][..],
-        &[("blaze-writer", writer), ("blaze-sequence", b"0")],
-        &[("blaze-writer", writer)],
-        &[
-            ("blaze-writer", writer),
-            ("blaze-sequence", b"1"),
-            ("blaze-encoding", &[b'x'; 70_000]),
-        ],
-    ] {
-        plain.write_with_headers(channel.as_str(), headers, "12345");
-        let content = reader.next().await.content;
-        assert!(
-            matches!(content, Content::Malformed { bytes: 5, .. }),
-            "{headers:?}: {content:?}"
-        );
-    }
-    plain.write_with_headers(channel.as_str(), &[("anything", b"\xff")], "bare");
-    assert_eq!(&reader.next_bare().await.0[..], b"bare");
-    plain.write_with_headers(
-        channel.as_str(),
-        &[("blaze-writer", writer), ("blaze-sequence", b"7"), ("blaze-hops", b"2")],
-        "",
-    );
-    let frame = reader.next_frame().await;
-    assert_eq!((frame.sequence(), frame.hops(), frame.payload().len()), (7, 2, 0));
-    assert_eq!(frame.topic(), channel.as_str());
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_writer_stays_in_order_on_several_partitions() {
     let server = start_server();
     let flow = Flow::open(&server).await;
@@ -177,11 +140,7 @@ async fn ages_count_what_a_message_lay_on_the_server() {
     while written.elapsed() < Duration::from_millis(700) {
         tokio::task::yield_now().await;
     }
-    let kept = SubscribeOptions {
-        with_kept: true,
-        ..SubscribeOptions::default()
-    };
-    let mut late = subscribe(&flow.broker, &channel, kept).await;
+    let mut late = subscribe(&flow.broker, &channel, WITH_KEPT).await;
     let received = late.next().await;
     let longest = u64::try_from(before.elapsed().as_micros()).unwrap();
     let age = received.broker_age_us;

@@ -5,7 +5,7 @@ use blaze_domain::names::ChannelName;
 use blaze_tests::servers::unique_name;
 
 use super::plain::{PlainProducer, make_topic};
-use super::{Flow, Reader, frame, publish, publisher, reader, start_server, subscribe};
+use super::{Flow, Reader, WITH_KEPT, frame, publish, publisher, reader, start_server, subscribe};
 
 async fn from(broker: &dyn Broker, channel: &ChannelName, begin: Begin) -> (Reader, Vec<i64>) {
     let subscription = broker.subscribe_from(channel, SubscribeOptions::default(), begin).await;
@@ -71,6 +71,13 @@ async fn a_reader_begins_where_it_is_told_and_the_others_get_nothing_twice() {
     let (mut bound, starts) = from(&flow.broker, &channel, since(&[2])).await;
     assert_eq!(starts, [start.min(2) as i64]);
     expect(&mut bound, start.min(2) as u64 + 1..=10).await;
+    // After the last record a time is the end.
+    let later = Begin::Since {
+        appended_ms: places[9].appended_ms.unwrap() + 60_000,
+        latest: [].into(),
+    };
+    let (mut later, starts) = from(&flow.broker, &channel, later).await;
+    assert_eq!(starts, [10]);
     // What the server does not have is moved to the nearest.
     let (mut beyond, starts) = from(&flow.broker, &channel, Begin::At([1000].into())).await;
     assert_eq!(starts, [10]);
@@ -79,29 +86,18 @@ async fn a_reader_begins_where_it_is_told_and_the_others_get_nothing_twice() {
     expect(&mut before, 1..=10).await;
 
     publish(writer.as_ref(), &frame(&channel, 1, 11));
-    for reader in [&mut first, &mut again, &mut timed, &mut bound, &mut beyond, &mut before] {
+    for reader in [
+        &mut first,
+        &mut again,
+        &mut timed,
+        &mut bound,
+        &mut later,
+        &mut beyond,
+        &mut before,
+    ] {
         expect(reader, 11..=11).await;
         assert!(reader.is_silent().await);
     }
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn after_the_last_record_a_time_is_the_end() {
-    let server = start_server();
-    let flow = Flow::open(&server).await;
-    let channel = flow.channel("later", 0).await;
-    let writer = publisher(&flow.broker, &channel, 0);
-    let mut first = reader(&flow.broker, &channel).await;
-    publish(writer.as_ref(), &frame(&channel, 1, 1));
-    let last = expect(&mut first, 1..=1).await[0].appended_ms.unwrap();
-    let begin = Begin::Since {
-        appended_ms: last + 60_000,
-        latest: [].into(),
-    };
-    let (mut later, starts) = from(&flow.broker, &channel, begin).await;
-    assert_eq!(starts, [1]);
-    publish(writer.as_ref(), &frame(&channel, 1, 2));
-    expect(&mut later, 2..=2).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -114,11 +110,7 @@ async fn who_gets_what_is_kept_is_told_where_it_goes_on_too() {
     let plain = PlainProducer::new(&server);
     plain.write(&name, 0, &["one", "two"]);
     plain.write(&name, 2, &["one"]);
-    let with_kept = SubscribeOptions {
-        with_kept: true,
-        ..SubscribeOptions::default()
-    };
-    let mut reader = subscribe(&flow.broker, &channel, with_kept).await;
+    let mut reader = subscribe(&flow.broker, &channel, WITH_KEPT).await;
     assert_eq!(reader.subscription.starts(), [2, 0, 1]);
     for (partition, offset) in [(2, 1), (1, 0), (0, 2)] {
         plain.write(&name, partition, &["live"]);

@@ -4,12 +4,13 @@ use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 use std::time::Duration;
 
+use base64::Engine as _;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use blaze_tests::servers::KafkaServer;
 use rdkafka::ClientConfig;
 use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, ResourceSpecifier, TopicReplication};
 use rdkafka::client::DefaultClientContext;
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
-use rdkafka::message::{Header, OwnedHeaders};
 use rdkafka::producer::{BaseProducer, BaseRecord, Producer as _};
 
 const TIMEOUT: Duration = Duration::from_secs(20);
@@ -80,21 +81,6 @@ impl PlainProducer {
         }
         self.0.flush(TIMEOUT).unwrap();
     }
-
-    pub(crate) fn write_with_headers(&self, topic: &str, headers: &[(&str, &[u8])], value: &str) {
-        let headers = headers.iter().fold(OwnedHeaders::new(), |headers, (key, value)| {
-            headers.insert(Header {
-                key,
-                value: Some(*value),
-            })
-        });
-        let record = BaseRecord::<str, str>::to(topic)
-            .partition(0)
-            .headers(headers)
-            .payload(value);
-        self.0.send(record).map_err(|(error, _)| error).unwrap();
-        self.0.flush(TIMEOUT).unwrap();
-    }
 }
 
 /// The server's identity of a topic in Kafka's text form, asked of the server itself (metadata, version 12).
@@ -120,15 +106,5 @@ pub(crate) fn topic_uuid(server: &KafkaServer, topic: &str) -> String {
         .windows(topic.len())
         .position(|window| window == topic.as_bytes())
         .unwrap();
-    base64(&answer[name + topic.len()..][..16])
-}
-
-fn base64(bytes: &[u8]) -> String {
-    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_";
-    let digit = |at: usize| {
-        let bit = |position: usize| bytes.get(position / 8).map_or(0, |byte| byte >> (7 - position % 8) & 1);
-        let value = (at * 6..at * 6 + 6).fold(0, |value, position| value << 1 | bit(position));
-        char::from(DIGITS[usize::from(value)])
-    };
-    (0..(bytes.len() * 8).div_ceil(6)).map(digit).collect()
+    URL_SAFE_NO_PAD.encode(&answer[name + topic.len()..][..16])
 }

@@ -2,21 +2,14 @@
 
 use std::collections::BTreeMap;
 
-use blaze_brokers::{Broker as _, BrokerError, FlowSide, Health, PublishOutcome, Role, SubscribeOptions};
+use blaze_brokers::{Broker as _, BrokerError, FlowSide, Health, PublishOutcome, SubscribeOptions};
 use blaze_domain::WriterId;
 use blaze_domain::names::ChannelName;
 use blaze_tests::servers::unique_name;
 use bytes::Bytes;
 
 use super::plain::{delete_topic, make_topic, topic_uuid};
-use super::{Flow, eventually, frame, health, publish, publisher, reader, start_server, subscribe};
-
-const WITH_KEPT: SubscribeOptions = SubscribeOptions {
-    max_messages: 4096,
-    max_bytes: 64 * 1024 * 1024,
-    large: false,
-    with_kept: true,
-};
+use super::{Flow, WITH_KEPT, eventually, frame, health, publish, publisher, reader, start_server, subscribe};
 
 async fn leases(side: &dyn FlowSide) -> BTreeMap<String, String> {
     let loaded = side.load_leases().await.unwrap();
@@ -94,27 +87,6 @@ async fn prepared_topics_are_made_again_until_they_are_released() {
         topic_uuid(&server, channel.as_str()).chars().all(|c| c == 'A'),
         "made again though released, and {other} was made"
     );
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn names_that_collide_or_are_too_long_are_refused() {
-    let server = start_server();
-    let flow = Flow::open(&server).await;
-    let stem = unique_name("imu").replace('-', "");
-    let one: ChannelName = format!("{stem}/data").parse().unwrap();
-    let other: ChannelName = format!("{stem}_data").parse().unwrap();
-    flow.side.prepare(&one, 0).unwrap();
-    assert!(matches!(
-        flow.side.prepare(&other, 0),
-        Err(BrokerError::Collision { .. })
-    ));
-    let long =
-        blaze_brokers::kafka::KafkaBroker::open(&super::section(&server, &"p".repeat(60)), &Role::Service).unwrap();
-    let channel: ChannelName = "t".repeat(200).parse().unwrap();
-    assert!(matches!(
-        long.publisher(&channel, blaze_brokers::PublisherOptions::default()),
-        Err(BrokerError::Name { .. })
-    ));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -128,42 +128,6 @@ async fn a_unix_socket_is_as_good() {
     assert_eq!(next_number(&mut reader).await, (1, 1));
 }
 
-/// Two prefixes on one server are two scopes.
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn prefixes_keep_scopes_apart() {
-    let server = Server::start(RedisKind::Valkey);
-    let flow = |prefix: &str, flow: &str| {
-        let role = Role::Flow {
-            flow: flow.parse().unwrap(),
-            epoch: 1,
-        };
-        open(&json!({ "url": server.server.url(), "prefix": prefix }), &role).unwrap()
-    };
-    let (one, two) = (flow("one:", "edge/robot-1"), flow("two:", "edge/robot-2"));
-    wait_for(&one, Health::Up).await;
-    wait_for(&two, Health::Up).await;
-    let (mut first, mut second) = (subscribe(&one, "imu").await, subscribe(&two, "imu").await);
-    publish(publisher(&one, "imu", 1).as_ref(), 1, 1);
-    publish(publisher(&two, "imu", 1).as_ref(), 2, 1);
-    assert_eq!(
-        (next_number(&mut first).await, next_number(&mut second).await),
-        ((1, 1), (2, 1))
-    );
-    let mut keys: Vec<_> = server
-        .cli(&["KEYS", "*"])
-        .split_whitespace()
-        .map(str::to_owned)
-        .collect();
-    keys.sort();
-    let expected = [
-        "one:blaze:flow:owner",
-        "one:blaze:last:imu",
-        "two:blaze:flow:owner",
-        "two:blaze:last:imu",
-    ];
-    assert_eq!(keys, expected);
-}
-
 /// What can never work is an error at once, and says which key is at fault.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn bad_settings_are_told_at_once() {

@@ -39,24 +39,6 @@ async fn late_joiners_get_an_unbroken_row() {
     assert_eq!(thread.join().unwrap(), 0);
 }
 
-/// What is kept comes in the order in which it was published, and knows how long it lay there.
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn kept_messages_come_in_order_of_arrival() {
-    let server = Server::start(RedisKind::Valkey);
-    let (source, sink) = (server.service().await, server.service().await);
-    let publishers = [publisher(&source, "map", 2), publisher(&source, "map", 2)];
-    for sequence in 1..=3 {
-        for (number, publisher) in (1..).zip(&publishers) {
-            publish(publisher.as_ref(), number, sequence);
-            settled(publisher.as_ref()).await;
-        }
-    }
-    let mut late = subscribe_with_kept(&sink, "map").await;
-    for expected in [(1, 2), (2, 2), (1, 3), (2, 3)] {
-        assert_eq!(next_number(&mut late).await, expected);
-    }
-}
-
 /// When a writer's lease has lapsed, its field goes; so it does not come back when the server loses everything.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_forgotten_writer_stays_forgotten() {

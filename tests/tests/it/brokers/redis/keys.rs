@@ -49,34 +49,6 @@ async fn until<T>(mut ask: impl AsyncFnMut() -> T, is_good: impl Fn(&T) -> bool)
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn values_and_the_messages_about_them_come_together() {
-    let server = Server::start(RedisKind::Redis);
-    let keys = keys_of(&server);
-    let section = section_of(&json!({ "url": server.server.url(), "prefix": "site:" }));
-    let broker = RedisBroker::open(&section, &Role::Service).unwrap();
-    wait_for(&broker, Health::Up).await;
-    let mut reader = subscribe(&broker, "blaze/config/changed/slam").await;
-    let notice = (channel("blaze/config/changed/slam"), Bytes::from("changed"));
-    keys.apply(
-        &[put("blaze:config:slam", "new"), put("blaze:config:nav", "n")],
-        &[notice],
-    )
-    .await
-    .unwrap();
-    let mut batch = Vec::new();
-    reader.receive(&mut batch, 1).await;
-    assert_eq!(batch.len(), 1);
-    assert_eq!(keys.get("blaze:config:slam").await.unwrap(), Some(Bytes::from("new")));
-    let gone = KeyChange::Delete {
-        key: "blaze:config:slam".to_owned(),
-    };
-    keys.apply(&[gone], &[]).await.unwrap();
-    assert_eq!(keys.get("blaze:config:slam").await.unwrap(), None);
-    assert_eq!(keys.get("blaze:config:nav").await.unwrap(), Some(Bytes::from("n")));
-    broker.close().await;
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_record_vanishes_unless_it_is_renewed_and_only_those_asked_for_are_found() {
     let server = Server::start(RedisKind::Redis);
     let keys = keys_of(&server);
@@ -112,23 +84,18 @@ async fn a_value_for_a_while_vanishes_and_a_new_one_takes_its_place_and_time() {
         .await
         .unwrap();
     keys.put_for("cache:a", &Bytes::from("2"), SHORT).await.unwrap();
-    until(async || keys.get("cache:a").await.unwrap(), Option::is_none).await;
+    // Less than the server can count is as short as it can be, and no error.
+    keys.put_for("cache:c", &Bytes::from("3"), Duration::ZERO)
+        .await
+        .unwrap();
+    for gone in ["cache:a", "cache:c"] {
+        until(async || keys.get(gone).await.unwrap(), Option::is_none).await;
+    }
     assert_eq!(
         keys.get("cache:b").await.unwrap(),
         Some(Bytes::from_static(b"\x00\xff")),
         "it has its own time"
     );
-    // Less than the server can count is as short as it can be, and no error.
-    keys.put_for("cache:c", &Bytes::from("3"), Duration::ZERO)
-        .await
-        .unwrap();
-    until(async || keys.get("cache:c").await.unwrap(), Option::is_none).await;
-    // Without an expiry it stays, whatever it had before.
-    keys.put_for("cache:b", &Bytes::from("4"), SHORT).await.unwrap();
-    keys.apply(&[put("cache:b", "5")], &[]).await.unwrap();
-    keys.put_for("cache:d", &Bytes::from("6"), SHORT).await.unwrap();
-    until(async || keys.get("cache:d").await.unwrap(), Option::is_none).await;
-    assert_eq!(keys.get("cache:b").await.unwrap(), Some(Bytes::from("5")));
 }
 
 fn lock(owner: &str) -> RedisLock {
@@ -136,21 +103,6 @@ fn lock(owner: &str) -> RedisLock {
         key: "blaze:lease:worker:fog".to_owned(),
         owner: owner.to_owned(),
     }
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_lock_has_one_owner_until_it_runs_out_or_is_given_up() {
-    let server = Server::start(RedisKind::Valkey);
-    let (keys, one, other) = (keys_of(&server), lock("one"), lock("other"));
-    let has = async |lock: &RedisLock, time| keys.hold(lock, time, None).await.unwrap().is_held;
-    assert!(has(&one, LONG).await);
-    assert!(has(&one, LONG).await, "it goes on having it");
-    assert!(!has(&other, LONG).await);
-    keys.release(&other).await.unwrap();
-    assert!(!has(&other, LONG).await, "nobody gives up what another has");
-    keys.release(&one).await.unwrap();
-    assert!(has(&other, SHORT).await);
-    until(async || has(&one, LONG).await, |has| *has).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -164,7 +116,10 @@ async fn what_counts_only_while_a_lock_is_held_is_done_wholly_or_not_at_all() {
     let gone = KeyChange::Delete { key: "c".to_owned() };
     let changes = [put("a", "1"), record("b", "ready", LONG), gone];
     let notice = [(channel("blaze/config/changed/slam"), Bytes::from("hear"))];
-    keys.apply(&[put("c", "0")], &[]).await.unwrap();
+    keys.apply(&[put("c", "0")], &notice).await.unwrap();
+    let mut batch = Vec::new();
+    reader.receive(&mut batch, 10).await;
+    assert_eq!(batch.len(), 1, "it comes with the change");
     assert!(
         !keys.apply_if_held(&one, &changes, &notice).await.unwrap(),
         "nobody has it"
@@ -180,9 +135,8 @@ async fn what_counts_only_while_a_lock_is_held_is_done_wholly_or_not_at_all() {
     assert_eq!(keys.get("a").await.unwrap(), Some(Bytes::from("1")));
     assert_eq!(keys.record("b").await.unwrap().unwrap()["state"], "ready");
     assert_eq!(keys.get("c").await.unwrap(), None);
-    let mut batch = Vec::new();
     reader.receive(&mut batch, 10).await;
-    assert_eq!(batch.len(), 1, "it was published once");
+    assert_eq!(batch.len(), 2, "it was published once more");
     // As much as a worker tells at once.
     let large = |number: usize| KeyChange::Put {
         key: format!("many:{number}"),

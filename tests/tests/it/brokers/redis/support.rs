@@ -12,13 +12,12 @@ use blaze_brokers::{
 use blaze_conformance::broker::{Capabilities, Fixture};
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::{NodeBroker, NodeFile, RedisBroker as Section};
-use blaze_domain::{Origin, WriterId};
-use blaze_proto::{Frame, Header};
+use blaze_proto::Frame;
 use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
-use bytes::Bytes;
 
-/// How long a condition may take; spent only where a test fails.
-pub(super) const DEADLINE: Duration = Duration::from_secs(20);
+use super::super::support::WITH_KEPT;
+pub(super) use super::super::support::{DEADLINE, eventually, wait_for, writer};
+
 /// How long silence must last to count as silence.
 pub(super) const SILENCE: Duration = Duration::from_millis(300);
 
@@ -125,39 +124,12 @@ pub(super) fn section_of(redis: &serde_json::Value) -> Section {
     }
 }
 
-/// Waits until a client's health is as given, and gives its detail.
-pub(super) async fn wait_for(broker: &dyn Broker, health: Health) -> String {
-    let mut status = broker.status();
-    let waited = tokio::time::timeout(DEADLINE, status.wait_for(|status| status.health == health)).await;
-    match waited {
-        Ok(status) => status.unwrap().detail.clone(),
-        Err(_) => panic!("not {health:?} within {DEADLINE:?}: {:?}", broker.status().borrow()),
-    }
-}
-
-/// Waits until something holds.
-pub(super) async fn eventually<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
-    let until = Instant::now() + DEADLINE;
-    loop {
-        if let Some(found) = look() {
-            return found;
-        }
-        assert!(Instant::now() < until, "{what}: not within {DEADLINE:?}");
-        tokio::time::sleep(Duration::from_millis(10)).await;
-    }
-}
-
 pub(super) fn channel(name: &str) -> ChannelName {
     name.parse().unwrap()
 }
 
-pub(super) fn writer(number: u8) -> WriterId {
-    WriterId([number; 16])
-}
-
 pub(super) fn frame(number: u8, sequence: u64, bytes: usize) -> Frame {
-    let header = Header::new("test", Origin::default(), writer(number), sequence, 0);
-    Frame::new(&header, Bytes::from(vec![b'x'; bytes])).unwrap()
+    super::super::support::frame("test", number, sequence, bytes)
 }
 
 pub(super) fn publisher(broker: &dyn Broker, name: &str, depth: u32) -> Arc<dyn Publisher> {
@@ -190,11 +162,7 @@ pub(super) async fn subscribe(broker: &dyn Broker, name: &str) -> Subscription {
 }
 
 pub(super) async fn subscribe_with_kept(broker: &dyn Broker, name: &str) -> Subscription {
-    let options = SubscribeOptions {
-        with_kept: true,
-        ..SubscribeOptions::default()
-    };
-    broker.subscribe(&channel(name), options).await.unwrap()
+    broker.subscribe(&channel(name), WITH_KEPT).await.unwrap()
 }
 
 /// The next message.
