@@ -13,7 +13,7 @@ use serde_json::{Map, Value, json};
 const OPAQUE: &[&str] = &["example", "examples", "default", "enum", "value"];
 
 /// The twin of a document.
-pub(in super::super) fn to_3_0(document: &Value) -> Value {
+pub(super) fn to_3_0(document: &Value) -> Value {
     let mut out = walk(document);
     if let Value::Object(members) = &mut out {
         members.insert("openapi".to_owned(), "3.0.3".into());
