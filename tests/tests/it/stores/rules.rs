@@ -1,12 +1,14 @@
-//! The rules for all stores, on the MongoDB that all tests share.
+//! The rules for all stores, on the MongoDB that all tests share and on files.
 
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use blaze_config::store::{Archive as _, CommitLog as _, FullStore, MongoStore};
+use blaze_config::store::{Archive as _, CommitLog as _, FullStore, MongoStore, SqliteStore};
 use blaze_conformance::store::Fixture;
+use blaze_runtime::Supervisor;
 use blaze_tests::servers::{drop_mongo_database, mongo_command, shared_mongo, unique_name};
 use parking_lot::Mutex;
+use tempfile::TempDir;
 
 use super::support::record;
 
@@ -50,6 +52,38 @@ impl Drop for Databases {
             let _ = drop_mongo_database(&self.uri, database);
         }
     }
+}
+
+/// Files of one test.
+struct Files {
+    folder: TempDir,
+    supervisor: Supervisor,
+}
+
+impl Files {
+    fn new() -> Self {
+        Self {
+            folder: tempfile::tempdir().unwrap(),
+            supervisor: Supervisor::new("test"),
+        }
+    }
+}
+
+#[async_trait]
+impl Fixture for Files {
+    async fn open(&self, name: &str) -> Result<Arc<dyn FullStore>, String> {
+        let path = self.folder.path().join(format!("{name}.db"));
+        let store = SqliteStore::open(&path, &self.supervisor).await;
+        Ok(Arc::new(store.map_err(|error| error.to_string())?))
+    }
+
+    fn is_shared(&self) -> bool {
+        false
+    }
+}
+
+mod on_files {
+    blaze_conformance::store_conformance_tests!(async { super::Files::new() });
 }
 
 mod usually {
