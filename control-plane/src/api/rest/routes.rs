@@ -351,50 +351,6 @@ pub(super) fn allow(path: &str) -> String {
 mod tests {
     use super::*;
 
-    /// The `operationId`s of the contract.
-    const OPERATIONS: &[&str] = &[
-        "list_nodes",
-        "create_node",
-        "get_node",
-        "replace_node",
-        "patch_node",
-        "delete_node",
-        "list_node_history",
-        "diff_node",
-        "rollback_node",
-        "apply",
-        "get_effective",
-        "watch",
-        "get_topology",
-        "list_workers",
-        "get_digest",
-        "list_audit",
-        "list_tokens",
-        "create_token",
-        "revoke_token",
-        "trim",
-        "revert",
-        "promote_rollout",
-        "abort_rollout",
-    ];
-
-    #[test]
-    fn the_operations_are_those_of_the_contract() {
-        let mut expected: Vec<String> = Vec::new();
-        for name in OPERATIONS {
-            if name.contains("node") {
-                expected
-                    .extend(["layer", "node", "service", "instance", "rollout"].map(|word| name.replace("node", word)));
-            } else {
-                expected.push((*name).to_owned());
-            }
-        }
-        let mut found: Vec<&str> = all().map(|route| route.operation).collect();
-        expected.sort_unstable();
-        found.sort_unstable();
-        assert_eq!(found, expected);
-    }
-
     #[test]
     fn each_path_and_method_comes_once() {
         let mut pairs: Vec<(&str, Verb)> = all().map(|route| (route.path, route.verb)).collect();
