@@ -37,10 +37,7 @@ async fn a_watch_tells_every_commit_from_a_revision_on() {
     let (revision, changes) = next(&mut stream).await;
     assert_eq!((revision, changes.len()), (1, 4));
     assert_eq!(next(&mut stream).await, (2, vec![("create", "Layer/fog".to_owned())]));
-    w.service
-        .delete(&w.admin, &key("Layer/fog"), Precondition::Any, false)
-        .await
-        .unwrap();
+    w.delete("Layer/fog", false).await.unwrap();
     assert_eq!(next(&mut stream).await, (3, vec![("delete", "Layer/fog".to_owned())]));
 }
 
