@@ -79,7 +79,7 @@ async fn a_role_opens_what_its_rights_say() {
         let token = NewToken {
             subject: "ops",
             roles: &roles,
-            layer: None,
+            layer: (role == "worker").then_some("edge"),
             issued_s: now_s,
             expires_s: now_s + 3600,
             id: "t1",
@@ -87,7 +87,7 @@ async fn a_role_opens_what_its_rights_say() {
         format!("Bearer {}", keys.sign(&token).unwrap().unwrap())
     };
     for (role, rights) in [
-        ("root", &[][..]),
+        ("worker", &[Right::Read][..]),
         ("viewer", &[Right::Read]),
         ("operator", &[Right::Read, Right::Write]),
         ("admin", &[Right::Read, Right::Write, Right::Admin]),
