@@ -1,7 +1,6 @@
 //! What the rules share: stores, waiting, comparing.
 
 use std::collections::BTreeMap;
-use std::fmt::Debug;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -10,9 +9,6 @@ use blaze_domain::config::{Document, Key};
 
 use super::{Fixture, samples};
 use blaze_config::store::{Commit, CommitError, CommitRecord, FullStore, Op, StoreError};
-
-/// What a rule gives: nothing, or what is wrong.
-pub(super) type Outcome<T = ()> = Result<T, String>;
 
 /// How long a condition may take to come true; generous, because it is only spent where a rule is broken.
 pub(super) const DEADLINE: Duration = Duration::from_secs(20);
@@ -26,63 +22,46 @@ pub(super) fn store_name(base: &str) -> String {
 }
 
 /// A store that is empty.
-pub(super) async fn fresh(fixture: &dyn Fixture, base: &str) -> Outcome<Arc<dyn FullStore>> {
+pub(super) async fn fresh(fixture: &dyn Fixture, base: &str) -> Arc<dyn FullStore> {
     fixture.open(&store_name(base)).await
 }
 
-/// As text, what went wrong.
-pub(super) fn told<T, E: std::fmt::Display>(what: &str, result: Result<T, E>) -> Outcome<T> {
-    result.map_err(|error| format!("{what}: {error}"))
-}
-
 /// Waits for something that may never come.
-pub(super) async fn within<F: Future>(what: &str, future: F) -> Outcome<F::Output> {
-    tokio::time::timeout(DEADLINE, future)
-        .await
-        .map_err(|_| format!("{what}: not within {} s", DEADLINE.as_secs()))
-}
-
-/// Insists on equality.
-pub(super) fn same<T: PartialEq + Debug>(what: &str, found: &T, expected: &T) -> Outcome {
-    match found == expected {
-        true => Ok(()),
-        false => Err(format!("{what}: {found:?} instead of {expected:?}")),
-    }
+pub(super) async fn within<F: Future>(what: &str, future: F) -> F::Output {
+    let done = tokio::time::timeout(DEADLINE, future).await;
+    done.unwrap_or_else(|_| panic!("{what}: not within {DEADLINE:?}"))
 }
 
 /// Insists on [`CommitError::Conflict`].
-pub(super) fn conflict(what: &str, result: Result<(), CommitError>) -> Outcome {
-    match result {
-        Err(CommitError::Conflict) => Ok(()),
-        Err(error) => Err(format!("{what} is a conflict, but was: {error}")),
-        Ok(()) => Err(format!("{what} is a conflict, but was written")),
-    }
+pub(super) fn conflict(what: &str, result: Result<(), CommitError>) {
+    assert!(
+        matches!(result, Err(CommitError::Conflict)),
+        "{what} is a conflict, but was {result:?}"
+    );
 }
 
 /// Commits, and tries again when another transaction was in the way without taking the revision.
-pub(super) async fn commit(store: &dyn FullStore, records: &[CommitRecord]) -> Outcome {
+pub(super) async fn commit(store: &dyn FullStore, records: &[CommitRecord]) {
     let first = records.first().map_or(0, |record| record.commit.revision);
     loop {
         match store.commit(records).await {
-            Err(CommitError::Conflict) if told("head", store.head().await)? < first => {
+            Err(CommitError::Conflict) if store.head().await.unwrap() < first => {
                 tokio::time::sleep(Duration::from_millis(2)).await;
             }
-            result => return told(&format!("commit {first}"), result),
+            result => return result.unwrap(),
         }
     }
 }
 
 /// All commits after a revision, over as many reads as it takes.
-pub(super) async fn log(store: &dyn FullStore, after: u64) -> Outcome<Vec<Commit>> {
+pub(super) async fn log(store: &dyn FullStore, after: u64) -> Vec<Commit> {
     let mut commits: Vec<Commit> = Vec::new();
     loop {
         let from = commits.last().map_or(after, |commit| commit.revision);
-        let batch = told("commits_after", store.commits_after(from, 100).await)?;
-        if batch.floor > from {
-            return Err(format!("the floor is {} above {from}", batch.floor));
-        }
+        let batch = store.commits_after(from, 100).await.unwrap();
+        assert!(batch.floor <= from, "the floor is {} above {from}", batch.floor);
         if batch.commits.is_empty() {
-            return Ok(commits);
+            return commits;
         }
         commits.extend(batch.commits);
     }
@@ -106,13 +85,13 @@ pub(super) struct Model {
 }
 
 impl Model {
-    pub(super) async fn new(fixture: &dyn Fixture, base: &str) -> Outcome<Self> {
-        Ok(Self {
-            store: fresh(fixture, base).await?,
+    pub(super) async fn new(fixture: &dyn Fixture, base: &str) -> Self {
+        Self {
+            store: fresh(fixture, base).await,
             documents: BTreeMap::new(),
             states: vec![BTreeMap::new()],
             commits: Vec::new(),
-        })
+        }
     }
 
     pub(super) fn revision(&self) -> u64 {
@@ -150,7 +129,7 @@ impl Model {
     }
 
     /// Adds commits to model and store, as one group.
-    pub(super) async fn write(&mut self, group: &[&[&str]]) -> Outcome {
+    pub(super) async fn write(&mut self, group: &[&[&str]]) {
         let mut records: Vec<CommitRecord> = group.iter().map(|names| self.record(names)).collect();
         if let Some(batch) = records.first().map(|record| record.commit.batch.clone()) {
             // A group has one batch.
@@ -160,27 +139,26 @@ impl Model {
                 record.commit = Arc::new(commit.clone());
             }
         }
-        commit(self.store.as_ref(), &records).await?;
+        commit(self.store.as_ref(), &records).await;
         // Whatever a store does beside must change nothing of what it says.
-        match self.revision() % 3 {
-            0 => told("tidy", self.store.tidy().await),
-            _ => Ok(()),
+        if self.revision().is_multiple_of(3) {
+            self.store.tidy().await.unwrap();
         }
     }
 
     /// Insists that the store has this state.
-    pub(super) async fn check_now(&self) -> Outcome {
-        let snapshot = told("load", self.store.load().await)?;
-        same("the loaded revision", &snapshot.revision, &self.revision())?;
-        same("the documents", &by_key(snapshot.documents), &self.documents)?;
-        same("the head", &told("head", self.store.head().await)?, &self.revision())
+    pub(super) async fn check_now(&self) {
+        let snapshot = self.store.load().await.unwrap();
+        assert_eq!(snapshot.revision, self.revision(), "the loaded revision");
+        assert_eq!(by_key(snapshot.documents), self.documents, "the documents");
+        assert_eq!(self.store.head().await.unwrap(), self.revision(), "the head");
     }
 
     /// Insists that what was at each revision from `floor` on can be told.
-    pub(super) async fn check_past(&self, floor: u64) -> Outcome {
+    pub(super) async fn check_past(&self, floor: u64) {
         let now = self.revision();
         for at in floor..=now {
-            let changed = told("documents_at", self.store.documents_at(at, now).await)?;
+            let changed = self.store.documents_at(at, now).await.unwrap();
             let mut found = self.documents.clone();
             for (key, before) in changed {
                 match before {
@@ -188,21 +166,16 @@ impl Model {
                     None => found.remove(&key),
                 };
             }
-            let expected = usize::try_from(at).ok().and_then(|at| self.states.get(at));
-            let expected = expected.ok_or_else(|| format!("no state {at}"))?;
-            same(&format!("the documents at {at}"), &found, expected)?;
+            let expected = &self.states[usize::try_from(at).unwrap()];
+            assert_eq!(found, *expected, "the documents at {at}");
         }
-        Ok(())
     }
 }
 
 /// Insists on an error of the store that a later try may not have.
-pub(super) fn unavailable<T>(what: &str, result: Result<T, StoreError>) -> Outcome {
-    match result {
-        Err(StoreError::Unavailable(_)) => Ok(()),
-        Err(error) => Err(format!("{what} must be unavailable, but was: {error}")),
-        Ok(_) => Err(format!("{what} must be unavailable, but was answered")),
-    }
+pub(super) fn unavailable<T>(what: &str, result: Result<T, StoreError>) {
+    let error = result.err().unwrap_or_else(|| panic!("{what} was answered"));
+    assert!(matches!(error, StoreError::Unavailable(_)), "{what}: {error}");
 }
 
 /// Numbers that look random and are the same each time.

@@ -200,12 +200,10 @@ pub fn watch_commit(commit: &WatchCommit) -> &Bytes {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::OnceLock;
-
     use blaze_domain::config::Timestamp;
 
     use super::*;
-    use crate::core::{ApplyAction, WatchOp};
+    use crate::core::ApplyAction;
     use crate::store::Op;
 
     fn node() -> Arc<Document> {
@@ -266,25 +264,5 @@ mod tests {
         assert!(history_entry(&entry, false).get("document").is_none());
         entry.document = Some(node());
         assert_eq!(history_entry(&entry, true)["document"]["name"], "robot-1");
-    }
-
-    #[test]
-    fn an_event_is_written_once() {
-        let commit = WatchCommit {
-            revision: 413,
-            previous: 412,
-            time: Timestamp::from_millis(0),
-            subject: "ops".to_owned(),
-            changes: vec![(WatchOp::Leave, node())],
-            json: OnceLock::new(),
-            wire: OnceLock::new(),
-        };
-        let first = watch_commit(&commit).clone();
-        assert_eq!(first.as_ptr(), watch_commit(&commit).as_ptr());
-        assert!(!first.contains(&b'\n'));
-        let event: Value = serde_json::from_slice(&first).unwrap();
-        assert_eq!(event["revision"], 413);
-        assert_eq!(event["changes"][0]["op"], "leave");
-        assert_eq!(event["changes"][0]["document"]["uid"], node().uid);
     }
 }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use blaze_domain::config::diff::{Delta, document_diff};
 use blaze_domain::config::{Document, Key, Timestamp};
 use blaze_domain::{InstanceName, LayerName, NodeName, ServiceName};
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::affected;
@@ -165,83 +166,67 @@ fn document_from(value: &Value) -> Option<Document> {
     })
 }
 
+/// An answer of `apply` as it is kept.
+#[derive(Serialize, Deserialize)]
+struct Kept {
+    revision: u64,
+    results: Vec<KeptResult>,
+    affected: Vec<(
+        Option<ServiceName>,
+        Option<InstanceName>,
+        Option<LayerName>,
+        Option<NodeName>,
+    )>,
+    affected_total: u64,
+}
+
+#[derive(Serialize, Deserialize)]
+struct KeptResult {
+    key: String,
+    action: ApplyAction,
+    revision: u64,
+    changes: Vec<Value>,
+}
+
 fn report_text(report: &ApplyReport) -> String {
-    let results: Vec<Value> = report
-        .results
-        .iter()
-        .map(|result| {
-            let changes: Vec<Value> = result.changes.iter().map(Delta::to_json).collect();
-            json!({ "key": result.key.to_string(), "action": result.action.as_str(), "revision": result.revision, "changes": changes })
-        })
-        .collect();
-    let affected: Vec<Value> = report
-        .affected
-        .iter()
-        .map(|place| {
-            json!([
-                place.service.as_ref().map(ServiceName::as_str),
-                place.instance.as_ref().map(InstanceName::as_str),
-                place.layer.as_ref().map(LayerName::as_str),
-                place.node.as_ref().map(NodeName::as_str),
-            ])
-        })
-        .collect();
-    json!({ "revision": report.revision, "results": results, "affected": affected, "affected_total": report.affected_total })
-        .to_string()
+    let result = |result: &ApplyResult| KeptResult {
+        key: result.key.to_string(),
+        action: result.action,
+        revision: result.revision,
+        changes: result.changes.iter().map(Delta::to_json).collect(),
+    };
+    let places = report.affected.iter().cloned();
+    let kept = Kept {
+        revision: report.revision,
+        results: report.results.iter().map(result).collect(),
+        affected: places.map(|at| (at.service, at.instance, at.layer, at.node)).collect(),
+        affected_total: report.affected_total,
+    };
+    json!(kept).to_string()
 }
 
 /// An answer of `apply` that was kept.
 pub(crate) fn report_from(text: &str) -> Option<ApplyReport> {
-    let value: Value = serde_json::from_str(text).ok()?;
-    let results = value
-        .get("results")?
-        .as_array()?
-        .iter()
-        .map(result_from)
-        .collect::<Option<_>>()?;
-    let affected = value
-        .get("affected")?
-        .as_array()?
-        .iter()
-        .map(place_from)
-        .collect::<Option<_>>()?;
+    let kept: Kept = serde_json::from_str(text).ok()?;
+    let result = |result: KeptResult| {
+        Some(ApplyResult {
+            key: result.key.parse().ok()?,
+            action: result.action,
+            revision: result.revision,
+            changes: result.changes.iter().map(Delta::from_json).collect::<Option<_>>()?,
+        })
+    };
+    let place = |(service, instance, layer, node)| Place {
+        service,
+        instance,
+        layer,
+        node,
+    };
     Some(ApplyReport {
         dry_run: false,
-        revision: value.get("revision")?.as_u64()?,
-        results,
-        affected,
-        affected_total: value.get("affected_total")?.as_u64()?,
-    })
-}
-
-fn result_from(value: &Value) -> Option<ApplyResult> {
-    let actions = [
-        ApplyAction::Created,
-        ApplyAction::Updated,
-        ApplyAction::Deleted,
-        ApplyAction::Unchanged,
-    ];
-    let action = value.get("action")?.as_str()?;
-    let changes = value.get("changes")?.as_array()?;
-    Some(ApplyResult {
-        key: value.get("key")?.as_str()?.parse().ok()?,
-        action: actions.into_iter().find(|known| known.as_str() == action)?,
-        revision: value.get("revision")?.as_u64()?,
-        changes: changes
-            .iter()
-            .map(blaze_domain::config::diff::Delta::from_json)
-            .collect::<Option<_>>()?,
-    })
-}
-
-fn place_from(value: &Value) -> Option<Place> {
-    fn name<T: std::str::FromStr>(value: &Value, index: usize) -> Option<T> {
-        value.get(index)?.as_str()?.parse().ok()
-    }
-    value.is_array().then(|| Place {
-        service: name(value, 0),
-        instance: name(value, 1),
-        layer: name(value, 2),
-        node: name(value, 3),
+        revision: kept.revision,
+        results: kept.results.into_iter().map(result).collect::<Option<_>>()?,
+        affected: kept.affected.into_iter().map(place).collect(),
+        affected_total: kept.affected_total,
     })
 }

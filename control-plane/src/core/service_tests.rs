@@ -99,6 +99,20 @@ impl World {
         Ok(answer.value.document)
     }
 
+    async fn delete(&self, name: &str, cascade: bool) -> Result<Answer<()>, Problem> {
+        let any = Precondition::Any;
+        self.service.delete(&self.admin, &key(name), any, cascade).await
+    }
+
+    /// A document with its secrets as text.
+    async fn revealed(&self, name: &str) -> Arc<Document> {
+        let reveal = ReadOptions {
+            reveal: true,
+            ..ReadOptions::default()
+        };
+        self.service.get(&self.admin, &key(name), &reveal).await.unwrap().value
+    }
+
     async fn apply(&self, items: Vec<(&str, Value)>) -> Result<ApplyReport, Problem> {
         let items = items.into_iter().map(|(name, spec)| ApplyItem {
             input: input(name, spec),
@@ -172,10 +186,7 @@ async fn a_document_is_made_read_changed_and_deleted() {
         .unwrap();
     assert_eq!((patched.revision, patched.uid == made.uid), (2, true));
     assert_eq!(w.service.revision(), 2);
-    w.service
-        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, false)
-        .await
-        .unwrap();
+    w.delete("Layer/edge", false).await.unwrap();
     assert_eq!(code(w.get("Layer/edge").await), Code::NotFound);
     let again = w.put("Layer/edge", json!({ "kind": "edge" })).await;
     assert_ne!(again.uid, made.uid);
@@ -261,15 +272,9 @@ async fn references_must_exist_and_hold() {
     assert_eq!(missing.code, Code::ReferenceNotFound);
     assert_eq!(missing.errors[0].pointer, "/spec/layer");
     w.robot().await;
-    let used = w
-        .service
-        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, false)
-        .await;
+    let used = w.delete("Layer/edge", false).await;
     assert_eq!(code(used), Code::InUse);
-    w.service
-        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, true)
-        .await
-        .unwrap();
+    w.delete("Layer/edge", true).await.unwrap();
     for gone in ["Layer/edge", "Node/robot-1", "Instance/slam/0"] {
         assert_eq!(code(w.get(gone).await), Code::NotFound, "{gone}");
     }
@@ -421,12 +426,8 @@ async fn what_is_written_leaves_an_old_key_behind_and_what_has_no_key_is_not_sho
         .unwrap();
 
     let w = world_on(&store, &[new]).await;
-    let reveal = ReadOptions {
-        reveal: true,
-        ..ReadOptions::default()
-    };
     let password = async |name: &str| {
-        let shown = w.service.get(&w.admin, &key(name), &reveal).await.unwrap().value;
+        let shown = w.revealed(name).await;
         shown.spec["config"]["password"]["$secret"].clone()
     };
     assert_eq!(password("Service/a").await, json!({ "text": "canary", "version": 1 }));
@@ -436,7 +437,7 @@ async fn what_is_written_leaves_an_old_key_behind_and_what_has_no_key_is_not_sho
     let back = json!({ "description": "y", "config": { "password": { "$secret": kept } } });
     w.put("Service/b", back).await;
     let w = world_on(&store, &[new, old]).await;
-    let clear = w.service.get(&w.admin, &key("Service/b"), &reveal).await.unwrap().value;
+    let clear = w.revealed("Service/b").await;
     assert_eq!(clear.spec["config"]["password"]["$secret"]["text"], "canary");
 }
 
@@ -460,12 +461,7 @@ async fn secrets_are_kept_encrypted_and_shown_redacted() {
         reveal: true,
         ..ReadOptions::default()
     };
-    let clear = w
-        .service
-        .get(&w.admin, &key("Service/slam"), &reveal)
-        .await
-        .unwrap()
-        .value;
+    let clear = w.revealed("Service/slam").await;
     let shown = json!({ "$secret": { "text": canary, "version": 1 } });
     assert_eq!(clear.spec.pointer("/config/db/password"), Some(&shown));
     let unknown = w.try_put("Service/other", spec(redacted), Precondition::None).await;
@@ -485,12 +481,7 @@ async fn secrets_are_kept_encrypted_and_shown_redacted() {
         .rollback(&w.admin, &key("Service/slam"), 1, Precondition::None, None)
         .await
         .unwrap();
-    let clear = w
-        .service
-        .get(&w.admin, &key("Service/slam"), &reveal)
-        .await
-        .unwrap()
-        .value;
+    let clear = w.revealed("Service/slam").await;
     assert_eq!(
         clear.spec.pointer("/config/db/password/$secret/text"),
         Some(&json!(canary))

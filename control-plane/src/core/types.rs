@@ -7,6 +7,7 @@ use blaze_domain::config::diff::Delta;
 use blaze_domain::config::{Document, Key, Kind, Labels, Problem, Timestamp};
 use blaze_domain::{LayerName, NodeName, ServiceName};
 use bytes::Bytes;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::auth::Claims;
@@ -147,7 +148,8 @@ pub struct ApplyRequest {
 }
 
 /// What `apply` did to one document.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum ApplyAction {
     /// It is new.
     Created,

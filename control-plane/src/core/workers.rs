@@ -236,12 +236,6 @@ impl Workers {
             .map(|(node, (_, layer, told))| (node, (layer, told)))
             .collect()
     }
-
-    /// How many are connected.
-    pub(crate) fn connected(&self) -> usize {
-        let known = self.known.lock();
-        known.workers.values().filter(|worker| worker.is_connected()).count()
-    }
 }
 
 impl Known {
@@ -331,7 +325,6 @@ mod tests {
         assert!(worker.is_connected());
         assert_eq!((worker.has.revision, worker.last_seen), (9, at(4)));
         drop(new);
-        assert_eq!(workers.connected(), 0);
         assert!(!workers.list(|_| true)[0].1.is_connected());
     }
 

@@ -654,44 +654,17 @@ fn faulty_files_are_named() {
         .unwrap()
         .is_none()
     );
-    let good = authority.section(true);
-    for (section, named) in [
-        (
-            TlsSection {
-                cert_file: Some(authority.path("gone.pem")),
-                ..good.clone()
-            },
-            "gone.pem",
-        ),
-        (
-            TlsSection {
-                cert_file: Some(authority.path("server.key")),
-                ..good.clone()
-            },
-            "server.key",
-        ),
-        (
-            TlsSection {
-                key_file: Some(authority.path("server.pem")),
-                ..good.clone()
-            },
-            "server.pem",
-        ),
-        (
-            TlsSection {
-                key_file: Some(authority.path("other.key")),
-                ..good.clone()
-            },
-            "do not go together",
-        ),
-        (
-            TlsSection {
-                client_ca_file: Some(authority.path("server.key")),
-                ..good.clone()
-            },
-            "server.key",
-        ),
-    ] {
+    let pem = |name: &str| Some(authority.path(name));
+    let changes: [(&dyn Fn(&mut TlsSection), &str); 5] = [
+        (&|tls| tls.cert_file = pem("gone.pem"), "gone.pem"),
+        (&|tls| tls.cert_file = pem("server.key"), "server.key"),
+        (&|tls| tls.key_file = pem("server.pem"), "server.pem"),
+        (&|tls| tls.key_file = pem("other.key"), "do not go together"),
+        (&|tls| tls.client_ca_file = pem("server.key"), "server.key"),
+    ];
+    for (change, named) in changes {
+        let mut section = authority.section(true);
+        change(&mut section);
         let faults = Tls::load(&section).unwrap_err();
         assert!(faults.len() == 1 && faults[0].contains(named), "{faults:?}");
         assert!(faults[0].starts_with("control_plane.tls."), "{faults:?}");

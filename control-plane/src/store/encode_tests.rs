@@ -52,21 +52,6 @@ fn the_order_of_members_and_the_status_are_kept() {
     assert_eq!(read.spec.to_string(), written.spec.to_string());
 }
 
-#[test]
-fn a_commit_is_read_as_it_was_written() {
-    let records = [record(commit(4, &["a", "b"])), record(commit(5, &["a"]))];
-    let group = encode_group(&records).unwrap();
-    let (events, versions) = rows(&group);
-    let commits = decode_commits(3, events, versions).unwrap();
-    assert_eq!(commits.len(), 2);
-    for (read, record) in commits.iter().zip(&records) {
-        assert_eq!(read, &*record.commit);
-    }
-    let last = last_versions(group.iter().flat_map(|commit| &commit.versions));
-    assert_eq!(last.len(), 2);
-    assert_eq!(last.get("Node/a").map(|version| version.revision), Some(5));
-}
-
 fn rows(group: &[EncodedCommit]) -> (Vec<EventRow>, Vec<VersionRow>) {
     let events = group.iter().map(|commit| commit.event.clone()).collect();
     let versions = group.iter().flat_map(|commit| commit.versions.clone()).collect();

@@ -162,8 +162,6 @@ fn change((op, of): &(WatchOp, Arc<Document>)) -> v1::Change {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::OnceLock;
-
     use blaze_domain::config::Labels;
     use serde_json::json;
 
@@ -193,27 +191,6 @@ mod tests {
             value: None,
         });
         assert_eq!((wire.old_json.as_str(), wire.value_json.as_str()), ("null", ""));
-    }
-
-    #[test]
-    fn a_commit_is_made_once_and_says_what_happened() {
-        let seen = WatchCommit {
-            revision: 7,
-            previous: 5,
-            time: Timestamp::from_millis(1500),
-            subject: "ops".into(),
-            changes: vec![(WatchOp::Create, robot()), (WatchOp::Leave, robot())],
-            json: OnceLock::new(),
-            wire: OnceLock::new(),
-        };
-        let wire = commit(&seen);
-        assert_eq!(
-            (wire.revision, wire.previous, wire.time.unwrap().nanos),
-            (7, 5, 500_000_000)
-        );
-        let ops: Vec<_> = wire.changes.iter().map(v1::Change::op).collect();
-        assert_eq!(ops, [v1::Op::Create, v1::Op::Leave]);
-        assert_eq!(seen.wire.get(), Some(&wire));
     }
 
     #[test]

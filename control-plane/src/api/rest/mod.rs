@@ -77,11 +77,10 @@ struct Rest {
 /// The whole interface. Peers' addresses are taken from `ConnectInfo<SocketAddr>` of the requests.
 pub fn router(service: ConfigService, options: RestOptions) -> Router {
     let rest = Arc::new(Rest { service, options });
-    let (api, document) = routes::mount(&rest).split_for_parts();
-    let api = api
+    let api = routes::router(&rest)
         .fallback(gate::unknown)
         .method_not_allowed_fallback(gate::wrong_method);
-    let pages = pages::router(&rest, &document);
+    let pages = pages::router(&rest);
     Router::new().fallback(move |request: Request| {
         let (rest, api, pages) = (Arc::clone(&rest), api.clone(), pages.clone());
         async move { frame::serve(&rest, api, pages, request).await }

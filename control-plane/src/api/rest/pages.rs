@@ -15,7 +15,6 @@ use axum::routing::get;
 use blaze_domain::config::{Code, Problem};
 use bytes::Bytes;
 use serde_json::{Value, json};
-use utoipa::openapi::OpenApi;
 use utoipa_swagger_ui::Config;
 
 use super::frame::{Served, Visit, allow, note};
@@ -38,10 +37,9 @@ const START: &str = "window.ui = SwaggerUIBundle({\n  url: \"/openapi.json\",\n 
 const UI_FILES: &[&str] = &["swagger-ui.css", "swagger-ui-bundle.js", "favicon-32x32.png"];
 
 /// All open routes.
-pub(super) fn router(rest: &Arc<Rest>, document: &OpenApi) -> Router {
-    let document = openapi::finished(document);
-    let newest = Bytes::from(openapi::pretty(&document));
-    let older = Bytes::from(openapi::pretty(&openapi::to_3_0(&document)));
+pub(super) fn router(rest: &Arc<Rest>) -> Router {
+    let newest = Bytes::from(openapi::openapi_json());
+    let older = Bytes::from(openapi::openapi_3_0_json());
     let readiness = rest.options.readiness.clone();
     Router::new()
         .route(

@@ -1,4 +1,4 @@
-//! Small bodies of requests (`{"revision":412}`): read strictly, and described in the OpenAPI document by the same types.
+//! Small bodies of requests (`{"revision":412}`): read strictly; `openapi/parts.yaml` describes the same.
 
 use blaze_domain::LayerName;
 use blaze_domain::config::{Code, FieldFault, Problem, json as pointers};
@@ -6,83 +6,67 @@ use serde::de::{DeserializeOwned, Error};
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 use serde_path_to_error::Segment;
-use utoipa::ToSchema;
 
-use super::openapi::{layer_or_null, roles};
 use crate::api::DEFAULT_TOKEN_LIFE_S;
 
 /// Largest revision.
 const MAX_REVISION: u64 = blaze_domain::config::MAX_INTEGER.unsigned_abs();
 /// Longest life of a token, in seconds: a year.
-const MAX_LIFE_S: u64 = 31_536_000;
+pub(super) const MAX_LIFE_S: u64 = 31_536_000;
 /// Longest subject of a token, in characters.
 const MAX_SUBJECT: usize = 256;
 /// Longest reason of an aborted roll-out, in characters.
-const MAX_REASON: usize = 1000;
+pub(super) const MAX_REASON: usize = 1000;
 
 /// Request of a rollback.
-#[derive(Debug, Deserialize, ToSchema)]
+#[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-#[schema(examples(json!({ "revision": 7 })))]
 pub(super) struct RollbackRequest {
     /// Content as it was at this revision.
     #[serde(deserialize_with = "whole::<_, 1, MAX_REVISION>")]
-    #[schema(minimum = 1, maximum = 9007199254740991i64)]
     pub(super) revision: u64,
 }
 
 /// Request of a revert.
-#[derive(Debug, Deserialize, ToSchema)]
+#[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-#[schema(examples(json!({ "revision": 7, "force": false })))]
 pub(super) struct RevertRequest {
     /// The commit whose changes are taken back.
     #[serde(deserialize_with = "whole::<_, 1, MAX_REVISION>")]
-    #[schema(minimum = 1, maximum = 9007199254740991i64)]
     pub(super) revision: u64,
     /// Also documents that were changed since.
     #[serde(default)]
-    #[schema(default = false)]
     pub(super) force: bool,
 }
 
 /// Request to trim the history.
-#[derive(Debug, Deserialize, ToSchema)]
+#[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-#[schema(examples(json!({ "before": 1 })))]
 pub(super) struct TrimRequest {
     /// Commits before this revision are forgotten.
     #[serde(deserialize_with = "whole::<_, 1, MAX_REVISION>")]
-    #[schema(minimum = 1, maximum = 9007199254740991i64)]
     pub(super) before: u64,
 }
 
 /// Request to abort a roll-out.
-#[derive(Debug, Deserialize, ToSchema)]
+#[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-#[schema(examples(json!({ "reason": "too slow" })))]
 pub(super) struct AbortRequest {
     /// For people.
     #[serde(default, deserialize_with = "text::<_, 0, MAX_REASON>")]
-    #[schema(max_length = 1000)]
     pub(super) reason: String,
 }
 
 /// Request for a token.
-#[derive(Debug, Deserialize, ToSchema)]
+#[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-#[schema(examples(json!({ "subject": "ops@example.org", "roles": ["operator"], "layer": null, "expires_in_s": 86400 })))]
 pub(super) struct TokenRequest {
     #[serde(deserialize_with = "text::<_, 1, MAX_SUBJECT>")]
-    #[schema(min_length = 1, max_length = 256)]
     pub(super) subject: String,
-    #[schema(schema_with = roles)]
     pub(super) roles: Vec<String>,
     #[serde(default)]
-    #[schema(schema_with = layer_or_null)]
     pub(super) layer: Option<LayerName>,
     #[serde(default = "default_life_s", deserialize_with = "whole::<_, 1, MAX_LIFE_S>")]
-    #[schema(default = 86400, minimum = 1, maximum = 31536000)]
     pub(super) expires_in_s: u64,
 }
 

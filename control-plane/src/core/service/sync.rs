@@ -221,12 +221,6 @@ impl ConfigService {
         session.said(has, now());
     }
 
-    /// How many workers are connected to this process.
-    #[must_use]
-    pub fn connected_workers(&self) -> usize {
-        self.inner.workers.connected()
-    }
-
     fn enter(&self, hello: &SyncHello) -> Result<WorkerSession, Problem> {
         let name = WorkerName {
             layer: hello.layer.clone(),

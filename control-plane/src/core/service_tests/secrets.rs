@@ -3,11 +3,7 @@
 use super::*;
 
 async fn revealed(w: &World) -> Value {
-    let reveal = ReadOptions {
-        reveal: true,
-        ..ReadOptions::default()
-    };
-    let document = w.service.get(&w.admin, &key("Service/s"), &reveal).await.unwrap().value;
+    let document = w.revealed("Service/s").await;
     document.spec["config"]["users"].clone()
 }
 

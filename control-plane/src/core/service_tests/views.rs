@@ -117,8 +117,7 @@ async fn the_past_outside_of_a_layer_is_not_shown_in_it() {
     assert_eq!(code(back(outside).await), Code::PermissionDenied);
     assert!(back(inside).await.is_ok());
     // Of a document that had the name before.
-    let none = Precondition::Any;
-    w.service.delete(&w.admin, &key("Node/n"), none, false).await.unwrap();
+    w.delete("Node/n", false).await.unwrap();
     w.put("Node/n", json!({ "layer": "edge" })).await;
     assert_eq!(code(at(&bound, outside).await), Code::PermissionDenied);
 }

@@ -37,10 +37,7 @@ async fn a_watch_tells_every_commit_from_a_revision_on() {
     let (revision, changes) = next(&mut stream).await;
     assert_eq!((revision, changes.len()), (1, 4));
     assert_eq!(next(&mut stream).await, (2, vec![("create", "Layer/fog".to_owned())]));
-    w.service
-        .delete(&w.admin, &key("Layer/fog"), Precondition::Any, false)
-        .await
-        .unwrap();
+    w.delete("Layer/fog", false).await.unwrap();
     assert_eq!(next(&mut stream).await, (3, vec![("delete", "Layer/fog".to_owned())]));
 }
 
@@ -120,4 +117,79 @@ async fn a_watch_begins_at_the_revision_that_is_waited_for() {
     };
     let (watch, ()) = tokio::join!(w.service.watch_with(&w.admin, &query, &read), writes);
     assert_eq!(watch.unwrap().revision, 2);
+}
+
+#[tokio::test]
+async fn a_bound_token_is_told_of_its_layer_alone() {
+    let w = world().await;
+    w.robot().await;
+    for (name, spec) in [
+        ("Layer/fog", json!({ "kind": "fog" })),
+        ("Node/server", json!({ "layer": "fog" })),
+        (
+            "Instance/slam/0",
+            json!({ "node": "server", "config": { "of": "fog" } }),
+        ),
+        (
+            "Instance/slam/0",
+            json!({ "node": "server", "config": { "of": "more fog" } }),
+        ),
+        ("Layer/edge", json!({ "kind": "edge" })),
+    ] {
+        w.put(name, spec).await;
+    }
+    let query = WatchQuery {
+        since: Some(1),
+        ..WatchQuery::default()
+    };
+    let bound = caller(&["viewer"], Some("edge"));
+    let mut stream = w.service.watch(&bound, &query).await.unwrap().value;
+    let mut told = Vec::new();
+    while told.len() < 2 {
+        match tokio::time::timeout(Duration::from_secs(10), stream.next())
+            .await
+            .unwrap()
+        {
+            Some(WatchItem::Commit(commit)) => told.push(commit),
+            Some(WatchItem::Bookmark(_)) => {}
+            other => panic!("the stream ended: {other:?}"),
+        }
+    }
+    // What it was when it was last seen, not what it is now.
+    assert!(!format!("{told:?}").contains("fog"), "{told:?}");
+    let told: Vec<(u64, &str, String)> = told
+        .iter()
+        .flat_map(|commit| {
+            commit
+                .changes
+                .iter()
+                .map(|(op, document)| (commit.revision, op, document))
+        })
+        .map(|(revision, op, document)| (revision, op.as_str(), document.key.to_string()))
+        .collect();
+    assert_eq!(
+        told,
+        [
+            (4, "leave", "Instance/slam/0".to_owned()),
+            (6, "update", "Layer/edge".to_owned())
+        ]
+    );
+}
+
+#[tokio::test]
+async fn a_watch_ends_with_its_reason_when_the_service_ends() {
+    let w = world().await;
+    let mut stream = w.service.watch(&w.admin, &WatchQuery::default()).await.unwrap().value;
+    w.service.end_watches();
+    let problem = loop {
+        match tokio::time::timeout(Duration::from_secs(10), stream.next())
+            .await
+            .unwrap()
+        {
+            Some(WatchItem::End(problem)) => break problem.unwrap(),
+            Some(_) => {}
+            None => panic!("it ends without a word"),
+        }
+    };
+    assert_eq!(problem.code, Code::ShuttingDown);
 }

@@ -52,11 +52,7 @@ async fn a_refusal_carries_the_revision_of_the_document() {
     let w = world().await;
     w.robot().await;
     w.put("Layer/fog", json!({ "kind": "fog" })).await;
-    let used = w
-        .service
-        .delete(&w.admin, &key("Layer/edge"), Precondition::Any, false)
-        .await
-        .unwrap_err();
+    let used = w.delete("Layer/edge", false).await.unwrap_err();
     assert_eq!((used.code, used.revision), (Code::InUse, Some(1)));
     let missing = w
         .try_put("Layer/x", json!({ "kind": "fog" }), Precondition::Revisions(vec![1]))
@@ -73,10 +69,7 @@ async fn a_refusal_carries_the_revision_of_the_document() {
         .unwrap_err();
     assert_eq!((unsaid.code, unsaid.revision), (Code::PreconditionRequired, Some(1)));
     // A document that is gone since.
-    w.service
-        .delete(&w.admin, &key("Layer/fog"), Precondition::Any, false)
-        .await
-        .unwrap();
+    w.delete("Layer/fog", false).await.unwrap();
     let gone = w.service.revert(&w.admin, 2, false, None).await.unwrap_err();
     assert_eq!((gone.code, gone.revision), (Code::RevisionConflict, Some(3)));
 }

@@ -2,7 +2,8 @@
 //!
 //! Numbers are read in any width, as tools that copy databases do not keep it.
 
-use mongodb::bson::{Bson, DateTime, Document, doc};
+use mongodb::bson::{Bson, DateTime, Document, deserialize_from_document, doc};
+use serde::de::DeserializeOwned;
 
 use crate::store::StoreError;
 use crate::store::encode::{EncodedCommit, corrupt};
@@ -226,18 +227,24 @@ pub(super) fn version(row: &VersionRow) -> Document {
 pub(super) fn read_version(found: &Document) -> Result<VersionRow, StoreError> {
     let id = text(found, "_id")?;
     let (key, _) = split_version_id(&id)?;
+    let row: VersionRow = read(found, "key")?;
     Ok(VersionRow {
         key: key.to_owned(),
-        revision: integer(found, "revision")?,
-        position: integer(found, "position")?,
-        op: text(found, "op")?,
-        previous: optional_integer(found, "previous")?,
-        time: integer(found, "time")?,
-        subject: text(found, "subject")?,
-        request_id: text(found, "request_id")?,
-        paths: text(found, "paths")?,
-        document: text(found, "document")?,
+        ..row
     })
+}
+
+/// A row whose members are those of the document; its `_id` is called otherwise in the row.
+fn read<T: DeserializeOwned>(found: &Document, id: &str) -> Result<T, StoreError> {
+    let members = found.iter().map(|(name, value)| {
+        let name = if name == "_id" { id } else { name };
+        let value = match value {
+            Bson::DateTime(time) => Bson::Int64(time.timestamp_millis()),
+            other => other.clone(),
+        };
+        (name.to_owned(), value)
+    });
+    deserialize_from_document(members.collect()).map_err(corrupt)
 }
 
 pub(super) fn document(row: &DocumentRow) -> Document {
@@ -245,11 +252,7 @@ pub(super) fn document(row: &DocumentRow) -> Document {
 }
 
 pub(super) fn read_document(found: &Document) -> Result<DocumentRow, StoreError> {
-    Ok(DocumentRow {
-        key: text(found, "_id")?,
-        revision: integer(found, "revision")?,
-        document: text(found, "document")?,
-    })
+    read(found, "key")
 }
 
 pub(super) fn audit(row: &AuditRow) -> Document {
@@ -263,23 +266,7 @@ pub(super) fn audit(row: &AuditRow) -> Document {
 }
 
 pub(super) fn read_audit(found: &Document) -> Result<AuditRow, StoreError> {
-    Ok(AuditRow {
-        id: text(found, "_id")?,
-        time: date(found, "time")?,
-        revision: optional_integer(found, "revision")?,
-        subject: text(found, "subject")?,
-        roles: text(found, "roles")?,
-        action: text(found, "action")?,
-        kind: optional_text(found, "kind")?,
-        service: optional_text(found, "service")?,
-        name: optional_text(found, "name")?,
-        allowed: found.get_bool("allowed").map_err(corrupt)?,
-        code: optional_text(found, "code")?,
-        paths: text(found, "paths")?,
-        request_id: text(found, "request_id")?,
-        address: text(found, "address")?,
-        detail: optional_text(found, "detail")?,
-    })
+    read(found, "id")
 }
 
 pub(super) fn idempotency(row: &IdempotencyRow) -> Document {
@@ -290,13 +277,7 @@ pub(super) fn idempotency(row: &IdempotencyRow) -> Document {
 }
 
 pub(super) fn read_idempotency(found: &Document) -> Result<IdempotencyRow, StoreError> {
-    Ok(IdempotencyRow {
-        id: text(found, "_id")?,
-        body: text(found, "body")?,
-        expires: date(found, "expires")?,
-        revision: integer(found, "revision")?,
-        answer: text(found, "answer")?,
-    })
+    read(found, "id")
 }
 
 pub(super) fn token(row: &TokenRow) -> Document {
@@ -308,15 +289,7 @@ pub(super) fn token(row: &TokenRow) -> Document {
 }
 
 pub(super) fn read_token(found: &Document) -> Result<TokenRow, StoreError> {
-    Ok(TokenRow {
-        id: text(found, "_id")?,
-        subject: text(found, "subject")?,
-        roles: text(found, "roles")?,
-        layer: optional_text(found, "layer")?,
-        create_time: integer(found, "create_time")?,
-        expire_time: date(found, "expire_time")?,
-        revoke_time: optional_integer(found, "revoke_time")?,
-    })
+    read(found, "id")
 }
 
 fn optional(value: &Option<String>) -> Bson {
@@ -347,13 +320,6 @@ fn optional_integer(found: &Document, name: &str) -> Result<Option<i64>, StoreEr
         None | Some(Bson::Null) => Ok(None),
         Some(_) => integer(found, name).map(Some),
     }
-}
-
-fn date(found: &Document, name: &str) -> Result<i64, StoreError> {
-    found
-        .get_datetime(name)
-        .map(|date| date.timestamp_millis())
-        .map_err(corrupt)
 }
 
 #[cfg(test)]

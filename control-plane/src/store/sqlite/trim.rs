@@ -121,26 +121,3 @@ fn parse(text: &str) -> Option<Trimmed> {
         keep: words.next()?.parse().ok()?,
     })
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_note_is_read_as_it_was_written() {
-        let connection = Connection::open_in_memory().unwrap();
-        connection
-            .execute_batch("CREATE TABLE meta (name TEXT PRIMARY KEY, value ANY NOT NULL) STRICT")
-            .unwrap();
-        assert_eq!(trimmed(&connection).unwrap(), Trimmed::default());
-        let now = Trimmed {
-            floor: 3,
-            head: 9,
-            keep: 20,
-        };
-        note(&connection, now).unwrap();
-        assert_eq!(trimmed(&connection).unwrap(), now);
-        assert_eq!(parse("3 9"), None);
-        assert_eq!(parse("3 9 x"), None);
-    }
-}

@@ -1,4 +1,4 @@
-//! Processes and their store are killed while many write. What each writer was told is true: what took effect is there, once
+//! Processes and their store are killed, or replaced as an upgrade does it, while many write. What each writer was told is true: what took effect is there, once
 //! and whole; what did not is nowhere; of what nobody knows it is one or the other, whole.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -39,6 +39,8 @@ struct Attempt {
 #[derive(Debug, Clone, Copy)]
 enum Victim {
     Process(usize),
+    /// It is asked to end, as an upgrade does it.
+    Replaced(usize),
     Store,
 }
 
@@ -63,11 +65,12 @@ async fn what_writers_are_told_is_true_while_the_service_on_sqlite_is_killed() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_writers_are_told_is_true_while_two_services_and_mongodb_are_killed() {
+async fn what_writers_are_told_is_true_while_two_services_and_mongodb_go_and_come() {
     let stage = Arc::new(Stage::mongo());
     let mains = vec![stage.start("one"), stage.start("two")];
-    let pairs = (0..count(10, 2)).flat_map(|index| [Victim::Process(index % 2), Victim::Store]);
-    told_the_truth(&stage, &mains, pairs.collect(), count(20_000, 400)).await;
+    let each = |index: usize| [Victim::Process(index % 2), Victim::Store, Victim::Replaced(index % 2)];
+    let victims = (0..count(10, 2)).flat_map(each).collect();
+    told_the_truth(&stage, &mains, victims, count(20_000, 400)).await;
 }
 
 async fn told_the_truth(stage: &Arc<Stage>, mains: &[Arc<Main>], victims: Vec<Victim>, goal: usize) {
@@ -134,6 +137,10 @@ fn kill_all(stage: &Stage, mains: &[Arc<Main>], victims: &[Victim], progress: &P
         match *victim {
             Victim::Process(index) => {
                 mains[index].kill();
+                mains[index].start_again();
+            }
+            Victim::Replaced(index) => {
+                assert_eq!(mains[index].stop(), Some(0), "it ends well");
                 mains[index].start_again();
             }
             Victim::Store => stage.server().restart().unwrap(),

@@ -7,7 +7,7 @@
 //! stage    a store and the processes on it: start, kill -9, start again, backup, restore
 //! client   one user of one process, over REST or gRPC: put, apply, get, delete, list; yes, no or unknown
 //! watcher  a watch with cuts, that checks what it is told;  stream, sse: events from bytes and messages
-//! writer   changes services of its own;  raw: gRPC by hand
+//! writer   changes services of its own
 //! register, checker   the history of a register, and whether it can be explained
 //! ```
 
@@ -15,20 +15,14 @@ mod backup;
 mod canary;
 mod checker;
 mod client;
-mod counter;
 mod crashes;
 mod linearizable;
-mod matrix;
 mod other_layer;
-mod raw;
 mod register;
-mod resumes;
-mod routes;
 mod sse;
 mod stage;
 mod stream;
 mod token;
-mod upgrade;
 mod watch;
 mod watcher;
 mod writer;

@@ -15,8 +15,6 @@ use parking_lot::{Mutex, RwLock};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use super::token::{self, Rsa};
-
 /// A start on a machine that does much else; measured below a second.
 const START: Duration = Duration::from_secs(60);
 
@@ -34,8 +32,6 @@ pub(crate) struct Stage {
     pub(crate) store: Store,
     /// The key that signs, HS256, id `k1`.
     pub(crate) secret: Vec<u8>,
-    /// A second key, RS256, id `r1`: its public half alone is on the server.
-    pub(crate) rsa: Rsa,
 }
 
 /// Addresses of a process; others after each start.
@@ -69,14 +65,8 @@ impl Stage {
         let folder = TempDir::new().unwrap();
         let secret = blaze_auth::generate_key(blaze_auth::Algorithm::Hs256).unwrap();
         let secret = secret.private.trim_end().as_bytes().to_vec();
-        let stage = Self {
-            folder,
-            store,
-            secret,
-            rsa: token::rsa().clone(),
-        };
+        let stage = Self { folder, store, secret };
         stage.write("jwt.key", &stage.secret);
-        stage.write("rsa.pem", stage.rsa.public.as_bytes());
         stage.write("enc.key", blaze_auth::generate_encryption_key().unwrap().as_bytes());
         stage
     }
@@ -162,13 +152,10 @@ impl Stage {
                 "grpc": { "listen": "127.0.0.1:0" },
                 "admin": { "listen": "127.0.0.1:0" },
                 "store": self.store_section(),
-                "auth": { "keys": [
-                    { "id": "k1", "alg": "HS256", "file": self.path("jwt.key"), "sign": true },
-                    { "id": "r1", "alg": "RS256", "file": self.path("rsa.pem") },
-                ] },
+                "auth": { "keys": [{ "id": "k1", "alg": "HS256", "file": self.path("jwt.key"), "sign": true }] },
                 "encryption": { "keys": [{ "id": "e1", "file": self.path("enc.key") }] },
-                // Tests present more bad tokens than anybody may, and more watches of one subject.
-                "limits": { "watches_per_subject": 10_000, "auth_failures_per_s": 0 },
+                // Tests open more watches of one subject than anybody may.
+                "limits": { "watches_per_subject": 10_000 },
             },
         });
         std::fs::write(&path, serde_json::to_string_pretty(&file).unwrap()).unwrap();

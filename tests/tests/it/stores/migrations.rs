@@ -1,82 +1,151 @@
-//! Migrations of a database: killed at every point, by several at once, and from the first schema.
+//! Migrations of both kinds of stores: killed at every point they go on where they were, by several at once, and from the
+//! first schema.
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use blaze_config::store::migrate::{Action, Migration, Migrations, Step};
-use blaze_config::store::{Archive as _, CommitLog as _, MongoStore, Op, StoreError, TokenStore as _, Upkeep as _};
+use blaze_config::store::{AuditQuery, FullStore, MongoStore, Op, SqliteStore, StoreError};
 use blaze_domain::config::{Document, Key, Timestamp};
+use blaze_runtime::Supervisor;
 use blaze_tests::servers::{drop_mongo_database, mongo_command, mongo_insert, shared_mongo, unique_name};
 use serde_json::{Value, json};
+use tempfile::TempDir;
 
 use super::support::{Ledger, check, record, write_through};
 
-const SCHEMA_1: &str = include_str!("fixtures/schema1.mongodb.jsonl");
-/// Set for the process that is to die, with where.
-const VICTIM_DATABASE: &str = "BLAZE_TEST_MIGRATES_DATABASE";
+const SQL_1: &str = include_str!("fixtures/schema1.sql");
+const MONGO_1: &str = include_str!("fixtures/schema1.mongodb.jsonl");
+/// Set for the process that is to die: what it migrates, and where it dies.
+const VICTIM: &str = "BLAZE_TEST_MIGRATES";
 const VICTIM_DIES: &str = "BLAZE_TEST_DIES_AT";
 const COMMITS: u64 = 300;
 const MARK: &str = "migrated";
 
-/// A database that goes with the test.
-struct Database {
-    uri: String,
-    name: String,
+/// A store that goes with the test.
+struct Home {
+    /// Path of a file, or name of a database on the server that all tests share.
+    place: String,
+    folder: Option<TempDir>,
 }
 
-impl Database {
-    fn new() -> Self {
+async fn open(place: &str, migrations: &Migrations) -> Result<Arc<dyn FullStore>, StoreError> {
+    if place.contains('/') {
+        let store = SqliteStore::open_with(Path::new(place), migrations, &Supervisor::new("test")).await?;
+        return Ok(Arc::new(store));
+    }
+    let store = MongoStore::open_with(&shared_mongo().unwrap(), place, migrations).await?;
+    Ok(Arc::new(store))
+}
+
+impl Home {
+    fn file() -> Self {
+        let folder = tempfile::tempdir().unwrap();
         Self {
-            uri: shared_mongo().unwrap(),
-            name: unique_name("migrate"),
+            place: folder.path().join("store.db").display().to_string(),
+            folder: Some(folder),
         }
     }
 
-    async fn open(&self, migrations: &Migrations) -> Result<MongoStore, StoreError> {
-        MongoStore::open_with(&self.uri, &self.name, migrations).await
+    fn database() -> Self {
+        Self {
+            place: unique_name("migrate"),
+            folder: None,
+        }
+    }
+
+    fn is_file(&self) -> bool {
+        self.folder.is_some()
+    }
+
+    async fn open(&self, migrations: &Migrations) -> Result<Arc<dyn FullStore>, StoreError> {
+        open(&self.place, migrations).await
     }
 
     async fn pending(&self, migrations: &Migrations) -> Vec<String> {
-        MongoStore::plan(&self.uri, &self.name, migrations)
-            .await
-            .unwrap()
-            .pending
+        let plan = match self.is_file() {
+            true => SqliteStore::plan(Path::new(&self.place), migrations).await,
+            false => MongoStore::plan(&shared_mongo().unwrap(), &self.place, migrations).await,
+        };
+        plan.unwrap().pending
+    }
+
+    fn command(&self, command: &Value) {
+        mongo_command(&shared_mongo().unwrap(), &self.place, command).unwrap();
+    }
+
+    /// Migrates in a process of its own, which dies where it is told.
+    fn migrate_and_die(&self, at: &str) {
+        let mut victim = Command::new(std::env::current_exe().unwrap());
+        victim.args([
+            "--ignored",
+            "--exact",
+            "--nocapture",
+            "stores::migrations::migrates_and_dies",
+        ]);
+        victim
+            .env(VICTIM, &self.place)
+            .env(VICTIM_DIES, at)
+            .stdin(Stdio::null());
+        if !self.is_file() {
+            victim.env("BLAZE_TEST_MONGODB_URI", shared_mongo().unwrap());
+        }
+        let output = victim.output().unwrap();
+        let text = String::from_utf8_lossy(&output.stdout);
+        let faults = String::from_utf8_lossy(&output.stderr);
+        assert!(
+            text.contains("migrating") && !output.status.success(),
+            "{at}: {text}{faults}"
+        );
+        if !self.is_file() {
+            // A lease whose holder was killed runs out; tests do not wait for that.
+            self.command(&json!({ "update": "meta", "updates": [
+                { "q": { "_id": "lease" }, "u": { "$set": { "until": { "$date": { "$numberLong": "0" } } } } },
+            ] }));
+        }
     }
 }
 
-impl Drop for Database {
+impl Drop for Home {
     fn drop(&mut self) {
-        // What stays goes with the server.
-        let _ = drop_mongo_database(&self.uri, &self.name);
+        if !self.is_file() {
+            // What stays goes with the server.
+            let _ = drop_mongo_database(&shared_mongo().unwrap(), &self.place);
+        }
     }
 }
 
-/// A migration for tests: a collection, a rewriting of all documents, an index.
+/// A migration for tests: a table, a rewriting of all documents, another table.
 fn further() -> Migration {
-    let command = |name: &'static str, text: &'static str| Step {
+    let step = |name: &'static str, action: Action| Step {
         name: Cow::Borrowed(name),
-        action: Action::Command(Cow::Borrowed(text)),
+        action,
     };
+    let rewrite = || Action::Rewrite {
+        text: Cow::Borrowed("mark"),
+        function: mark,
+    };
+    let sql = |text: &'static str| Action::Sql(Cow::Borrowed(text));
+    let command = |text: &'static str| Action::Command(Cow::Borrowed(text));
     Migration {
         number: 2,
         name: Cow::Borrowed("test"),
         min_version: 1,
-        sqlite: Vec::new(),
+        sqlite: vec![
+            step("before", sql("CREATE TABLE before (id INTEGER PRIMARY KEY) STRICT")),
+            step("mark", rewrite()),
+            step("after", sql("CREATE TABLE after (id INTEGER PRIMARY KEY) STRICT")),
+        ],
         mongodb: vec![
-            command("before", r#"{"create":"further"}"#),
-            Step {
-                name: Cow::Borrowed("mark"),
-                action: Action::Rewrite {
-                    text: Cow::Borrowed("mark"),
-                    function: mark,
-                },
-            },
-            command(
+            step("before", command(r#"{"create":"further"}"#)),
+            step("mark", rewrite()),
+            step(
                 "after",
-                r#"{"createIndexes":"further","indexes":[{"key":{"a":1},"name":"a"}]}"#,
+                command(r#"{"createIndexes":"further","indexes":[{"key":{"a":1},"name":"a"}]}"#),
             ),
         ],
     }
@@ -97,37 +166,11 @@ fn mark(document: &Document) -> Option<Document> {
     Some(new)
 }
 
-/// Migrates in a process of its own, which dies where it is told.
-fn migrate_and_die(database: &Database, at: &str) {
-    let output = Command::new(std::env::current_exe().unwrap())
-        .args([
-            "--ignored",
-            "--exact",
-            "--nocapture",
-            "stores::migrations::migrates_and_dies",
-        ])
-        .env("BLAZE_TEST_MONGODB_URI", &database.uri)
-        .env(VICTIM_DATABASE, &database.name)
-        .env(VICTIM_DIES, at)
-        .stdin(Stdio::null())
-        .output()
-        .unwrap();
-    let text = String::from_utf8_lossy(&output.stdout);
-    assert!(
-        text.contains("migrating"),
-        "{at}: {text}{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
-    assert!(!output.status.success(), "{at}: {text}");
-}
-
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-#[ignore = "started by a_migration_that_is_killed_goes_on, which needs its death"]
+#[ignore = "started by the tests of migrations that are killed, which need its death"]
 async fn migrates_and_dies() {
-    let Some(database) = std::env::var_os(VICTIM_DATABASE) else {
-        return;
-    };
-    let at = std::env::var_os(VICTIM_DIES).unwrap_or_default().into_string().unwrap();
+    let Ok(place) = std::env::var(VICTIM) else { return };
+    let at = std::env::var(VICTIM_DIES).unwrap_or_default();
     println!("\nmigrating");
     if let Ok(documents) = at.parse() {
         LEFT.store(documents, Ordering::Relaxed);
@@ -139,40 +182,37 @@ async fn migrates_and_dies() {
                 std::process::abort();
             }
         }));
-    let uri = shared_mongo().unwrap();
-    MongoStore::open_with(&uri, &database.to_string_lossy(), &migrations)
-        .await
-        .unwrap()
-        .close()
-        .await;
-}
-
-/// A lease whose holder was killed runs out; tests do not wait for that.
-async fn end_lease(database: &Database) {
-    let now_free = json!({ "update": "meta", "updates": [
-        { "q": { "_id": "lease" }, "u": { "$set": { "until": { "$date": { "$numberLong": "0" } } } } },
-    ] });
-    blaze_tests::servers::mongo_command(&database.uri, &database.name, &now_free).unwrap();
+    open(&place, &migrations).await.unwrap().close().await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_migration_that_is_killed_goes_on() {
-    let database = Database::new();
+async fn a_migration_of_a_file_that_is_killed_goes_on() {
+    goes_on_when_killed(Home::file()).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_migration_of_a_database_that_is_killed_goes_on() {
+    goes_on_when_killed(Home::database()).await;
+}
+
+async fn goes_on_when_killed(home: Home) {
     let own = Migrations::default();
-    let all = database.pending(&own).await;
-    // Of a new database, too: after each step.
-    for label in &all {
-        migrate_and_die(&database, label);
-        end_lease(&database).await;
+    // Of a new store, too: after each step.
+    for label in &home.pending(&own).await {
+        home.migrate_and_die(label);
     }
-    assert_eq!(database.pending(&own).await, Vec::<String>::new());
-    let store = database.open(&own).await.unwrap();
+    assert_eq!(home.pending(&own).await, Vec::<String>::new());
+    let mut before = home.open(&own).await.unwrap();
     let mut ledger = Ledger::new();
     for _ in 0..COMMITS {
-        write_through(&store, &mut ledger).await;
+        write_through(&*before, &mut ledger).await;
+    }
+    if home.is_file() {
+        before.close().await;
     }
     let migrations = Migrations::default().and([further()]);
     let mut pending = 3;
+    // After each step, and within the rewriting of documents and versions.
     for (at, done) in [
         ("0002 test/before", 1),
         ("1", 0),
@@ -180,36 +220,29 @@ async fn a_migration_that_is_killed_goes_on() {
         ("0002 test/mark", 1),
         ("0002 test/after", 1),
     ] {
-        migrate_and_die(&database, at);
-        end_lease(&database).await;
+        home.migrate_and_die(at);
         pending -= done;
-        assert_eq!(database.pending(&migrations).await.len(), pending, "{at}");
+        assert_eq!(home.pending(&migrations).await.len(), pending, "{at}");
     }
-    // The process of before went on all the time, and still does.
-    write_through(&store, &mut ledger).await;
-    check(&store, &ledger).await;
-    let snapshot = database.open(&migrations).await.unwrap().load().await.unwrap();
-    let marked = snapshot
-        .documents
-        .iter()
-        .filter(|document| document.annotations.contains_key(MARK))
-        .count();
-    assert_eq!(
-        marked,
-        usize::try_from(COMMITS).unwrap(),
-        "all but the two of the last commit"
-    );
+    // A program of before goes on, as `min_version` did not rise; on a database it was there all the time.
+    if home.is_file() {
+        before = home.open(&own).await.unwrap();
+    }
+    write_through(&*before, &mut ledger).await;
+    check(&*before, &ledger).await;
+    before.close().await;
+    let snapshot = home.open(&migrations).await.unwrap().load().await.unwrap();
+    let is_marked = |document: &&Document| document.annotations.contains_key(MARK);
+    let marked = snapshot.documents.iter().filter(is_marked).count();
+    let all_but_the_last_two = usize::try_from(COMMITS).unwrap();
+    assert_eq!(marked, all_but_the_last_two);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn several_that_start_at_once_migrate_once() {
-    let database = Database::new();
+    let home = Home::database();
     let migrations = Migrations::default().and([further()]);
-    let (a, b, c) = tokio::join!(
-        database.open(&migrations),
-        database.open(&migrations),
-        database.open(&migrations)
-    );
+    let (a, b, c) = tokio::join!(home.open(&migrations), home.open(&migrations), home.open(&migrations));
     let stores = [a.unwrap(), b.unwrap(), c.unwrap()];
     let mut ids = Vec::new();
     for store in &stores {
@@ -224,72 +257,74 @@ async fn several_that_start_at_once_migrate_once() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_program_that_is_too_old_refuses_to_start() {
-    let database = Database::new();
-    let mut newer = further();
-    newer.min_version = 2;
-    database
-        .open(&Migrations::default().and([newer]))
-        .await
-        .unwrap()
-        .close()
-        .await;
-    let error = database.open(&Migrations::default()).await.err().unwrap();
-    assert!(
-        matches!(&error, StoreError::Refused(text) if text.contains("newer blaze-config")),
-        "{error}"
-    );
+async fn a_file_of_schema_1_is_read_and_migrated() {
+    let home = Home::file();
+    let connection = rusqlite::Connection::open(&home.place).unwrap();
+    connection.execute_batch(SQL_1).unwrap();
+    drop(connection);
+    schema_1_is_read_and_migrated(&home).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_database_of_schema_1_is_read_and_migrated() {
-    let database = Database::new();
+    let home = Home::database();
     // Collections and indexes as the migration makes them.
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../migrations/0001_first.mongodb");
     let files = std::fs::read_dir(folder).unwrap();
     let files: BTreeSet<_> = files.map(|file| file.unwrap().path()).collect();
     for file in files {
-        let command: Value = serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap();
-        mongo_command(&database.uri, &database.name, &command).unwrap();
+        home.command(&serde_json::from_str(&std::fs::read_to_string(file).unwrap()).unwrap());
     }
-    for line in SCHEMA_1.lines() {
+    for line in MONGO_1.lines() {
         let line: Value = serde_json::from_str(line).unwrap();
         let table = line["collection"].as_str().unwrap();
-        mongo_insert(&database.uri, &database.name, table, &line["document"]).unwrap();
+        mongo_insert(&shared_mongo().unwrap(), &home.place, table, &line["document"]).unwrap();
     }
+    schema_1_is_read_and_migrated(&home).await;
+}
+
+async fn schema_1_is_read_and_migrated(home: &Home) {
     assert_eq!(
-        database.pending(&Migrations::default()).await,
+        home.pending(&Migrations::default()).await,
         Vec::<String>::new(),
         "its checksum is the released one"
     );
     for migrations in [Migrations::default(), Migrations::default().and([further()])] {
-        let store = database.open(&migrations).await.unwrap();
+        let store = home.open(&migrations).await.unwrap();
         let snapshot = store.load().await.unwrap();
         assert_eq!((snapshot.revision, snapshot.floor), (5, 2));
         assert_eq!(snapshot.store_id, "0197c1d2-7f3a-7b64-9c1e-2f6f0a4e8d11");
-        let mut keys: Vec<String> = snapshot
-            .documents
-            .iter()
-            .map(|document| document.key.to_string())
-            .collect();
+        let documents = snapshot.documents.iter();
+        let mut keys: Vec<String> = documents.clone().map(|document| document.key.to_string()).collect();
         keys.sort();
         assert_eq!(keys, ["Instance/slam/0", "Layer/edge", "Service/slam"]);
+        let slam = documents
+            .clone()
+            .find(|document| document.key.to_string() == "Service/slam");
+        let slam = slam.unwrap();
+        assert_eq!(slam.spec["config"]["camera"]["rate_hz"], json!(15));
+        assert_eq!(slam.labels["site"], "lab");
         let key: Key = "Node/robot-1".parse().unwrap();
         let history = store.versions(&key, None, 10).await.unwrap();
-        assert_eq!(
-            history.iter().map(|version| version.change.op).collect::<Vec<_>>(),
-            [Op::Delete, Op::Create]
-        );
+        let ops: Vec<Op> = history.iter().map(|version| version.change.op).collect();
+        assert_eq!(ops, [Op::Delete, Op::Create]);
         assert_eq!(store.commits_after(2, 10).await.unwrap().commits.len(), 3);
-        assert_eq!(store.documents_at(2, 5).await.unwrap().len(), 3);
-        assert_eq!(store.tokens(Timestamp::from_millis(0)).await.unwrap().len(), 1);
-        assert!(
-            store
-                .idempotency("request", Timestamp::from_millis(0))
-                .await
-                .unwrap()
-                .is_some()
-        );
+        let before = store.documents_at(2, 5).await.unwrap();
+        assert_eq!(before.len(), 3);
+        let held = before.iter().filter(|(_, document)| document.is_some());
+        let held: Vec<String> = held.map(|(key, _)| key.to_string()).collect();
+        assert_eq!(held, ["Node/robot-1"]);
+        if home.is_file() {
+            // A database gives no entry that is older than it keeps them.
+            let query = AuditQuery {
+                limit: 10,
+                ..AuditQuery::default()
+            };
+            assert_eq!(store.audit(&query).await.unwrap().len(), 2);
+        }
+        let begin = Timestamp::from_millis(0);
+        assert_eq!(store.tokens(begin).await.unwrap().len(), 1);
+        assert!(store.idempotency("request", begin).await.unwrap().is_some());
         store.close().await;
     }
 }

@@ -1,4 +1,4 @@
-//! MongoDB as a store of the configuration: the rules for all stores, outages, processes that are killed, migrations.
+//! The stores of the configuration: the rules for all of them, outages, processes that are killed, migrations.
 //!
 //! Needs `scripts/services install`.
 
@@ -6,8 +6,6 @@ mod alone;
 mod killed;
 mod migrations;
 mod outages;
-mod rates;
 mod refused;
 mod rules;
-mod sqlite;
 mod support;

@@ -1,14 +1,11 @@
 //! The server is killed and stands still.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use blaze_config::store::{CommitError, CommitLog as _, MongoStore, StoreError};
-use blaze_tests::servers::MongoServer;
 use blaze_tests::within;
 
-use super::support::{Ledger, Told, check, record, server, store, write_one, write_through};
+use super::support::{Ledger, Told, check, record, server, store, write_through};
 
 /// The store is to show within two seconds that it is lost.
 const SHOWS: Duration = Duration::from_millis(2_500);
@@ -130,56 +127,4 @@ async fn what_was_sent_to_a_server_that_stands_still_is_not_refused() {
 async fn check_with_unknown(store: &MongoStore, ledger: &mut Ledger) {
     write_through(store, ledger).await;
     check(store, ledger).await;
-}
-
-/// Every write counts as yes, no or unknown, and yes and no hold exactly, while the server is killed again and again.
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_a_writer_is_told_is_true_while_the_server_is_killed() {
-    let server = Arc::new(server());
-    let stores = [store(&server).await, store(&server).await];
-    let over = Arc::new(AtomicBool::new(false));
-    let write = async |store: &MongoStore| {
-        let mut ledger = Ledger::new();
-        while !over.load(Ordering::Acquire) {
-            if write_one(store, &mut ledger).await.is_none() {
-                tokio::time::sleep(Duration::from_millis(20)).await;
-            }
-        }
-        ledger
-    };
-    let kills = if blaze_tests::long() { 20 } else { 4 };
-    let killer = tokio::task::spawn_blocking({
-        let (server, over) = (Arc::clone(&server), Arc::clone(&over));
-        move || kill_often(&server, &over, kills)
-    });
-    let (one, other) = tokio::join!(write(&stores[0]), write(&stores[1]));
-    killer.await.unwrap();
-    let mut ledger = one;
-    ledger.extend(other);
-    write_through(&stores[0], &mut ledger).await;
-    let count = |told: Told| ledger.values().filter(|found| **found == told).count();
-    println!(
-        "yes {} no {} unknown {}",
-        count(Told::Yes),
-        count(Told::No),
-        count(Told::Unknown)
-    );
-    check(&stores[1], &ledger).await;
-    assert!(count(Told::Yes) > 20);
-}
-
-fn kill_often(server: &MongoServer, over: &AtomicBool, kills: u32) {
-    for round in 0..kills {
-        // Not on a condition: it is to hit whatever is under way.
-        std::thread::sleep(Duration::from_millis(700 + u64::from(round) * 37));
-        if round % 4 == 3 {
-            server.freeze().unwrap();
-            std::thread::sleep(Duration::from_millis(1_500));
-            server.thaw().unwrap();
-        } else {
-            server.restart().unwrap();
-        }
-    }
-    std::thread::sleep(Duration::from_millis(700));
-    over.store(true, Ordering::Release);
 }

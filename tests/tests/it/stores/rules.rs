@@ -1,12 +1,14 @@
-//! The rules for all stores, on the MongoDB that all tests share.
+//! The rules for all stores, on the MongoDB that all tests share and on files.
 
 use std::sync::Arc;
 
 use async_trait::async_trait;
-use blaze_config::store::{Archive as _, CommitLog as _, FullStore, MongoStore};
+use blaze_config::store::{Archive as _, CommitLog as _, FullStore, MongoStore, SqliteStore};
 use blaze_conformance::store::Fixture;
+use blaze_runtime::Supervisor;
 use blaze_tests::servers::{drop_mongo_database, mongo_command, shared_mongo, unique_name};
 use parking_lot::Mutex;
+use tempfile::TempDir;
 
 use super::support::record;
 
@@ -30,12 +32,11 @@ impl Databases {
 
 #[async_trait]
 impl Fixture for Databases {
-    async fn open(&self, name: &str) -> Result<Arc<dyn FullStore>, String> {
+    async fn open(&self, name: &str) -> Arc<dyn FullStore> {
         let database = format!("rules_{name}");
         self.made.lock().push(database.clone());
-        let store = MongoStore::open(&self.uri, &database).await;
-        let store = store.map_err(|error| error.to_string())?;
-        Ok(Arc::new(if self.in_a_hurry { store.in_a_hurry() } else { store }))
+        let store = MongoStore::open(&self.uri, &database).await.unwrap();
+        Arc::new(if self.in_a_hurry { store.in_a_hurry() } else { store })
     }
 
     fn is_shared(&self) -> bool {
@@ -50,6 +51,37 @@ impl Drop for Databases {
             let _ = drop_mongo_database(&self.uri, database);
         }
     }
+}
+
+/// Files of one test.
+struct Files {
+    folder: TempDir,
+    supervisor: Supervisor,
+}
+
+impl Files {
+    fn new() -> Self {
+        Self {
+            folder: tempfile::tempdir().unwrap(),
+            supervisor: Supervisor::new("test"),
+        }
+    }
+}
+
+#[async_trait]
+impl Fixture for Files {
+    async fn open(&self, name: &str) -> Arc<dyn FullStore> {
+        let path = self.folder.path().join(format!("{name}.db"));
+        Arc::new(SqliteStore::open(&path, &self.supervisor).await.unwrap())
+    }
+
+    fn is_shared(&self) -> bool {
+        false
+    }
+}
+
+mod on_files {
+    blaze_conformance::store_conformance_tests!(async { super::Files::new() });
 }
 
 mod usually {

@@ -76,10 +76,9 @@ pub(crate) enum Told {
 pub(crate) type Ledger = BTreeMap<String, Told>;
 
 /// Tries to write one commit behind the newest.
-pub(crate) async fn write_one(store: &MongoStore, ledger: &mut Ledger) -> Option<Told> {
+async fn write_one(store: &(impl CommitLog + ?Sized), ledger: &mut Ledger) -> Option<Told> {
     let head = store.head().await.ok()?;
     let batch = unique_name("batch");
-    begins(&batch);
     let told = match store.commit(&[record(head + 1, &batch)]).await {
         Ok(()) => Told::Yes,
         Err(CommitError::Conflict | CommitError::NotWritten(_)) => Told::No,
@@ -89,13 +88,8 @@ pub(crate) async fn write_one(store: &MongoStore, ledger: &mut Ledger) -> Option
     Some(told)
 }
 
-/// Told before it is tried, for who reads the output of a process that is killed.
-fn begins(batch: &str) {
-    println!("begins {batch}");
-}
-
 /// Writes until a commit is acknowledged. How long that took.
-pub(crate) async fn write_through(store: &MongoStore, ledger: &mut Ledger) -> Duration {
+pub(crate) async fn write_through(store: &(impl CommitLog + ?Sized), ledger: &mut Ledger) -> Duration {
     let begin = Instant::now();
     while write_one(store, ledger).await != Some(Told::Yes) {
         assert!(begin.elapsed() < Duration::from_secs(60), "nothing can be written");
@@ -106,7 +100,7 @@ pub(crate) async fn write_through(store: &MongoStore, ledger: &mut Ledger) -> Du
 
 /// What was told is what is there: yes is in the log, no is not, unknown may be; nothing else is in it, and no revision is
 /// missing. Documents and log say the same.
-pub(crate) async fn check(store: &MongoStore, ledger: &Ledger) {
+pub(crate) async fn check(store: &(impl CommitLog + ?Sized), ledger: &Ledger) {
     let mut commits: Vec<Commit> = Vec::new();
     loop {
         let from = commits.last().map_or(0, |commit| commit.revision);

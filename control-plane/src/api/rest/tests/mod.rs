@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 use tower::ServiceExt;
 
 use super::*;
-use crate::auth::Revocations;
+use crate::auth::{Authenticator, Revocations};
 use crate::core::{CoreOptions, testing};
 use crate::secrets::Keyring;
 use crate::store::SqliteStore;
@@ -91,10 +91,15 @@ async fn open_with(limits: &LimitsSection) -> Api {
 
 /// Nobody has a token that is accepted.
 async fn locked(limits: &LimitsSection) -> Api {
+    guarded(limits, None).await
+}
+
+/// Tokens of these keys are accepted.
+async fn guarded(limits: &LimitsSection, authenticator: Option<Arc<Authenticator>>) -> Api {
     let supervisor = Supervisor::new("test");
     let options = CoreOptions {
         store: Arc::new(SqliteStore::in_memory(&supervisor).await.unwrap()),
-        authenticator: None,
+        authenticator,
         dev: false,
         revocations: Revocations::new(),
         keyring: Arc::new(Keyring::with_keys(&[("e1", [7; 32])]).unwrap()),
