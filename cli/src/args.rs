@@ -99,6 +99,13 @@ pub(crate) fn parse_topic(text: &str) -> Result<TopicName, String> {
     })
 }
 
+pub(crate) fn parse_seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if (0.1..=3600.0).contains(&seconds) => Ok(seconds),
+        _ => Err("it is 0.1 to 3600 seconds".to_owned()),
+    }
+}
+
 /// Host and port of an admin port.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FlowAddress {

@@ -149,6 +149,15 @@ impl CliError {
         Self::Advised(Box::new(self), advice.into())
     }
 
+    /// The same, with one more thing to do, if the main service refused with this code.
+    #[must_use]
+    pub fn hinted(self, code: &str, hint: &str) -> Self {
+        match self {
+            Self::Problem(refusal) if refusal.code() == code => Self::Problem(Box::new(refusal.with_hint(hint))),
+            other => other,
+        }
+    }
+
     /// The exit code for it.
     #[must_use]
     pub fn exit(&self) -> Exit {

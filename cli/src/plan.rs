@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 
 use crate::exit::{CliError, Exit};
 use crate::node_file;
-use crate::output::{self, Align, Format, number, render_table, terminal_width};
+use crate::output::{self, Align, Format, number, terminal_width};
 
 /// Options of `blaze plan`.
 #[derive(Debug, Args)]
@@ -227,30 +227,7 @@ fn table(planned: &[Planned], width: Option<u16>) -> String {
             output::bytes(flow.bandwidth.limit_bytes_per_s()),
             if flow.rates.feasible { "" } else { "; NOT feasible" },
         ));
-        let columns = [
-            ("TOPIC", Align::Left),
-            ("CLASS", Align::Left),
-            ("BYTES", Align::Right),
-            ("ADVERTISED/Hz", Align::Right),
-            ("TO", Align::Left),
-            ("ASKED/Hz", Align::Right),
-            ("ALLOCATED/Hz", Align::Right),
-        ];
-        let mut rows = Vec::new();
-        for (topic, rates) in flow.topics.iter().zip(&flow.rates.topics) {
-            for (lane, hz) in topic.lanes.iter().zip(&rates.lanes_hz) {
-                rows.push(vec![
-                    topic.topic.to_string(),
-                    rates.class.as_str().to_owned(),
-                    topic.bytes.to_string(),
-                    number(Some(advertised_hz(topic)), 2),
-                    lane.layer.to_string(),
-                    number(lane.max_rate_hz, 2),
-                    number(Some(*hz), 2),
-                ]);
-            }
-        }
-        text.push_str(&render_table(&columns, rows, width));
+        text.push_str(&lanes(flow, width));
         for layer in flow.rates.load_bytes_per_s.keys() {
             let (load, limit) = (flow.load(layer), flow.limit(layer));
             let own = if flow.rates.infeasible_links.contains(layer) {
@@ -268,6 +245,31 @@ fn table(planned: &[Planned], width: Option<u16>) -> String {
         text.push('\n');
     }
     text
+}
+
+fn lanes(flow: &Planned, width: Option<u16>) -> String {
+    let topics = flow.topics.iter().zip(&flow.rates.topics);
+    let lanes: Vec<_> = topics
+        .flat_map(|(topic, rates)| {
+            let lanes = topic.lanes.iter().zip(&rates.lanes_hz);
+            lanes.map(move |(lane, hz)| (topic, rates.class, lane, *hz))
+        })
+        .collect();
+    output::table(
+        &lanes,
+        width,
+        &[
+            ("TOPIC", Align::Left, &|(topic, ..)| topic.topic.to_string()),
+            ("CLASS", Align::Left, &|(_, class, ..)| class.as_str().to_owned()),
+            ("BYTES", Align::Right, &|(topic, ..)| topic.bytes.to_string()),
+            ("ADVERTISED/Hz", Align::Right, &|(topic, ..)| {
+                number(Some(advertised_hz(topic)), 2)
+            }),
+            ("TO", Align::Left, &|(_, _, lane, _)| lane.layer.to_string()),
+            ("ASKED/Hz", Align::Right, &|(_, _, lane, _)| number(lane.max_rate_hz, 2)),
+            ("ALLOCATED/Hz", Align::Right, &|(.., hz)| number(Some(*hz), 2)),
+        ],
+    )
 }
 
 #[cfg(test)]

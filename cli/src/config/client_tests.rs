@@ -21,7 +21,7 @@ async fn requests_carry_what_they_should() {
     let asked = stub.asked();
     assert_eq!(
         asked[0].line(),
-        "GET /api/v1/nodes?label_selector=a%20in%20%28b%2C%20%C3%BC%29"
+        "GET /api/v1/nodes?label_selector=a+in+%28b%2C+%C3%BC%29"
     );
     assert_eq!(asked[0].header("authorization"), Some("Bearer abc.def"));
     assert_eq!(asked[0].header("if-match"), None);

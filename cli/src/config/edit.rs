@@ -7,9 +7,7 @@
 //! The file holds the revision that was read: where it is applied later, it is the precondition.
 //! ```
 
-use std::fs::OpenOptions;
 use std::io::Write as _;
-use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
@@ -57,10 +55,12 @@ pub(super) async fn run(options: &EditOptions, format: Format) -> Result<Exit, C
     match edit(&client, &key, options.force, &editor, &std::env::temp_dir()).await? {
         Some(document) => print(&document, format, |document| {
             format!("{} is at revision {}", name_of(&key), cell(document.get("revision")))
-        })?,
-        None => note(format, "nothing was changed"),
+        }),
+        None => {
+            note(format, "nothing was changed");
+            Ok(Exit::Done)
+        }
     }
-    Ok(Exit::Done)
 }
 
 /// The document after the change; `None` if there is none.
@@ -71,10 +71,9 @@ async fn edit(
     editor: &str,
     directory: &Path,
 ) -> Result<Option<Value>, CliError> {
-    let mut answer = client.document(key, None).await?;
-    let document = std::mem::take(&mut answer.body);
-    let tag = if force { "*".to_owned() } else { client.tag(answer)? };
-    let (before, text) = shown(key, document, force);
+    let answer = client.document(key, None).await?;
+    let tag = client.tag(&answer, force)?;
+    let (before, text) = shown(key, answer.body, force);
     let file = new_file(directory, key, &text)?;
     if let Err(error) = launch(editor, &file).await {
         return Err(not_edited(error, &file, &text));
@@ -115,20 +114,17 @@ fn shown(key: &Key, document: Value, force: bool) -> (Value, String) {
 }
 
 fn new_file(directory: &Path, key: &Key, text: &str) -> Result<PathBuf, CliError> {
-    let name = name_of(key).replace('/', "-");
     let failed = |error: std::io::Error| CliError::Failed(format!("a file in {}: {error}", directory.display()));
-    for number in 0..100 {
-        let file = directory.join(format!("blaze-{name}-{}-{number}.yaml", std::process::id()));
-        match OpenOptions::new().create_new(true).write(true).mode(0o600).open(&file) {
-            Ok(mut open) => {
-                open.write_all(text.as_bytes()).map_err(failed)?;
-                return Ok(file);
-            }
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-            Err(error) => return Err(failed(error)),
-        }
-    }
-    Err(failed(std::io::Error::from(std::io::ErrorKind::AlreadyExists)))
+    let name = format!("blaze-{}-", name_of(key).replace('/', "-"));
+    // Its mode is 0600.
+    let made = tempfile::Builder::new()
+        .prefix(&name)
+        .suffix(".yaml")
+        .tempfile_in(directory);
+    let mut file = made.map_err(failed)?;
+    file.write_all(text.as_bytes()).map_err(failed)?;
+    let (_, path) = file.keep().map_err(|error| failed(error.error))?;
+    Ok(path)
 }
 
 /// Runs the editor; its variable may hold options, as in `code --wait`.

@@ -1,6 +1,8 @@
 //! How kinds and documents are written on the command line, and where they are in the API.
 
-use blaze_domain::config::{Key, KeyError, Kind};
+use std::sync::Arc;
+
+use blaze_domain::config::{Document, Key, KeyError, Kind, Labels, Timestamp};
 use blaze_domain::{DocumentName, ServiceName};
 use serde_json::Value;
 
@@ -149,6 +151,25 @@ pub(crate) fn key_of(value: &Value) -> Result<Key, String> {
         .transpose()
         .map_err(|error| format!("service {error}"))?;
     Key::new(kind, service, name).map_err(|error: KeyError| error.to_string())
+}
+
+/// A document of the server as far as the rules of the domain need it: what it refers to, and where it counts.
+///
+/// # Errors
+/// In words: what is missing or bad.
+pub(crate) fn document_of(value: &Value) -> Result<Document, String> {
+    Ok(Document {
+        key: key_of(value)?,
+        uid: String::new(),
+        revision: 0,
+        create_time: Timestamp::from_millis(0),
+        update_time: Timestamp::from_millis(0),
+        updated_by: String::new(),
+        labels: Labels::new(),
+        annotations: Labels::new(),
+        spec: Arc::new(value.get("spec").cloned().unwrap_or_default()),
+        status: value.get("status").cloned(),
+    })
 }
 
 fn unknown_kind(found: &str) -> String {

@@ -166,21 +166,7 @@ impl DemoOptions {
 }
 
 fn parse_duration(text: &str) -> Result<Duration, String> {
-    let split = text
-        .find(|c: char| !c.is_ascii_digit() && c != '.')
-        .unwrap_or(text.len());
-    let (number, unit) = text.split_at(split);
-    let scale = match unit {
-        "ms" => 0.001,
-        "" | "s" => 1.0,
-        "m" | "min" => 60.0,
-        "h" => 3600.0,
-        _ => return Err(format!("unit {unit:?} is not one of ms, s, m, h")),
-    };
-    let value: f64 = number
-        .parse()
-        .map_err(|_| format!("{text:?} is no time, for example 30s"))?;
-    let duration = Duration::try_from_secs_f64(value * scale).map_err(|error| error.to_string())?;
+    let duration = crate::config::parse_duration(text)?;
     if DURATION_RANGE.contains(&duration) {
         Ok(duration)
     } else {

@@ -9,7 +9,7 @@ use blaze_runtime::config::Sources;
 use clap::Args;
 use serde_json::{Value, json};
 
-use crate::config::node::options::has_password;
+use crate::config::node::options::{has_password, is_redis};
 use crate::demo::options::Setting;
 use crate::exit::CliError;
 use crate::node_file;
@@ -64,12 +64,7 @@ impl FromStr for DevBroker {
             url if has_password(url) => {
                 Err("a password does not belong here: --set brokers.node.redis.password_file=FILE".to_owned())
             }
-            url if ["redis://", "rediss://", "redis+unix://", "unix://"]
-                .iter()
-                .any(|scheme| url.starts_with(scheme)) =>
-            {
-                Ok(Self::Redis(url.to_owned()))
-            }
+            url if is_redis(url) => Ok(Self::Redis(url.to_owned())),
             _ => Err("it is memory, redis or redis://HOST:PORT".to_owned()),
         }
     }

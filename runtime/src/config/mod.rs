@@ -35,7 +35,7 @@ pub use follow::{Follower, Keys, follow};
 pub use overlay::{Overlay, Verdict};
 pub use place::{LocatedFault, Place};
 pub use watch::{Current, WatchSettings, watch, watch_with};
-pub use yaml::yaml_documents;
+pub use yaml::{located_documents, yaml_documents};
 
 /// A path and what is to be said of it.
 pub type Remark = (String, String);
