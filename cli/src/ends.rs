@@ -1,27 +1,12 @@
 //! What ends a command that runs on: a signal, or a part of it that failed.
 
-use blaze_runtime::Supervisor;
-use tokio::signal::unix::{Signal, SignalKind, signal};
+use blaze_runtime::{Signals, Supervisor};
 use tokio::sync::Mutex;
 
 use crate::exit::CliError;
 
-/// Ctrl-C and SIGTERM, from its making on.
-struct Signals([Signal; 2]);
-
-impl Signals {
-    fn new() -> Result<Self, CliError> {
-        let listen = |kind| signal(kind).map_err(|error| CliError::Failed(format!("no signal handlers: {error}")));
-        Ok(Self([listen(SignalKind::interrupt())?, listen(SignalKind::terminate())?]))
-    }
-
-    async fn next(&mut self) {
-        let [interrupt, terminate] = &mut self.0;
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-        }
-    }
+fn signals() -> Result<Signals, CliError> {
+    Signals::new().map_err(|error| CliError::Failed(format!("no signal handlers: {error}")))
 }
 
 /// Waits for Ctrl-C or SIGTERM.
@@ -29,7 +14,7 @@ impl Signals {
 /// # Errors
 /// [`CliError::Failed`] when the system gives no signal handlers.
 pub(crate) async fn interrupted() -> Result<(), CliError> {
-    Signals::new()?.next().await;
+    signals()?.recv().await;
     Ok(())
 }
 
@@ -44,7 +29,7 @@ impl Ends {
     /// [`CliError::Failed`] when the system gives no signal handlers.
     pub(crate) fn new(supervisor: Supervisor) -> Result<Self, CliError> {
         Ok(Self {
-            signals: Mutex::new(Signals::new()?),
+            signals: Mutex::new(signals()?),
             supervisor,
         })
     }
@@ -59,6 +44,6 @@ impl Ends {
 
     /// Waits for a signal.
     pub(crate) async fn signal(&self) {
-        self.signals.lock().await.next().await;
+        self.signals.lock().await.recv().await;
     }
 }

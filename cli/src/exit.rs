@@ -1,5 +1,6 @@
 //! What a command ends with.
 
+use std::fmt;
 use std::process::ExitCode;
 
 use serde_json::{Value, json};
@@ -48,6 +49,12 @@ impl From<Exit> for ExitCode {
     fn from(exit: Exit) -> Self {
         Self::from(exit as u8)
     }
+}
+
+/// Faults, one a line, as they stand below a sentence.
+pub(crate) fn lines(faults: &[impl fmt::Display]) -> String {
+    let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
+    lines.join("\n  ")
 }
 
 /// Why a command did not do what was asked.

@@ -2,19 +2,18 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use blaze_domain::node_file::{
-    BandwidthSection, Fault, FlowSection, FlowSource, PlanFile, PlannedClass, PlannedFlow, PlannedTopic,
+    BandwidthSection, FlowSection, FlowSource, PlanFile, PlannedClass, PlannedFlow, PlannedTopic,
 };
 use blaze_domain::{FlowId, LayerName};
 use blaze_flow::limit::allocate::Class;
 use blaze_flow::limit::rates::{Budgets, Demand, LaneDemand, Rates, rates, terms};
-use blaze_runtime::config::{Schema, Sources, load_typed};
+use blaze_runtime::config::{Sources, load_typed, schema};
 use clap::Args;
 use serde_json::{Value, json};
 
-use crate::exit::{CliError, Exit};
+use crate::exit::{CliError, Exit, lines};
 use crate::node_file;
 use crate::output::{self, Align, Format, number, terminal_width};
 
@@ -67,16 +66,10 @@ pub fn run(options: &PlanOptions, format: Format) -> Result<Exit, CliError> {
 }
 
 fn read(file: &Path) -> Result<PlanFile, CliError> {
-    let remarks =
-        |faults: Vec<Fault>| -> Vec<_> { faults.into_iter().map(|fault| (fault.path, fault.detail)).collect() };
-    let schema: Schema<PlanFile> =
-        Arc::new(move |tree| PlanFile::read(tree).map(|plan| (plan, Vec::new())).map_err(remarks));
+    let schema = schema(|tree| PlanFile::read(tree).map(|plan| (plan, Vec::new())));
     load_typed(&Sources::of_file(file), &schema)
         .map(|loaded| loaded.value)
-        .map_err(|faults| {
-            let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
-            CliError::Invalid(format!("the plan has faults:\n  {}", lines.join("\n  ")))
-        })
+        .map_err(|faults| CliError::Invalid(format!("the plan has faults:\n  {}", lines(&faults))))
 }
 
 /// One flow with its rates.

@@ -212,24 +212,17 @@ mod tests {
     }
 
     fn left(directory: &Path) -> Vec<PathBuf> {
-        std::fs::read_dir(directory)
-            .unwrap()
-            .map(|entry| entry.unwrap().path())
-            .collect()
+        let entries = std::fs::read_dir(directory).unwrap();
+        entries.map(|entry| entry.unwrap().path()).collect()
     }
+
+    const TO_MOBILE: &str = "sed -i s/static/mobile/";
 
     #[tokio::test]
     async fn what_was_edited_replaces_what_was_read() {
         let directory = tempfile::tempdir().unwrap();
         let stub = stub(200).await;
-        let done = edit(
-            &stub.client(),
-            &key(),
-            false,
-            "sed -i s/static/mobile/",
-            directory.path(),
-        )
-        .await;
+        let done = edit(&stub.client(), &key(), false, TO_MOBILE, directory.path()).await;
         assert_eq!(done.unwrap().unwrap()["revision"], 412);
         let put = stub.asked().pop().unwrap();
         assert_eq!(put.line(), "PUT /api/v1/nodes/robot-1");
@@ -245,29 +238,15 @@ mod tests {
     async fn nothing_is_sent_where_nothing_was_changed_or_the_editor_failed() {
         let directory = tempfile::tempdir().unwrap();
         let stub = stub(200).await;
-        let client = stub.client();
-        assert!(
-            edit(&client, &key(), false, "true", directory.path())
-                .await
-                .unwrap()
-                .is_none()
-        );
-        let error = edit(&client, &key(), false, "false", directory.path())
-            .await
-            .unwrap_err();
+        let (client, key) = (stub.client(), key());
+        let edited = |editor: &'static str| edit(&client, &key, false, editor, directory.path());
+        assert!(edited("true").await.unwrap().is_none());
+        let error = edited("false").await.unwrap_err();
         assert!(error.to_string().contains("nothing was changed"), "{error}");
         assert!(!error.to_string().contains("What "), "{error}");
         assert!(left(directory.path()).is_empty());
         // It wrote something and failed then.
-        let error = edit(
-            &client,
-            &key(),
-            false,
-            "false $(sed -i s/static/mobile/ \"$1\")",
-            directory.path(),
-        )
-        .await
-        .unwrap_err();
+        let error = edited("false $(sed -i s/static/mobile/ \"$1\")").await.unwrap_err();
         assert!(
             error.to_string().contains("What the editor left behind is in"),
             "{error}"
@@ -276,52 +255,35 @@ mod tests {
         assert!(stub.asked().iter().all(|asked| asked.method == "GET"));
     }
 
+    /// The file is fenced by the revision that was read, except for whoever forces a change: he wants no precondition.
     #[tokio::test]
     async fn a_conflict_keeps_the_file_and_says_how_to_go_on() {
-        let directory = tempfile::tempdir().unwrap();
-        let stub = stub(412).await;
-        let client = stub.client();
-        let error = edit(&client, &key(), true, "sed -i s/static/mobile/", directory.path())
-            .await
-            .unwrap_err();
-        assert_eq!(error.exit() as u8, 5);
-        assert_eq!(stub.asked().pop().unwrap().header("if-match"), Some("*"));
-        let files = left(directory.path());
-        assert!(
-            error
-                .to_string()
-                .contains(&format!("blaze diff -f {}", files[0].display())),
-            "{error}"
-        );
-        let text = std::fs::read_to_string(&files[0]).unwrap();
-        // Whoever forces a change wants no precondition.
-        assert!(text.contains("type: mobile") && !text.contains("revision"), "{text}");
-    }
-
-    #[tokio::test]
-    async fn what_stays_is_fenced_by_the_revision_that_was_read() {
-        let directory = tempfile::tempdir().unwrap();
-        let stub = stub(412).await;
-        let error = edit(
-            &stub.client(),
-            &key(),
-            false,
-            "sed -i s/static/mobile/",
-            directory.path(),
-        )
-        .await
-        .unwrap_err();
-        assert_eq!(error.exit() as u8, 5);
-        // The revision is the precondition of `apply`; here the entity tag is.
-        assert_eq!(stub.asked().pop().unwrap().json().get("revision"), None);
-        let file = left(directory.path()).remove(0);
-        let kept = files::read(&[file]).unwrap();
-        assert_eq!(kept[0].value["revision"], 412);
-        assert_eq!(kept[0].value["spec"]["type"], "mobile");
-        assert!(
-            error.to_string().contains("set its `revision` to the one of now"),
-            "{error}"
-        );
+        for (force, tag, revision, advice) in [
+            (true, "*", Value::Null, "blaze diff -f "),
+            (false, "\"412\"", json!(412), "set its `revision` to the one of now"),
+        ] {
+            let directory = tempfile::tempdir().unwrap();
+            let stub = stub(412).await;
+            let error = edit(&stub.client(), &key(), force, TO_MOBILE, directory.path())
+                .await
+                .unwrap_err();
+            assert_eq!(error.exit() as u8, 5);
+            let put = stub.asked().pop().unwrap();
+            assert_eq!(put.header("if-match"), Some(tag));
+            // The revision is the precondition of `apply`; here the entity tag is.
+            assert_eq!(put.json().get("revision"), None);
+            let file = left(directory.path()).remove(0);
+            let text = error.to_string();
+            assert!(
+                text.contains(advice) && text.contains(&file.display().to_string()),
+                "{text}"
+            );
+            let kept = &files::read(&[file]).unwrap()[0].value;
+            assert_eq!(
+                (&kept["revision"], &kept["spec"]["type"]),
+                (&revision, &json!("mobile"))
+            );
+        }
     }
 
     #[tokio::test]

@@ -203,23 +203,13 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::args::{Arguments, Command};
+    use crate::args::tests::config;
     use crate::config::ConfigCommand;
-    use clap::Parser as _;
-
-    fn options(line: &str) -> GetOptions {
-        let words = ["blaze", "get"].into_iter().chain(line.split_whitespace());
-        match Arguments::try_parse_from(words).unwrap().command {
-            Command::Config(command) => match *command {
-                ConfigCommand::Get(options) => options,
-                other => panic!("{other:?}"),
-            },
-            other => panic!("{other:?}"),
-        }
-    }
 
     fn check(line: &str, output: Output) -> Result<(), CliError> {
-        let options = options(line);
+        let ConfigCommand::Get(options) = config(&format!("get {line}")).unwrap() else {
+            panic!("{line}");
+        };
         let key = options.document.target.optional_key(options.document.name.as_deref())?;
         options.check(key.as_ref(), output)
     }

@@ -1,8 +1,6 @@
 //! How kinds and documents are written on the command line, and where they are in the API.
 
-use std::sync::Arc;
-
-use blaze_domain::config::{Document, Key, KeyError, Kind, Labels, Timestamp};
+use blaze_domain::config::{Document, Key, KeyError, Kind};
 use blaze_domain::{DocumentName, ServiceName};
 use serde_json::Value;
 
@@ -159,16 +157,8 @@ pub(crate) fn key_of(value: &Value) -> Result<Key, String> {
 /// In words: what is missing or bad.
 pub(crate) fn document_of(value: &Value) -> Result<Document, String> {
     Ok(Document {
-        key: key_of(value)?,
-        uid: String::new(),
-        revision: 0,
-        create_time: Timestamp::from_millis(0),
-        update_time: Timestamp::from_millis(0),
-        updated_by: String::new(),
-        labels: Labels::new(),
-        annotations: Labels::new(),
-        spec: Arc::new(value.get("spec").cloned().unwrap_or_default()),
         status: value.get("status").cloned(),
+        ..Document::new(key_of(value)?, value.get("spec").cloned().unwrap_or_default())
     })
 }
 

@@ -18,12 +18,8 @@ use crate::exit::CliError;
 /// # Errors
 /// As [`Client::new`].
 pub(crate) fn client(rest: SocketAddr) -> Result<Client, CliError> {
-    Client::new(Endpoint {
-        url: parse_server(&format!("http://{rest}")).map_err(CliError::Failed)?,
-        ca_file: None,
-        client_certificate: None,
-        token: None,
-    })
+    let url = parse_server(&format!("http://{rest}")).map_err(CliError::Failed)?;
+    Client::new(Endpoint::at(url))
 }
 
 /// Makes those of `own` that are not there, then applies `sources`. Gives the revision after it.

@@ -15,8 +15,8 @@ use super::options::ServerOptions;
 use super::stream::{Lost, Told, Watcher};
 use super::text::{json_line, list, member, note, whole};
 use super::yaml;
-use crate::exit::{CliError, Exit};
 use crate::ends::interrupted;
+use crate::exit::{CliError, Exit};
 use crate::output::{self, Format};
 
 /// Options of `blaze watch`.

@@ -16,9 +16,7 @@ use blaze_brokers::{Broker, BrokerKind, Health, OpenError, Role, open_layer, ope
 use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
 use blaze_domain::{InstanceName, Reliability, Scope, ServiceName, TopicName};
 use blaze_runtime::config::Sources;
-use blaze_sdk::{
-    FlowError, Lease, Message, Request, ServiceManager, ServiceOptions, SubscribeOptions, Subscription,
-};
+use blaze_sdk::{FlowError, Lease, Message, Request, ServiceManager, ServiceOptions, SubscribeOptions, Subscription};
 use clap::Args;
 
 use crate::args::parse_topic;
