@@ -99,6 +99,13 @@ pub(crate) fn parse_topic(text: &str) -> Result<TopicName, String> {
     })
 }
 
+pub(crate) fn parse_seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if (0.1..=3600.0).contains(&seconds) => Ok(seconds),
+        _ => Err("it is 0.1 to 3600 seconds".to_owned()),
+    }
+}
+
 /// Host and port of an admin port.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FlowAddress {
@@ -188,13 +195,19 @@ impl fmt::Display for Destination {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use clap::CommandFactory as _;
-    use clap::error::ErrorKind;
 
-    fn refused(line: &[&str]) -> clap::Error {
-        Arguments::try_parse_from(line).unwrap_err()
+    pub(crate) fn parse(line: &str) -> Result<Arguments, clap::Error> {
+        Arguments::try_parse_from(["blaze"].into_iter().chain(line.split_whitespace()))
+    }
+
+    pub(crate) fn config(line: &str) -> Result<ConfigCommand, clap::Error> {
+        match parse(line)?.command {
+            Command::Config(command) => Ok(*command),
+            other => panic!("{other:?}"),
+        }
     }
 
     #[test]
@@ -203,26 +216,26 @@ mod tests {
     }
 
     #[test]
-    fn a_misspelt_command_gets_a_suggestion() {
-        let error = refused(&["blaze", "topcis"]);
-        assert_eq!(error.exit_code(), 2);
-        assert!(error.to_string().contains("'topics'"), "{error}");
-    }
-
-    #[test]
-    fn a_leading_slash_gets_a_suggestion() {
-        let error = refused(&["blaze", "why", "/imu/data"]);
-        assert!(error.to_string().contains("did you mean imu/data?"), "{error}");
-        assert_eq!(error.kind(), ErrorKind::ValueValidation);
+    fn slips_get_a_suggestion() {
+        for (line, meant) in [
+            ("topcis", "'topics'"),
+            ("why /imu/data", "did you mean imu/data?"),
+            ("aply -f a", "'apply'"),
+            ("get servces", "did you mean services?"),
+            ("watch instnace", "did you mean instance?"),
+            ("token create --subject s --role operater", "operator"),
+            ("effective SLAM", "did you mean slam?"),
+        ] {
+            let error = parse(line).unwrap_err();
+            assert!(error.to_string().contains(meant), "{line}: {error}");
+            assert_eq!(error.exit_code(), 2, "{line}");
+        }
     }
 
     #[test]
     fn the_output_format_may_stand_anywhere() {
-        for line in [
-            ["blaze", "-o", "json", "why", "imu/data"],
-            ["blaze", "why", "imu/data", "-o", "json"],
-        ] {
-            assert_eq!(Arguments::try_parse_from(line).unwrap().output, Output::Json);
+        for line in ["-o json why imu/data", "why imu/data -o json"] {
+            assert_eq!(parse(line).unwrap().output, Output::Json);
         }
     }
 

@@ -30,7 +30,7 @@ use blaze_worker::settings::WorkerSettings;
 use serde_json::Value;
 use tokio::time::sleep;
 
-use crate::exit::CliError;
+use crate::exit::{CliError, lines};
 
 /// Between two looks at a worker.
 const LOOK: Duration = Duration::from_millis(10);
@@ -77,10 +77,8 @@ pub(crate) async fn follow(
 ) -> Result<FlowService, CliError> {
     let id = flow.id();
     let refused = |error: String| CliError::Usage(format!("the flow {id} cannot follow BlazeConfig: {error}"));
-    let followed = Followed::of_tree(&format!("node file of {id}"), node_file, log).map_err(|faults| {
-        let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
-        refused(lines.join("\n  "))
-    })?;
+    let followed = Followed::of_tree(&format!("node file of {id}"), node_file, log);
+    let followed = followed.map_err(|faults| refused(lines(&faults)))?;
     let service = FlowService::follow(flow, followed, cache.cloned(), supervisor, judged).await;
     let service = service.map_err(|error| refused(error.to_string()))?;
     service.ok_or_else(|| refused("it has no broker of its node or layer".to_owned()))
@@ -117,10 +115,7 @@ impl Worker {
         supervisor: &Supervisor,
     ) -> Result<Self, CliError> {
         let failed = |error: String| CliError::Failed(format!("the worker does not start: {error}"));
-        let settings = WorkerSettings::of(file).map_err(|faults| {
-            let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
-            CliError::Invalid(lines.join("\n  "))
-        })?;
+        let settings = WorkerSettings::of(file).map_err(|faults| CliError::Invalid(lines(&faults)))?;
         let keys = settings.keys.as_ref().map(RedisKeys::open).transpose();
         let keys = keys.map_err(|error| failed(error.to_string()))?.map(Arc::new);
         let (shown, readiness) = (Shown::default(), Readiness::new());

@@ -1,14 +1,26 @@
 //! What ends a command that runs on: a signal, or a part of it that failed.
 
-use blaze_runtime::Supervisor;
-use tokio::signal::unix::{SignalKind, signal};
+use blaze_runtime::{Signals, Supervisor};
 use tokio::sync::Mutex;
 
 use crate::exit::CliError;
 
+fn signals() -> Result<Signals, CliError> {
+    Signals::new().map_err(|error| CliError::Failed(format!("no signal handlers: {error}")))
+}
+
+/// Waits for Ctrl-C or SIGTERM.
+///
+/// # Errors
+/// [`CliError::Failed`] when the system gives no signal handlers.
+pub(crate) async fn interrupted() -> Result<(), CliError> {
+    signals()?.recv().await;
+    Ok(())
+}
+
 /// Listens to signals from its making on, so that an end while parts start is orderly, too.
 pub(crate) struct Ends {
-    signals: Mutex<[tokio::signal::unix::Signal; 2]>,
+    signals: Mutex<Signals>,
     supervisor: Supervisor,
 }
 
@@ -16,9 +28,8 @@ impl Ends {
     /// # Errors
     /// [`CliError::Failed`] when the system gives no signal handlers.
     pub(crate) fn new(supervisor: Supervisor) -> Result<Self, CliError> {
-        let listen = |kind| signal(kind).map_err(|error| CliError::Failed(format!("no signal handlers: {error}")));
         Ok(Self {
-            signals: Mutex::new([listen(SignalKind::interrupt())?, listen(SignalKind::terminate())?]),
+            signals: Mutex::new(signals()?),
             supervisor,
         })
     }
@@ -33,11 +44,6 @@ impl Ends {
 
     /// Waits for a signal.
     pub(crate) async fn signal(&self) {
-        let mut signals = self.signals.lock().await;
-        let [interrupt, terminate] = &mut *signals;
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-        }
+        self.signals.lock().await.recv().await;
     }
 }

@@ -1,5 +1,6 @@
 //! What a command ends with.
 
+use std::fmt;
 use std::process::ExitCode;
 
 use serde_json::{Value, json};
@@ -48,6 +49,12 @@ impl From<Exit> for ExitCode {
     fn from(exit: Exit) -> Self {
         Self::from(exit as u8)
     }
+}
+
+/// Faults, one a line, as they stand below a sentence.
+pub(crate) fn lines(faults: &[impl fmt::Display]) -> String {
+    let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
+    lines.join("\n  ")
 }
 
 /// Why a command did not do what was asked.
@@ -147,6 +154,15 @@ impl CliError {
     #[must_use]
     pub fn advised(self, advice: impl Into<String>) -> Self {
         Self::Advised(Box::new(self), advice.into())
+    }
+
+    /// The same, with one more thing to do, if the main service refused with this code.
+    #[must_use]
+    pub fn hinted(self, code: &str, hint: &str) -> Self {
+        match self {
+            Self::Problem(refusal) if refusal.code() == code => Self::Problem(Box::new(refusal.with_hint(hint))),
+            other => other,
+        }
     }
 
     /// The exit code for it.

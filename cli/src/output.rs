@@ -1,6 +1,6 @@
 //! Tables for people, JSON and YAML for programs.
 
-use std::io::Write as _;
+use std::io::Write;
 
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use serde_json::Value;
@@ -65,13 +65,18 @@ pub fn terminal_width() -> Option<u16> {
     Table::new().width()
 }
 
-/// Lays out rows under headings; wraps cells so that lines fit `width`, and does not wrap without one.
+/// A column: its heading, where its content stands, and what it shows of an item.
+pub type Column<'a, T> = (&'a str, Align, &'a dyn Fn(&T) -> String);
+
+/// Lays out items under headings; wraps cells so that lines fit `width`, and does not wrap without one.
 #[must_use]
-pub fn render_table(columns: &[(&str, Align)], rows: Vec<Vec<String>>, width: Option<u16>) -> String {
+pub fn table<T>(items: &[T], width: Option<u16>, columns: &[Column<'_, T>]) -> String {
     let mut table = Table::new();
     table.load_style(presets::NOTHING);
-    table.set_header(columns.iter().map(|(name, _)| *name));
-    table.add_rows(rows);
+    table.set_header(columns.iter().map(|(name, ..)| *name));
+    for item in items {
+        table.add_row(columns.iter().map(|(_, _, show)| show(item)));
+    }
     match width {
         Some(width) => {
             table.set_width(width);
@@ -81,7 +86,7 @@ pub fn render_table(columns: &[(&str, Align)], rows: Vec<Vec<String>>, width: Op
             table.set_content_arrangement(ContentArrangement::Disabled);
         }
     }
-    for (index, (_, align)) in columns.iter().enumerate() {
+    for (index, (_, align, _)) in columns.iter().enumerate() {
         if let Some(column) = table.column_mut(index) {
             column.set_padding((0, 2));
             if *align == Align::Right {
@@ -95,16 +100,22 @@ pub fn render_table(columns: &[(&str, Align)], rows: Vec<Vec<String>>, width: Op
 /// Writes a text to standard output, with a newline at its end.
 ///
 /// # Errors
-/// [`CliError::OutputClosed`] when nobody reads it any more, [`CliError::Failed`] for a full disk and the like.
+/// As [`write_text`].
 pub fn print(text: &str) -> Result<(), CliError> {
-    let mut out = std::io::stdout().lock();
     let newline = if text.ends_with('\n') { "" } else { "\n" };
-    write!(out, "{text}{newline}")
-        .and_then(|()| out.flush())
-        .map_err(|error| match error.kind() {
-            std::io::ErrorKind::BrokenPipe => CliError::OutputClosed,
-            _ => CliError::Failed(format!("standard output: {error}")),
-        })
+    write_text(&mut std::io::stdout().lock(), &format!("{text}{newline}"))
+}
+
+/// Writes a text as it is.
+///
+/// # Errors
+/// [`CliError::OutputClosed`] when nobody reads it any more, [`CliError::Failed`] for a full disk and the like.
+pub(crate) fn write_text(to: &mut impl Write, text: &str) -> Result<(), CliError> {
+    let written = to.write_all(text.as_bytes()).and_then(|()| to.flush());
+    written.map_err(|error| match error.kind() {
+        std::io::ErrorKind::BrokenPipe => CliError::OutputClosed,
+        _ => CliError::Failed(format!("standard output: {error}")),
+    })
 }
 
 /// An object in one of the formats for programs, or the text that `table` makes of it.
@@ -158,27 +169,22 @@ mod tests {
         }
     }
 
-    const COLUMNS: [(&str, Align); 2] = [("TOPIC", Align::Left), ("HZ", Align::Right)];
+    const COLUMNS: [Column<'_, (&str, &str)>; 2] = [
+        ("TOPIC", Align::Left, &|row| row.0.to_owned()),
+        ("HZ", Align::Right, &|row| row.1.to_owned()),
+    ];
 
     #[test]
-    fn tables_are_plain_and_aligned() {
-        let rows = vec![
-            vec!["imu/data".to_owned(), "50.0".to_owned()],
-            vec!["x".to_owned(), "1.0".to_owned()],
-        ];
+    fn tables_are_plain_aligned_and_fit_the_terminal() {
         assert_eq!(
-            render_table(&COLUMNS, rows, None),
+            table(&[("imu/data", "50.0"), ("x", "1.0")], None, &COLUMNS),
             "TOPIC       HZ\nimu/data  50.0\nx          1.0\n"
         );
-    }
-
-    #[test]
-    fn tables_fit_the_terminal() {
-        let rows = vec![vec![
-            "a/rather/long/topic name/with many/parts".to_owned(),
-            "50.0".to_owned(),
-        ]];
-        let text = render_table(&COLUMNS, rows, Some(24));
+        let text = table(
+            &[("a/rather/long/topic name/with many/parts", "50.0")],
+            Some(24),
+            &COLUMNS,
+        );
         assert!(text.lines().count() > 2, "{text}");
         assert!(text.lines().all(|line| line.chars().count() <= 24), "{text}");
     }

@@ -2,21 +2,20 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use blaze_domain::node_file::{
-    BandwidthSection, Fault, FlowSection, FlowSource, PlanFile, PlannedClass, PlannedFlow, PlannedTopic,
+    BandwidthSection, FlowSection, FlowSource, PlanFile, PlannedClass, PlannedFlow, PlannedTopic,
 };
 use blaze_domain::{FlowId, LayerName};
 use blaze_flow::limit::allocate::Class;
 use blaze_flow::limit::rates::{Budgets, Demand, LaneDemand, Rates, rates, terms};
-use blaze_runtime::config::{Schema, Sources, load_typed};
+use blaze_runtime::config::{Sources, load_typed, schema};
 use clap::Args;
 use serde_json::{Value, json};
 
-use crate::exit::{CliError, Exit};
+use crate::exit::{CliError, Exit, lines};
 use crate::node_file;
-use crate::output::{self, Align, Format, number, render_table, terminal_width};
+use crate::output::{self, Align, Format, number, terminal_width};
 
 /// Options of `blaze plan`.
 #[derive(Debug, Args)]
@@ -67,16 +66,10 @@ pub fn run(options: &PlanOptions, format: Format) -> Result<Exit, CliError> {
 }
 
 fn read(file: &Path) -> Result<PlanFile, CliError> {
-    let remarks =
-        |faults: Vec<Fault>| -> Vec<_> { faults.into_iter().map(|fault| (fault.path, fault.detail)).collect() };
-    let schema: Schema<PlanFile> =
-        Arc::new(move |tree| PlanFile::read(tree).map(|plan| (plan, Vec::new())).map_err(remarks));
+    let schema = schema(|tree| PlanFile::read(tree).map(|plan| (plan, Vec::new())));
     load_typed(&Sources::of_file(file), &schema)
         .map(|loaded| loaded.value)
-        .map_err(|faults| {
-            let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
-            CliError::Invalid(format!("the plan has faults:\n  {}", lines.join("\n  ")))
-        })
+        .map_err(|faults| CliError::Invalid(format!("the plan has faults:\n  {}", lines(&faults))))
 }
 
 /// One flow with its rates.
@@ -227,30 +220,7 @@ fn table(planned: &[Planned], width: Option<u16>) -> String {
             output::bytes(flow.bandwidth.limit_bytes_per_s()),
             if flow.rates.feasible { "" } else { "; NOT feasible" },
         ));
-        let columns = [
-            ("TOPIC", Align::Left),
-            ("CLASS", Align::Left),
-            ("BYTES", Align::Right),
-            ("ADVERTISED/Hz", Align::Right),
-            ("TO", Align::Left),
-            ("ASKED/Hz", Align::Right),
-            ("ALLOCATED/Hz", Align::Right),
-        ];
-        let mut rows = Vec::new();
-        for (topic, rates) in flow.topics.iter().zip(&flow.rates.topics) {
-            for (lane, hz) in topic.lanes.iter().zip(&rates.lanes_hz) {
-                rows.push(vec![
-                    topic.topic.to_string(),
-                    rates.class.as_str().to_owned(),
-                    topic.bytes.to_string(),
-                    number(Some(advertised_hz(topic)), 2),
-                    lane.layer.to_string(),
-                    number(lane.max_rate_hz, 2),
-                    number(Some(*hz), 2),
-                ]);
-            }
-        }
-        text.push_str(&render_table(&columns, rows, width));
+        text.push_str(&lanes(flow, width));
         for layer in flow.rates.load_bytes_per_s.keys() {
             let (load, limit) = (flow.load(layer), flow.limit(layer));
             let own = if flow.rates.infeasible_links.contains(layer) {
@@ -268,6 +238,31 @@ fn table(planned: &[Planned], width: Option<u16>) -> String {
         text.push('\n');
     }
     text
+}
+
+fn lanes(flow: &Planned, width: Option<u16>) -> String {
+    let topics = flow.topics.iter().zip(&flow.rates.topics);
+    let lanes: Vec<_> = topics
+        .flat_map(|(topic, rates)| {
+            let lanes = topic.lanes.iter().zip(&rates.lanes_hz);
+            lanes.map(move |(lane, hz)| (topic, rates.class, lane, *hz))
+        })
+        .collect();
+    output::table(
+        &lanes,
+        width,
+        &[
+            ("TOPIC", Align::Left, &|(topic, ..)| topic.topic.to_string()),
+            ("CLASS", Align::Left, &|(_, class, ..)| class.as_str().to_owned()),
+            ("BYTES", Align::Right, &|(topic, ..)| topic.bytes.to_string()),
+            ("ADVERTISED/Hz", Align::Right, &|(topic, ..)| {
+                number(Some(advertised_hz(topic)), 2)
+            }),
+            ("TO", Align::Left, &|(_, _, lane, _)| lane.layer.to_string()),
+            ("ASKED/Hz", Align::Right, &|(_, _, lane, _)| number(lane.max_rate_hz, 2)),
+            ("ALLOCATED/Hz", Align::Right, &|(.., hz)| number(Some(*hz), 2)),
+        ],
+    )
 }
 
 #[cfg(test)]

@@ -18,6 +18,6 @@ pub use admin::{AdminServer, CheckStatus, Gate, Readiness};
 pub use core_dumps::forbid_core_dumps;
 pub use ready::ready_line;
 pub use supervisor::{
-    ShutdownPhase, ShutdownReport, ShutdownSteps, StopOnDrop, Supervisor, TaskEnd, TaskHandle, TaskInfo, TaskPolicy,
-    block_on, exit_code, say,
+    ShutdownPhase, ShutdownReport, ShutdownSteps, Signals, StopOnDrop, Supervisor, TaskEnd, TaskHandle, TaskInfo,
+    TaskPolicy, block_on, exit_code, say,
 };

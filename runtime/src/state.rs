@@ -4,8 +4,9 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
+
+use tempfile::NamedTempFile;
 
 use crate::environment;
 
@@ -69,9 +70,7 @@ fn resolve(wanted: &Path, fallback: Option<PathBuf>) -> io::Result<StateDirector
 /// Makes the directory if need be and finds out by writing whether it can be written to.
 fn probe(directory: &Path) -> io::Result<()> {
     fs::create_dir_all(directory)?;
-    let (file, path) = temporary_beside(&directory.join("probe"))?;
-    drop(file);
-    fs::remove_file(path)
+    NamedTempFile::new_in(directory)?.close()
 }
 
 /// Replaces a small file in one step: a reader, and a machine that loses power, sees the old or the new content.
@@ -80,18 +79,12 @@ fn probe(directory: &Path) -> io::Result<()> {
 /// # Errors
 /// Those of the file system; the old content is then still there.
 pub fn write_atomically(path: &Path, content: &[u8]) -> io::Result<()> {
-    let (mut file, temporary) = temporary_beside(path)?;
-    let written = file
-        .write_all(content)
-        .and_then(|()| file.sync_all())
-        .and_then(|()| fs::rename(&temporary, path))
-        // The rename itself is in the directory.
-        .and_then(|()| File::open(parent_of(path))?.sync_all());
-    if written.is_err() {
-        // After the rename there is nothing left to remove.
-        let _ = fs::remove_file(&temporary);
-    }
-    written
+    let mut file = NamedTempFile::new_in(parent_of(path))?;
+    file.write_all(content)?;
+    file.as_file().sync_all()?;
+    file.persist(path)?;
+    // The rename itself is in the directory.
+    File::open(parent_of(path))?.sync_all()
 }
 
 /// A small file; `None` if there is none.
@@ -166,34 +159,6 @@ fn next_epoch_at(directory: &Path, layer: &str, node: &str, now_ms: u64) -> io::
 
 fn parse_epoch(content: &[u8]) -> Option<u64> {
     std::str::from_utf8(content).ok()?.trim().parse().ok()
-}
-
-/// A new file beside `path`, with a name that nothing else has.
-fn temporary_beside(path: &Path) -> io::Result<(File, PathBuf)> {
-    static COUNTER: AtomicU64 = AtomicU64::new(0);
-    let name = path
-        .file_name()
-        .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "no file name"))?;
-    for _ in 0..16 {
-        let unique = COUNTER.fetch_add(1, Ordering::Relaxed);
-        let temporary = format!(".{}.{}.{unique}.tmp", name.to_string_lossy(), std::process::id());
-        let temporary = parent_of(path).join(temporary);
-        match OpenOptions::new()
-            .create_new(true)
-            .write(true)
-            .mode(0o600)
-            .open(&temporary)
-        {
-            // Left over by a process that had our id before.
-            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-            Err(error) => return Err(error),
-            Ok(file) => return Ok((file, temporary)),
-        }
-    }
-    Err(io::Error::new(
-        io::ErrorKind::AlreadyExists,
-        "no free name for a temporary file",
-    ))
 }
 
 fn parent_of(path: &Path) -> &Path {

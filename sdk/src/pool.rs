@@ -219,7 +219,7 @@ fn help_when_stuck(shared: &Arc<Shared>) {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -251,7 +251,7 @@ mod tests {
         }
     }
 
-    fn eventually(mut holds: impl FnMut() -> bool) {
+    pub(crate) fn eventually(mut holds: impl FnMut() -> bool) {
         let until = Instant::now() + DEADLINE;
         while !holds() {
             assert!(Instant::now() < until, "not within {DEADLINE:?}");

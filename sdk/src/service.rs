@@ -296,9 +296,21 @@ fn observed(name: String) -> Supervisor {
     supervisor
 }
 
-fn now_ms() -> u64 {
+/// Milliseconds since 1970.
+pub(crate) fn now_ms() -> u64 {
     let since_epoch = SystemTime::now()
         .duration_since(SystemTime::UNIX_EPOCH)
         .unwrap_or_default();
     u64::try_from(since_epoch.as_millis()).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+pub(crate) fn slam() -> Identity {
+    Identity {
+        layer: "edge".parse().unwrap(),
+        node: Some("robot-1".parse().unwrap()),
+        service: "slam".parse().unwrap(),
+        instance: InstanceName::first(),
+        epoch: 17,
+    }
 }

@@ -8,7 +8,7 @@ use serde_json::Value;
 use super::{heading, typed};
 use crate::args::FlowAddress;
 use crate::exit::CliError;
-use crate::output::{Align, number, render_table};
+use crate::output::{self, Align, number};
 
 /// What `GET /v1/bridges` answers.
 #[derive(Debug, Clone, Deserialize)]
@@ -20,7 +20,6 @@ pub struct Bridges {
     pub bridges: Vec<Bridge>,
     #[serde(default)]
     not_owner: Vec<Elsewhere>,
-    #[serde(default)]
     balance: Option<Balance>,
 }
 
@@ -33,21 +32,17 @@ struct Elsewhere {
 
 /// How much the flow carries, and what it gave to other flows of its layer.
 #[derive(Debug, Clone, Default, Deserialize)]
+#[serde(default)]
 struct Balance {
-    #[serde(default)]
     out_bytes_per_s: u64,
-    #[serde(default)]
     in_bytes_per_s: u64,
-    #[serde(default)]
     moves: BTreeMap<String, u64>,
-    #[serde(default)]
     last_move: Option<LastMove>,
 }
 
 #[derive(Debug, Clone, Deserialize)]
 struct LastMove {
     topic: String,
-    #[serde(default)]
     to: Option<String>,
     reason: String,
     #[serde(default)]
@@ -80,9 +75,7 @@ pub struct Bridge {
     /// Why it failed, if it did.
     #[serde(default, deserialize_with = "super::text_or_null")]
     pub detail: String,
-    #[serde(default)]
     load_bytes_per_s: Option<f64>,
-    #[serde(default)]
     latency_ms: Option<Percentiles>,
 }
 
@@ -95,10 +88,8 @@ pub struct Place {
     #[serde(default, deserialize_with = "super::text_or_null")]
     pub broker: String,
     /// Destination layer, where `scope` is `inter`.
-    #[serde(default)]
     pub layer: Option<String>,
     /// Destination flow, where there is one.
-    #[serde(default)]
     pub flow: Option<String>,
 }
 
@@ -126,9 +117,7 @@ pub struct Count {
 
 #[derive(Debug, Clone, Copy, Deserialize)]
 struct Percentiles {
-    #[serde(default)]
     p50: Option<f64>,
-    #[serde(default)]
     p99: Option<f64>,
 }
 
@@ -142,21 +131,26 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
         text.push_str(&group_text(&answer));
         return Ok(text);
     }
-    let columns = [
-        ("TOPIC", Align::Left),
-        ("FROM", Align::Left),
-        ("TO", Align::Left),
-        ("STATE", Align::Left),
-        ("IN", Align::Right),
-        ("OUT", Align::Right),
-        ("KiB/s", Align::Right),
-        ("QUEUED", Align::Right),
-        ("p50/ms", Align::Right),
-        ("p99/ms", Align::Right),
-        ("DROPPED", Align::Left),
-    ];
-    let rows = answer.bridges.iter().map(row).collect();
-    text.push_str(&render_table(&columns, rows, width));
+    let millis = |bridge: &Bridge, part: fn(Percentiles) -> Option<f64>| number(bridge.latency_ms.and_then(part), 2);
+    text.push_str(&output::table(
+        &answer.bridges,
+        width,
+        &[
+            ("TOPIC", Align::Left, &|bridge| bridge.topic.clone()),
+            ("FROM", Align::Left, &|bridge| bridge.from.label()),
+            ("TO", Align::Left, &to_text),
+            ("STATE", Align::Left, &|bridge| bridge.state.clone()),
+            ("IN", Align::Right, &|bridge| bridge.input.messages.to_string()),
+            ("OUT", Align::Right, &|bridge| bridge.output.messages.to_string()),
+            ("KiB/s", Align::Right, &|bridge| {
+                bridge.load_bytes_per_s.map_or_else(|| number(None, 1), kib)
+            }),
+            ("QUEUED", Align::Right, &|bridge| bridge.queued.to_string()),
+            ("p50/ms", Align::Right, &|bridge| millis(bridge, |latency| latency.p50)),
+            ("p99/ms", Align::Right, &|bridge| millis(bridge, |latency| latency.p99)),
+            ("DROPPED", Align::Left, &|bridge| dropped_text(&bridge.dropped)),
+        ],
+    ));
     for bridge in answer.bridges.iter().filter(|bridge| !bridge.detail.is_empty()) {
         text.push_str(&format!("{} {}: {}\n", bridge.topic, bridge.state, bridge.detail));
     }
@@ -197,7 +191,7 @@ fn kib(bytes_per_s: f64) -> String {
     number(Some(bytes_per_s / 1024.0), 1)
 }
 
-fn row(bridge: &Bridge) -> Vec<String> {
+fn to_text(bridge: &Bridge) -> String {
     let mut to = bridge.to.label();
     if let Some(layer) = bridge.to.layer.as_ref().filter(|_| bridge.to.scope == "inter") {
         to = format!("{to} {layer}");
@@ -205,19 +199,7 @@ fn row(bridge: &Bridge) -> Vec<String> {
     if let Some(flow) = &bridge.to.flow {
         to = format!("{to} ({flow})");
     }
-    vec![
-        bridge.topic.clone(),
-        bridge.from.label(),
-        to,
-        bridge.state.clone(),
-        bridge.input.messages.to_string(),
-        bridge.output.messages.to_string(),
-        bridge.load_bytes_per_s.map_or_else(|| number(None, 1), kib),
-        bridge.queued.to_string(),
-        number(bridge.latency_ms.and_then(|latency| latency.p50), 2),
-        number(bridge.latency_ms.and_then(|latency| latency.p99), 2),
-        dropped_text(&bridge.dropped),
-    ]
+    to
 }
 
 /// Drops in words: `lifespan 3, queue_full 1`; a dash for none.

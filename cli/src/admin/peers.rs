@@ -6,7 +6,7 @@ use serde_json::Value;
 use super::{heading, typed};
 use crate::args::FlowAddress;
 use crate::exit::CliError;
-use crate::output::{Align, number, render_table};
+use crate::output::{self, Align, number};
 
 #[derive(Debug, Deserialize)]
 struct Peers {
@@ -23,19 +23,16 @@ struct Replica {
     state: String,
     #[serde(default)]
     settled: bool,
-    #[serde(default)]
     last_heard_ms: Option<f64>,
     #[serde(default)]
     carries: u64,
-    #[serde(default)]
     load: Option<Load>,
 }
 
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
 struct Load {
-    #[serde(default)]
     out_bytes_per_s: f64,
-    #[serde(default)]
     in_bytes_per_s: f64,
 }
 
@@ -45,17 +42,11 @@ struct Peer {
     #[serde(default, deserialize_with = "super::text_or_null")]
     kind: String,
     state: String,
-    #[serde(default)]
     last_heard_ms: Option<f64>,
-    #[serde(default)]
     rtt_ms: Option<f64>,
-    #[serde(default)]
     clock_offset_ms: Option<f64>,
-    #[serde(default)]
     clock_error_ms: Option<f64>,
-    #[serde(default)]
     loss: Option<f64>,
-    #[serde(default)]
     address: Option<String>,
 }
 
@@ -67,18 +58,24 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
         text.push_str(&replicas(&answer.replicas, width));
         return Ok(text);
     }
-    let columns = [
-        ("FLOW", Align::Left),
-        ("KIND", Align::Left),
-        ("STATE", Align::Left),
-        ("ADDRESS", Align::Left),
-        ("HEARD/ms", Align::Right),
-        ("RTT/ms", Align::Right),
-        ("LOSS/%", Align::Right),
-        ("CLOCK/ms", Align::Right),
-    ];
-    let rows = answer.peers.iter().map(row).collect();
-    text.push_str(&render_table(&columns, rows, width));
+    text.push_str(&output::table(
+        &answer.peers,
+        width,
+        &[
+            ("FLOW", Align::Left, &|peer| peer.flow.clone()),
+            ("KIND", Align::Left, &|peer| peer.kind.clone()),
+            ("STATE", Align::Left, &|peer| peer.state.clone()),
+            ("ADDRESS", Align::Left, &|peer| {
+                peer.address.clone().unwrap_or_else(|| "-".to_owned())
+            }),
+            ("HEARD/ms", Align::Right, &|peer| number(peer.last_heard_ms, 0)),
+            ("RTT/ms", Align::Right, &|peer| number(peer.rtt_ms, 2)),
+            ("LOSS/%", Align::Right, &|peer| {
+                number(peer.loss.map(|share| share * 100.0), 2)
+            }),
+            ("CLOCK/ms", Align::Right, &clock),
+        ],
+    ));
     text.push_str(&replicas(&answer.replicas, width));
     Ok(text)
 }
@@ -88,47 +85,35 @@ fn replicas(replicas: &[Replica], width: Option<u16>) -> String {
     if replicas.is_empty() {
         return String::new();
     }
-    let columns = [
-        ("REPLICA", Align::Left),
-        ("STATE", Align::Left),
-        ("HEARD/ms", Align::Right),
-        ("CARRIES", Align::Right),
-        ("OUT KiB/s", Align::Right),
-        ("IN KiB/s", Align::Right),
-    ];
-    let row = |replica: &Replica| {
-        let state = if replica.settled { "settled" } else { &replica.state };
-        let kib = |of: fn(&Load) -> f64| number(replica.load.as_ref().map(|load| of(load) / 1024.0), 1);
-        vec![
-            replica.flow.clone(),
-            state.to_owned(),
-            number(replica.last_heard_ms, 0),
-            replica.carries.to_string(),
-            kib(|load| load.out_bytes_per_s),
-            kib(|load| load.in_bytes_per_s),
-        ]
+    let kib = |replica: &Replica, of: fn(&Load) -> f64| number(replica.load.as_ref().map(|load| of(load) / 1024.0), 1);
+    let state = |replica: &Replica| match replica.settled {
+        true => "settled".to_owned(),
+        false => replica.state.clone(),
     };
-    format!(
-        "\n{}",
-        render_table(&columns, replicas.iter().map(row).collect(), width)
-    )
+    let table = output::table(
+        replicas,
+        width,
+        &[
+            ("REPLICA", Align::Left, &|replica| replica.flow.clone()),
+            ("STATE", Align::Left, &state),
+            ("HEARD/ms", Align::Right, &|replica| number(replica.last_heard_ms, 0)),
+            ("CARRIES", Align::Right, &|replica| replica.carries.to_string()),
+            ("OUT KiB/s", Align::Right, &|replica| {
+                kib(replica, |load| load.out_bytes_per_s)
+            }),
+            ("IN KiB/s", Align::Right, &|replica| {
+                kib(replica, |load| load.in_bytes_per_s)
+            }),
+        ],
+    );
+    format!("\n{table}")
 }
 
-fn row(peer: &Peer) -> Vec<String> {
-    let clock = match (peer.clock_offset_ms, peer.clock_error_ms) {
+fn clock(peer: &Peer) -> String {
+    match (peer.clock_offset_ms, peer.clock_error_ms) {
         (Some(offset), Some(error)) => format!("{offset:+.2} ±{error:.2}"),
         (offset, _) => number(offset, 2),
-    };
-    vec![
-        peer.flow.clone(),
-        peer.kind.clone(),
-        peer.state.clone(),
-        peer.address.clone().unwrap_or_else(|| "-".to_owned()),
-        number(peer.last_heard_ms, 0),
-        number(peer.rtt_ms, 2),
-        number(peer.loss.map(|share| share * 100.0), 2),
-        clock,
-    ]
+    }
 }
 
 #[cfg(test)]

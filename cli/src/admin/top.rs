@@ -8,10 +8,10 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use super::{heading, typed};
-use crate::args::{FlowAddress, FlowTarget};
+use crate::args::{FlowAddress, FlowTarget, parse_seconds};
 use crate::exit::{CliError, Exit};
 use crate::http::get_json;
-use crate::output::{self, Align, Format, bytes, number, render_table, terminal_width};
+use crate::output::{self, Align, Format, bytes, number, terminal_width};
 
 /// Options of `blaze top`.
 #[derive(Debug, Args)]
@@ -20,29 +20,19 @@ pub struct TopOptions {
     #[command(flatten)]
     pub target: FlowTarget,
     /// Seconds between two looks
-    #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = parse_interval)]
+    #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = parse_seconds)]
     pub interval: f64,
     /// End after this many looks
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
 }
 
-fn parse_interval(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(seconds) if (0.1..=3600.0).contains(&seconds) => Ok(seconds),
-        _ => Err("0.1 to 3600 seconds".to_owned()),
-    }
-}
-
 #[derive(Debug, Deserialize)]
 struct Allocation {
     limit_mbps: f64,
     budget_bytes_per_s: f64,
-    #[serde(default)]
     measured_bytes_per_s: Option<f64>,
-    #[serde(default)]
     wire_factor: Option<f64>,
-    #[serde(default)]
     feasible: Option<bool>,
     topics: Vec<Topic>,
     links: Vec<Link>,
@@ -54,21 +44,18 @@ struct Topic {
     class: String,
     size_bytes: f64,
     advertised_hz: f64,
-    #[serde(default)]
     compression: Option<Compression>,
     lanes: Vec<Lane>,
 }
 
 #[derive(Debug, Deserialize)]
 struct Compression {
-    #[serde(default)]
     ratio: Option<f64>,
 }
 
 #[derive(Debug, Deserialize)]
 struct Lane {
     layer: String,
-    #[serde(default)]
     allocated_hz: Option<f64>,
     actual_hz: f64,
     #[serde(default)]
@@ -76,22 +63,18 @@ struct Lane {
     skipped: u64,
     #[serde(default)]
     queued: u64,
-    #[serde(default)]
     wait_ms: Option<Percentiles>,
 }
 
 #[derive(Debug, Deserialize)]
 struct Percentiles {
-    #[serde(default)]
     p99: Option<f64>,
 }
 
 #[derive(Debug, Deserialize)]
 struct Link {
     layer: String,
-    #[serde(default)]
     limit_bytes_per_s: Option<f64>,
-    #[serde(default)]
     measured_bytes_per_s: Option<f64>,
     wire_bytes_per_s: f64,
 }
@@ -151,24 +134,7 @@ fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String
     if answer.topics.is_empty() {
         text.push_str("Nothing leaves on the inter scope. `blaze why TOPIC --to LAYER` says what is missing.\n");
     } else {
-        let columns = [
-            ("TOPIC", Align::Left),
-            ("CLASS", Align::Left),
-            ("BYTES", Align::Right),
-            ("LZ4", Align::Right),
-            ("TO", Align::Left),
-            ("ADVERTISED/Hz", Align::Right),
-            ("PLANNED/Hz", Align::Right),
-            ("ACTUAL/Hz", Align::Right),
-            ("SKIPPED", Align::Right),
-            ("QUEUED", Align::Right),
-            ("p99/ms", Align::Right),
-        ];
-        text.push_str(&render_table(
-            &columns,
-            answer.topics.iter().flat_map(rows).collect(),
-            width,
-        ));
+        text.push_str(&lanes(&answer.topics, width));
     }
     let exceeds = |topic: &&Topic| topic.lanes.iter().any(|lane| lane.exceeds_advertised);
     for topic in answer.topics.iter().filter(exceeds) {
@@ -198,24 +164,35 @@ fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Result<String
     Ok(text)
 }
 
-fn rows(topic: &Topic) -> Vec<Vec<String>> {
-    let ratio = topic.compression.as_ref().and_then(|compression| compression.ratio);
-    let row = |lane: &Lane| {
-        vec![
-            topic.topic.clone(),
-            topic.class.clone(),
-            number(Some(topic.size_bytes), 0),
-            ratio.map_or_else(|| "-".to_owned(), |ratio| format!("{:.0} %", 100.0 * ratio)),
-            lane.layer.clone(),
-            number(Some(topic.advertised_hz), 2),
-            number(lane.allocated_hz, 2),
-            number(Some(lane.actual_hz), 2),
-            lane.skipped.to_string(),
-            lane.queued.to_string(),
-            number(lane.wait_ms.as_ref().and_then(|wait| wait.p99), 2),
-        ]
-    };
-    topic.lanes.iter().map(row).collect()
+fn lanes(topics: &[Topic], width: Option<u16>) -> String {
+    let lanes: Vec<(&Topic, &Lane)> = topics
+        .iter()
+        .flat_map(|topic| topic.lanes.iter().map(move |lane| (topic, lane)))
+        .collect();
+    let ratio = |topic: &Topic| topic.compression.as_ref().and_then(|compression| compression.ratio);
+    output::table(
+        &lanes,
+        width,
+        &[
+            ("TOPIC", Align::Left, &|(topic, _)| topic.topic.clone()),
+            ("CLASS", Align::Left, &|(topic, _)| topic.class.clone()),
+            ("BYTES", Align::Right, &|(topic, _)| number(Some(topic.size_bytes), 0)),
+            ("LZ4", Align::Right, &|(topic, _)| {
+                ratio(topic).map_or_else(|| "-".to_owned(), |ratio| format!("{:.0} %", 100.0 * ratio))
+            }),
+            ("TO", Align::Left, &|(_, lane)| lane.layer.clone()),
+            ("ADVERTISED/Hz", Align::Right, &|(topic, _)| {
+                number(Some(topic.advertised_hz), 2)
+            }),
+            ("PLANNED/Hz", Align::Right, &|(_, lane)| number(lane.allocated_hz, 2)),
+            ("ACTUAL/Hz", Align::Right, &|(_, lane)| number(Some(lane.actual_hz), 2)),
+            ("SKIPPED", Align::Right, &|(_, lane)| lane.skipped.to_string()),
+            ("QUEUED", Align::Right, &|(_, lane)| lane.queued.to_string()),
+            ("p99/ms", Align::Right, &|(_, lane)| {
+                number(lane.wait_ms.as_ref().and_then(|wait| wait.p99), 2)
+            }),
+        ],
+    )
 }
 
 #[cfg(test)]

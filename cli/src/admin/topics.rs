@@ -6,7 +6,7 @@ use serde_json::Value;
 use super::{heading, typed};
 use crate::args::FlowAddress;
 use crate::exit::CliError;
-use crate::output::{Align, bytes, number, render_table};
+use crate::output::{self, Align, bytes, number};
 
 /// What `GET /v1/topics` answers, as far as the table shows it.
 #[derive(Debug, Deserialize)]
@@ -18,9 +18,7 @@ pub(super) struct Topics {
 pub(super) struct Topic {
     pub(super) topic: String,
     state: String,
-    #[serde(default)]
     rate_hz: Option<f64>,
-    #[serde(default)]
     bytes_per_s: Option<f64>,
     #[serde(default)]
     advertised: Vec<Lease>,
@@ -36,7 +34,6 @@ struct Lease {
     node: String,
     #[serde(default, deserialize_with = "super::text_or_null")]
     service: String,
-    #[serde(default)]
     max_rate_hz: Option<f64>,
 }
 
@@ -63,35 +60,26 @@ pub(super) fn table(flow: &FlowAddress, value: &Value, width: Option<u16>) -> Re
         text.push_str("No topics: no service here or elsewhere has advertised or requested one.\n");
         return Ok(text);
     }
-    let columns = [
-        ("TOPIC", Align::Left),
-        ("STATE", Align::Left),
-        ("RATE/Hz", Align::Right),
-        ("BYTES/s", Align::Right),
-        ("PUBLISHED BY", Align::Left),
-        ("REQUESTED BY", Align::Left),
-    ];
     // In a terminal a cell may have several lines; elsewhere a row is one line, for grep and awk.
     let separator = if width.is_some() { "\n" } else { "," };
     let list = |leases: &[Lease]| match leases {
         [] => "-".to_owned(),
         leases => leases.iter().map(Lease::text).collect::<Vec<_>>().join(separator),
     };
-    let rows = answer
-        .topics
-        .iter()
-        .map(|topic| {
-            vec![
-                topic.topic.clone(),
-                topic.state.clone(),
-                number(topic.rate_hz, 1),
-                topic.bytes_per_s.map_or_else(|| "-".to_owned(), bytes),
-                list(&topic.advertised),
-                list(&topic.requested),
-            ]
-        })
-        .collect();
-    text.push_str(&render_table(&columns, rows, width));
+    text.push_str(&output::table(
+        &answer.topics,
+        width,
+        &[
+            ("TOPIC", Align::Left, &|topic| topic.topic.clone()),
+            ("STATE", Align::Left, &|topic| topic.state.clone()),
+            ("RATE/Hz", Align::Right, &|topic| number(topic.rate_hz, 1)),
+            ("BYTES/s", Align::Right, &|topic| {
+                topic.bytes_per_s.map_or_else(|| "-".to_owned(), bytes)
+            }),
+            ("PUBLISHED BY", Align::Left, &|topic| list(&topic.advertised)),
+            ("REQUESTED BY", Align::Left, &|topic| list(&topic.requested)),
+        ],
+    ));
     Ok(text)
 }
 

@@ -7,12 +7,10 @@ use serde_json::Value;
 #[derive(Debug, Deserialize)]
 pub(super) struct Why {
     topic: String,
-    #[serde(default)]
     to: Option<Value>,
     verdict: Verdict,
     #[serde(default, deserialize_with = "super::text_or_null")]
     pub(super) code: String,
-    #[serde(default)]
     remedy: Option<String>,
     #[serde(default)]
     steps: Vec<Step>,
@@ -34,7 +32,6 @@ struct Step {
     ok: bool,
     #[serde(default, deserialize_with = "super::text_or_null")]
     code: String,
-    #[serde(default)]
     detail: Option<String>,
 }
 

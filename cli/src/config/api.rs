@@ -8,6 +8,7 @@ use super::call::Call;
 use super::client::{Answer, Client};
 use super::kinds::{BASE, collection_path, document_path};
 use super::refusal::Refusal;
+use super::text::list;
 use crate::admin::closest;
 use crate::exit::CliError;
 
@@ -57,15 +58,6 @@ impl Listing {
     }
 }
 
-/// What a change insists on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Insist {
-    /// That the document is as it was read.
-    AsRead,
-    /// That it exists (`--force`).
-    Exists,
-}
-
 impl Client {
     /// Documents of a kind.
     ///
@@ -113,11 +105,8 @@ impl Client {
             let items = items.ok_or_else(|| self.odd("a list has no `items`"))?;
             listing.items.append(items);
             listing.revision = answer.body.get("revision").and_then(Value::as_u64).or(answer.revision);
-            let next = answer
-                .body
-                .get("next_page_token")
-                .and_then(Value::as_str)
-                .unwrap_or_default();
+            let next = answer.body.get("next_page_token").and_then(Value::as_str);
+            let next = next.unwrap_or_default();
             let repeated = !next.is_empty() && next == listing.next_page_token;
             listing.next_page_token = next.to_owned();
             let full = limit.is_some_and(|limit| listing.items.len() as u64 >= limit);
@@ -152,10 +141,7 @@ impl Client {
         let call = Call::get(document_path(key))
             .query_if("revision", revision.map(|revision| revision.to_string()))
             .query_if("reveal", reveal.then_some("true"));
-        match self.send(&call).await {
-            Err(CliError::Problem(refusal)) => Err(self.with_suggestion(*refusal, key).await),
-            other => other,
-        }
+        self.send_about(key, &call).await
     }
 
     /// One document, or `None` where there is none.
@@ -170,23 +156,24 @@ impl Client {
         }
     }
 
-    /// The value of `If-Match` for a change of a document: what was read of it, or `*`.
+    /// The value of `If-Match` for a change of a document: that it is as it was read, or, with `force`, that it exists.
     ///
     /// # Errors
     /// As [`Self::document`].
-    pub(crate) async fn precondition(&self, key: &Key, insist: Insist) -> Result<String, CliError> {
-        match insist {
-            Insist::Exists => Ok("*".to_owned()),
-            Insist::AsRead => self.tag(self.document(key, None).await?),
+    pub(crate) async fn precondition(&self, key: &Key, force: bool) -> Result<String, CliError> {
+        match force {
+            true => Ok("*".to_owned()),
+            false => self.tag(&self.document(key, None).await?, false),
         }
     }
 
-    /// The entity tag of a document that was read.
+    /// The same for a document that was read already.
     ///
     /// # Errors
-    /// [`CliError::Foreign`] without one: a change could not be fenced.
-    pub(crate) fn tag(&self, answer: Answer) -> Result<String, CliError> {
-        answer.etag.ok_or_else(|| self.odd("a document came without an ETag"))
+    /// [`CliError::Foreign`] without an entity tag: a change could not be fenced.
+    pub(crate) fn tag(&self, read: &Answer, force: bool) -> Result<String, CliError> {
+        let tag = if force { Some("*".to_owned()) } else { read.etag.clone() };
+        tag.ok_or_else(|| self.odd("a document came without an ETag"))
     }
 
     /// Sends something about a document; a name that does not exist gets a suggestion.
@@ -243,15 +230,11 @@ impl Client {
 
     async fn names(&self, kind: Kind, service: Option<&ServiceName>) -> Vec<String> {
         let call = Call::get(collection_path(kind, service)).query("limit", PAGE.to_string());
-        let items = match self.send(&call).await {
-            Ok(answer) => answer.body.get("items").and_then(Value::as_array).cloned(),
-            Err(_) => None,
-        };
-        let names = items.unwrap_or_default();
-        names
+        let body = self.send(&call).await.map_or(Value::Null, |answer| answer.body);
+        let names = list(&body, "items")
             .iter()
-            .filter_map(|item| item.get("name")?.as_str().map(str::to_owned))
-            .collect()
+            .filter_map(|item| item.get("name")?.as_str());
+        names.map(str::to_owned).collect()
     }
 
     /// An answer that did not come while somebody waited for it.
@@ -264,10 +247,10 @@ impl Client {
     }
 
     /// An answer that is not as the contract says.
-    pub(crate) fn odd(&self, reason: &str) -> CliError {
+    pub(crate) fn odd(&self, reason: impl Into<String>) -> CliError {
         CliError::Foreign {
             server: self.server().to_owned(),
-            reason: reason.to_owned(),
+            reason: reason.into(),
         }
     }
 }

@@ -107,8 +107,8 @@ async fn changes_insist_on_what_was_read() {
     let stub = Stub::start(|_, _| Reply::at(412, &json!({"name": "robot-1"}))).await;
     let key = parse_key(Kind::Node, "robot-1").unwrap();
     let client = stub.client();
-    assert_eq!(client.precondition(&key, Insist::AsRead).await.unwrap(), "\"412\"");
-    assert_eq!(client.precondition(&key, Insist::Exists).await.unwrap(), "*");
+    assert_eq!(client.precondition(&key, false).await.unwrap(), "\"412\"");
+    assert_eq!(client.precondition(&key, true).await.unwrap(), "*");
     assert_eq!(stub.asked().len(), 1);
 }
 

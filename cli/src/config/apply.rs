@@ -14,9 +14,9 @@ use super::client::Client;
 use super::files::{self, MAX_BYTES, Source};
 use super::kinds::{BASE, key_of, name_of};
 use super::options::ServerOptions;
-use super::text::{cell, count, member, note, parse_duration, print};
+use super::text::{cell, count, flag, list, member, note, parse_duration, print, whole};
 use crate::exit::{CliError, Exit};
-use crate::output::{Align, Format, render_table, terminal_width};
+use crate::output::{self, Align, Format, terminal_width};
 
 /// Pauses between two looks at the workers.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
@@ -117,9 +117,9 @@ pub(super) async fn send_array(client: &Client, body: &Value, request: &Request<
     match client.send(&call).await {
         Ok(answer) if answer.body.get("results").is_some_and(Value::is_array) => Ok(answer.body),
         Ok(_) => Err(client.odd("the answer has no `results`")),
-        Err(CliError::Problem(refusal)) if refusal.code() == "limit_exceeded" && request.prune.is_some() => {
+        Err(error) if request.prune.is_some() => {
             let hint = "so many documents are deleted with --prune-confirm COUNT alone";
-            Err(CliError::Problem(Box::new(refusal.with_hint(hint))))
+            Err(error.hinted("limit_exceeded", hint))
         }
         Err(error) => Err(error),
     }
@@ -127,10 +127,7 @@ pub(super) async fn send_array(client: &Client, body: &Value, request: &Request<
 
 /// The results of an answer of `/apply`.
 pub(super) fn results(answer: &Value) -> &[Value] {
-    answer
-        .get("results")
-        .and_then(Value::as_array)
-        .map_or(&[][..], Vec::as_slice)
+    list(answer, "results")
 }
 
 /// How a result calls its document.
@@ -140,22 +137,18 @@ pub(super) fn result_name(result: &Value) -> String {
 
 /// One line per document.
 pub(super) fn table(answer: &Value) -> String {
-    let columns = [
-        ("DOCUMENT", Align::Left),
-        ("ACTION", Align::Left),
-        ("REVISION", Align::Right),
-        ("CHANGES", Align::Right),
-    ];
-    let row = |result: &Value| {
-        let changes = result.get("changes").and_then(Value::as_array).map_or(0, Vec::len);
-        vec![
-            result_name(result),
-            member(result, "action"),
-            cell(result.get("revision")),
-            changes.to_string(),
-        ]
-    };
-    render_table(&columns, results(answer).iter().map(row).collect(), terminal_width())
+    output::table(
+        results(answer),
+        terminal_width(),
+        &[
+            ("DOCUMENT", Align::Left, &result_name),
+            ("ACTION", Align::Left, &|result| member(result, "action")),
+            ("REVISION", Align::Right, &|result| cell(result.get("revision"))),
+            ("CHANGES", Align::Right, &|result| {
+                list(result, "changes").len().to_string()
+            }),
+        ],
+    )
 }
 
 /// One sentence about all documents.
@@ -170,10 +163,13 @@ pub(super) fn summary(answer: &Value) -> String {
             parts.push(format!("{number} {action}"));
         }
     }
-    let dry = answer.get("dry_run").and_then(Value::as_bool).unwrap_or(false);
-    let begin = if dry { "nothing was written; it would be: " } else { "" };
-    let total = answer.get("affected_total").and_then(Value::as_u64).unwrap_or(0);
-    let affected = count(usize::try_from(total).unwrap_or(usize::MAX), "configuration");
+    let begin = if flag(answer, "dry_run") {
+        "nothing was written; it would be: "
+    } else {
+        ""
+    };
+    let total = usize::try_from(whole(answer, "affected_total")).unwrap_or(usize::MAX);
+    let affected = count(total, "configuration");
     format!(
         "{begin}{}; revision {}; {affected} affected",
         parts.join(", "),
@@ -184,12 +180,8 @@ pub(super) fn summary(answer: &Value) -> String {
 /// Layers whose workers must have the revision; `None`: all.
 fn layers(answer: &Value, sources: &[Source]) -> Option<BTreeSet<String>> {
     let mut layers = BTreeSet::new();
-    let affected = answer
-        .get("affected")
-        .and_then(Value::as_array)
-        .map_or(&[][..], Vec::as_slice);
-    let total = answer.get("affected_total").and_then(Value::as_u64).unwrap_or(0);
-    if total > affected.len() as u64 {
+    let affected = list(answer, "affected");
+    if whole(answer, "affected_total") > affected.len() as u64 {
         return None;
     }
     for place in affected {
@@ -231,7 +223,7 @@ fn seen_by(sources: &[Source]) -> Option<BTreeSet<String>> {
             }
             Kind::Node => layers.extend(text("/spec/layer")),
             Kind::Service => {
-                let named = value.pointer("/spec/layers").and_then(Value::as_array)?;
+                let named = value.pointer("/spec/layers")?.as_array()?;
                 layers.extend(named.iter().filter_map(|layer| layer.as_str().map(str::to_owned)));
             }
             // Where a node stands, and what a roll-out is about, is not said here.
@@ -307,20 +299,17 @@ fn everywhere(workers: usize, revision: u64) -> String {
 
 /// Connected workers of some layers.
 fn concerned<'w>(workers: &'w Value, layers: Option<&BTreeSet<String>>) -> Vec<&'w Value> {
-    let items = workers.get("items").and_then(Value::as_array);
     let is_concerned = |worker: &&Value| {
-        let connected = worker.get("connected").and_then(Value::as_bool).unwrap_or(false);
-        let layer = worker.get("layer").and_then(Value::as_str).unwrap_or_default();
-        connected && layers.is_none_or(|layers| layers.contains(layer))
+        flag(worker, "connected") && layers.is_none_or(|layers| layers.contains(&member(worker, "layer")))
     };
-    items.into_iter().flatten().filter(is_concerned).collect()
+    list(workers, "items").iter().filter(is_concerned).collect()
 }
 
 /// Those that have not yet reached a revision, in words.
 fn behind(workers: &[&Value], revision: u64) -> Vec<String> {
     workers
         .iter()
-        .filter(|worker| worker.get("revision").and_then(Value::as_u64).unwrap_or(0) < revision)
+        .filter(|worker| whole(worker, "revision") < revision)
         .map(|worker| {
             let place = format!("{}/{}", member(worker, "layer"), cell(worker.get("node")));
             format!("the worker of {place} is at revision {}", cell(worker.get("revision")))

@@ -1,18 +1,7 @@
 //! What the command line takes, and what it says to what it does not take.
 
-use clap::Parser as _;
-use clap::error::ErrorKind;
-
 use super::*;
-use crate::args::{Arguments, Command};
-
-fn parse(line: &str) -> Result<ConfigCommand, clap::Error> {
-    let words = ["blaze"].into_iter().chain(line.split_whitespace());
-    match Arguments::try_parse_from(words)?.command {
-        Command::Config(command) => Ok(*command),
-        other => panic!("{other:?}"),
-    }
-}
+use crate::args::tests::config;
 
 #[test]
 fn every_command_of_the_contract_is_taken() {
@@ -70,7 +59,7 @@ fn every_command_of_the_contract_is_taken() {
         "context list",
         "context remove lab",
     ] {
-        parse(line).unwrap_or_else(|error| panic!("{line}: {error}"));
+        config(line).unwrap_or_else(|error| panic!("{line}: {error}"));
     }
 }
 
@@ -104,6 +93,7 @@ fn what_makes_no_sense_is_refused_with_exit_code_2() {
         "token create --subject s --role viewer --alg HS256",
         "token create --subject s --role viewer --key-file k",
         "token create --subject s --role viewer --token abc",
+        "get nodes --token abc",
         "token keygen --alg none --out f",
         "context add lab --server lab.example",
         "context add lab --server https://lab.example --client-key k",
@@ -115,59 +105,14 @@ fn what_makes_no_sense_is_refused_with_exit_code_2() {
         "context add a/b --server https://lab.example",
         "audit --outcome maybe",
     ] {
-        let error = parse(line).unwrap_err();
+        let error = config(line).unwrap_err();
         assert_eq!(error.exit_code(), 2, "{line}: {error}");
-    }
-}
-
-#[test]
-fn slips_get_a_suggestion() {
-    for (line, meant) in [
-        ("aply -f a", "'apply'"),
-        ("get servces", "did you mean services?"),
-        ("watch instnace", "did you mean instance?"),
-        ("token create --subject s --role operater", "operator"),
-        ("effective SLAM", "did you mean slam?"),
-    ] {
-        let error = parse(line).unwrap_err().to_string();
-        assert!(error.contains(meant), "{line}: {error}");
-    }
-}
-
-#[test]
-fn no_option_takes_the_text_of_a_token() {
-    let error = parse("get nodes --token abc").unwrap_err();
-    assert_eq!(error.kind(), ErrorKind::UnknownArgument);
-}
-
-#[test]
-fn completions_have_every_command_and_option() {
-    use clap::CommandFactory as _;
-    for shell in [
-        clap_complete::Shell::Bash,
-        clap_complete::Shell::Zsh,
-        clap_complete::Shell::Fish,
-    ] {
-        let mut script = Vec::new();
-        clap_complete::generate(shell, &mut Arguments::command(), "blaze", &mut script);
-        let script = String::from_utf8(script).unwrap();
-        for word in [
-            "topology",
-            "digest",
-            "trim",
-            "client-cert",
-            "client-key",
-            "reveal",
-            "before",
-        ] {
-            assert!(script.contains(word), "{shell}: {word}");
-        }
     }
 }
 
 #[tokio::test]
 async fn formats_that_a_command_does_not_have_are_refused() {
-    let command = parse("workers").unwrap();
+    let command = config("workers").unwrap();
     let error = run(command, Output::Name).await.unwrap_err();
     assert!(matches!(error, CliError::Usage(_)), "{error}");
 }

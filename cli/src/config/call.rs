@@ -92,29 +92,11 @@ impl Call {
     pub(super) fn url(&self, server: &Url) -> Url {
         let mut url = server.clone();
         url.set_path(&self.path);
-        let pairs: Vec<String> = self
-            .query
-            .iter()
-            .map(|(name, value)| format!("{name}={}", encode(value)))
-            .collect();
-        if !pairs.is_empty() {
-            url.set_query(Some(&pairs.join("&")));
+        if !self.query.is_empty() {
+            url.query_pairs_mut().extend_pairs(&self.query);
         }
         url
     }
-}
-
-/// A value of a query: everything but unreserved characters percent-encoded.
-fn encode(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for byte in text.bytes() {
-        if byte.is_ascii_alphanumeric() || b"-._~".contains(&byte) {
-            out.push(char::from(byte));
-        } else {
-            out.push_str(&format!("%{byte:02X}"));
-        }
-    }
-    out
 }
 
 #[cfg(test)]

@@ -8,16 +8,16 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use blaze_domain::DocumentName;
-use blaze_domain::config::{Key, Kind};
-use serde_json::Value;
+use blaze_domain::config::placement::is_active;
+use blaze_domain::config::spec::references;
+use blaze_domain::config::{Document, Key, Kind};
 use tokio::time::timeout;
 
 use super::api::Filter;
-use super::call::Call;
 use super::client::Client;
-use super::kinds::{BASE, key_of};
-use super::stream::{Told, Watcher};
+use super::kinds::{document_of, key_of};
+use super::stream::changes_between;
+use super::text::member;
 use crate::exit::CliError;
 
 /// How long the commit of a deletion is waited for. It is written already.
@@ -31,8 +31,7 @@ pub(super) async fn referrers(client: &Client, roots: &[Key]) -> Result<Vec<Key>
     let mut documents = Vec::new();
     for kind in kinds_above(roots) {
         for document in client.list(kind, &Filter::default()).await?.items {
-            let key = key_of(&document).map_err(|reason| client.odd(&format!("a document {reason}")))?;
-            documents.push((key, document));
+            documents.push(document_of(&document).map_err(|reason| client.odd(format!("a document {reason}")))?);
         }
     }
     Ok(closure(roots, &documents))
@@ -54,11 +53,13 @@ fn kinds_above(roots: &[Key]) -> Vec<Kind> {
     kinds
 }
 
-fn closure(roots: &[Key], documents: &[(Key, Value)]) -> Vec<Key> {
+fn closure(roots: &[Key], documents: &[Document]) -> Vec<Key> {
     let mut referrers: BTreeMap<Key, Vec<&Key>> = BTreeMap::new();
-    for (key, document) in documents {
-        for target in targets(key, document) {
-            referrers.entry(target).or_default().push(key);
+    // A roll-out that has ended holds nobody back.
+    let holds = |document: &&Document| document.key.kind() != Kind::Rollout || is_active(document);
+    for document in documents.iter().filter(holds) {
+        for (_, target) in references(document) {
+            referrers.entry(target).or_default().push(&document.key);
         }
     }
     let mut seen: BTreeSet<&Key> = roots.iter().collect();
@@ -76,36 +77,6 @@ fn closure(roots: &[Key], documents: &[(Key, Value)]) -> Vec<Key> {
     found
 }
 
-/// What a document refers to. A roll-out that has ended holds nobody back.
-fn targets(key: &Key, document: &Value) -> Vec<Key> {
-    let named = |kind: Kind, name: &Value| {
-        let name = name.as_str()?.parse::<DocumentName>().ok()?;
-        Key::new(kind, None, name).ok()
-    };
-    let at = |kind: Kind, pointer: &str| named(kind, document.pointer(pointer)?);
-    match key.kind() {
-        Kind::Layer => Vec::new(),
-        Kind::Node => at(Kind::Layer, "/spec/layer").into_iter().collect(),
-        Kind::Service => {
-            let layers = document.pointer("/spec/layers").and_then(Value::as_array);
-            let layers = layers.into_iter().flatten();
-            layers.filter_map(|name| named(Kind::Layer, name)).collect()
-        }
-        Kind::Instance => {
-            let placed = [at(Kind::Layer, "/spec/layer"), at(Kind::Node, "/spec/node")];
-            let service = key.service_name().map(Key::service);
-            placed.into_iter().flatten().chain(service).collect()
-        }
-        Kind::Rollout => {
-            let phase = document.pointer("/status/phase").and_then(Value::as_str);
-            let target = document
-                .pointer("/spec/target")
-                .filter(|_| phase.is_none_or(|phase| phase == "canary"));
-            target.and_then(|target| key_of(target).ok()).into_iter().collect()
-        }
-    }
-}
-
 /// What the commits of some revisions deleted; `None` where that cannot be told any more.
 pub(super) async fn deleted(client: &Client, revisions: &BTreeSet<u64>) -> Option<Vec<Key>> {
     timeout(LONGEST, read(client, revisions)).await.ok()?.ok().flatten()
@@ -115,32 +86,19 @@ async fn read(client: &Client, revisions: &BTreeSet<u64>) -> Result<Option<Vec<K
     let (Some(first), Some(last)) = (revisions.first(), revisions.last()) else {
         return Ok(None);
     };
-    let revision_of = |event: &Value| event.get("revision").and_then(Value::as_u64).unwrap_or(0);
-    let since = Some(first.saturating_sub(1));
-    let mut watcher = Watcher::new(client, Call::get(format!("{BASE}/watch")), since, false);
     let mut keys = Vec::new();
-    loop {
-        let reached = match watcher.next().await? {
-            Told::Relist(_) => return Ok(None),
-            Told::Bookmark(bookmark) => revision_of(&bookmark),
-            Told::Change(commit) => {
-                let revision = revision_of(&commit);
-                let changes = commit.get("changes").and_then(Value::as_array);
-                let of_ours = changes.into_iter().flatten().filter(|_| revisions.contains(&revision));
-                let gone = of_ours.filter(|change| change.get("op").and_then(Value::as_str) == Some("delete"));
-                keys.extend(gone.filter_map(|change| key_of(change).ok()));
-                revision
-            }
-        };
-        if reached >= *last {
-            return Ok(Some(keys));
+    let is_told = changes_between(client, first.saturating_sub(1), *last, |revision, change| {
+        if revisions.contains(&revision) && member(change, "op") == "delete" {
+            keys.extend(key_of(change));
         }
-    }
+        Ok(())
+    });
+    Ok(is_told.await?.then_some(keys))
 }
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
+    use serde_json::{Value, json};
 
     use super::*;
     use crate::config::kinds::{name_of, parse_target};

@@ -161,7 +161,7 @@ impl Client {
         }
         let kind = header(response.headers(), &CONTENT_TYPE).unwrap_or_default();
         if !kind.starts_with("text/event-stream") {
-            return Err(self.foreign(format!("the answer is {kind:?} and no stream of events")));
+            return Err(self.odd(format!("the answer is {kind:?} and no stream of events")));
         }
         let revision = revision(response.headers());
         Ok((response, revision))
@@ -206,7 +206,7 @@ impl Client {
         let value = if body.is_empty() {
             Value::Null
         } else {
-            serde_json::from_slice(body).map_err(|error| self.foreign(format!("the answer is no JSON: {error}")))?
+            serde_json::from_slice(body).map_err(|error| self.odd(format!("the answer is no JSON: {error}")))?
         };
         Ok(Answer {
             revision: revision(headers),
@@ -232,19 +232,12 @@ impl Client {
         CliError::Problem(Box::new(refusal))
     }
 
-    fn foreign(&self, reason: String) -> CliError {
-        CliError::Foreign {
-            server: self.server().to_owned(),
-            reason,
-        }
-    }
-
     fn no_answer(&self, call: &Call, fault: Fault, token: Option<&Token>) -> CliError {
         let mut advice = None;
         let (reason, unreached) = match fault {
             Fault::Before(error) => return error,
             Fault::TooLarge => {
-                return self.foreign(format!(
+                return self.odd(format!(
                     "the answer is larger than {} MiB",
                     MAX_ANSWER_BYTES / 1024 / 1024
                 ));

@@ -21,7 +21,7 @@ async fn requests_carry_what_they_should() {
     let asked = stub.asked();
     assert_eq!(
         asked[0].line(),
-        "GET /api/v1/nodes?label_selector=a%20in%20%28b%2C%20%C3%BC%29"
+        "GET /api/v1/nodes?label_selector=a+in+%28b%2C+%C3%BC%29"
     );
     assert_eq!(asked[0].header("authorization"), Some("Bearer abc.def"));
     assert_eq!(asked[0].header("if-match"), None);
@@ -87,13 +87,7 @@ async fn nobody_there_means_exit_3_for_writes_too() {
         .unwrap()
         .local_addr()
         .unwrap();
-    let client = Client::new(Endpoint {
-        url: parse_server(&format!("http://{address}")).unwrap(),
-        ca_file: None,
-        client_certificate: None,
-        token: None,
-    })
-    .unwrap();
+    let client = Client::new(Endpoint::at(parse_server(&format!("http://{address}")).unwrap())).unwrap();
     for call in [Call::get(NODES), Call::delete("/api/v1/nodes/a")] {
         let error = client.send(&call).await.unwrap_err();
         assert_eq!(error.exit() as u8, 3, "{error}");
@@ -152,10 +146,8 @@ fn authorities_are_read_before_anything_is_sent() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("ca.pem");
     let endpoint = Endpoint {
-        url: parse_server("https://127.0.0.1:1").unwrap(),
         ca_file: Some(file.clone()),
-        client_certificate: None,
-        token: None,
+        ..Endpoint::at(parse_server("https://127.0.0.1:1").unwrap())
     };
     assert_eq!(Client::new(endpoint.clone()).unwrap_err().exit() as u8, 1);
     std::fs::write(&file, "no certificate").unwrap();
@@ -229,10 +221,9 @@ async fn a_server_may_ask_for_a_certificate() {
     std::fs::write(&cert_file, made.cert.pem()).unwrap();
     std::fs::write(&key_file, made.signing_key.serialize_pem()).unwrap();
     let endpoint = |client_certificate| Endpoint {
-        url: parse_server(&url).unwrap(),
         ca_file: Some(ca_file.clone()),
         client_certificate,
-        token: None,
+        ..Endpoint::at(parse_server(&url).unwrap())
     };
     let shown = ClientCertificate {
         cert_file: cert_file.clone(),
@@ -265,10 +256,9 @@ async fn tls_needs_the_authority_that_signed() {
     let (url, ca_file, _task) = tls_server(directory.path(), None).await;
     let client = |url: &str, ca_file| {
         let endpoint = Endpoint {
-            url: parse_server(url).unwrap(),
             ca_file,
-            client_certificate: None,
             token: Some(TokenSource::Variable(Token::of("abc"))),
+            ..Endpoint::at(parse_server(url).unwrap())
         };
         Client::new(endpoint).unwrap()
     };

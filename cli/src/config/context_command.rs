@@ -7,9 +7,9 @@ use serde_json::{Value, json};
 
 use super::contexts::{self, Context, Contexts, parse_name};
 use super::endpoint::{parse_server, unknown_context};
-use super::text::{cell, note, print};
+use super::text::{cell, flag, list, note, print};
 use crate::exit::{CliError, Exit};
-use crate::output::{Align, Format, render_table, terminal_width};
+use crate::output::{self, Align, Format, terminal_width};
 
 /// Commands of `blaze context`.
 #[derive(Debug, Subcommand)]
@@ -120,8 +120,7 @@ fn run_with(command: &ContextCommand, file: &Path, format: Format) -> Result<Exi
                     "there are no contexts: `blaze context add NAME --server URL` makes one",
                 );
             }
-            print(&listed(&known), format, table)?;
-            Ok(Exit::Done)
+            print(&listed(&known), format, table)
         }
     }
 }
@@ -143,8 +142,7 @@ fn told(known: &Contexts, name: &str, what: &str, format: Format) -> Result<Exit
     print(&listed(known), format, |_| {
         let current = known.current.as_deref().unwrap_or("none");
         format!("{name} {what}; current: {current}")
-    })?;
-    Ok(Exit::Done)
+    })
 }
 
 fn listed(known: &Contexts) -> Value {
@@ -163,33 +161,26 @@ fn listed(known: &Contexts) -> Value {
 }
 
 fn table(listed: &Value) -> String {
-    let items = listed
-        .get("items")
-        .and_then(Value::as_array)
-        .map_or(&[][..], Vec::as_slice);
-    if items.is_empty() {
+    let contexts = list(listed, "items");
+    if contexts.is_empty() {
         return String::new();
     }
-    let columns = [
-        ("NAME", Align::Left),
-        ("CURRENT", Align::Left),
-        ("SERVER", Align::Left),
-        ("TOKEN FILE", Align::Left),
-        ("AUTHORITIES", Align::Left),
-        ("CLIENT CERTIFICATE", Align::Left),
-    ];
-    let row = |item: &Value| {
-        let current = item.get("current").and_then(Value::as_bool).unwrap_or(false);
-        vec![
-            cell(item.get("name")),
-            if current { "*".to_owned() } else { String::new() },
-            cell(item.get("server")),
-            cell(item.get("token_file")),
-            cell(item.get("ca_file")),
-            cell(item.get("client_cert")),
-        ]
-    };
-    render_table(&columns, items.iter().map(row).collect(), terminal_width())
+    output::table(
+        contexts,
+        terminal_width(),
+        &[
+            ("NAME", Align::Left, &|context| cell(context.get("name"))),
+            ("CURRENT", Align::Left, &|context| {
+                (if flag(context, "current") { "*" } else { "" }).to_owned()
+            }),
+            ("SERVER", Align::Left, &|context| cell(context.get("server"))),
+            ("TOKEN FILE", Align::Left, &|context| cell(context.get("token_file"))),
+            ("AUTHORITIES", Align::Left, &|context| cell(context.get("ca_file"))),
+            ("CLIENT CERTIFICATE", Align::Left, &|context| {
+                cell(context.get("client_cert"))
+            }),
+        ],
+    )
 }
 
 #[cfg(test)]

@@ -150,23 +150,14 @@ async fn delete(
         return Ok(());
     }
     for (index, (key, answer)) in found.iter().enumerate() {
-        let tag = if force {
-            "*".to_owned()
-        } else {
-            client.tag(answer.clone())?
-        };
         let call = Call::delete(document_path(key))
             .query_if("cascade", cascade.then_some("true"))
-            .if_match(Some(tag));
+            .if_match(Some(client.tag(answer, force)?));
         match client.send(&call).await {
             Ok(answer) => gone.revisions.extend(answer.revision),
             // What stood before it has taken it along; it existed when all was read.
             Err(CliError::Problem(refusal)) if index > 0 && refusal.code() == "not_found" => {}
-            Err(CliError::Problem(refusal)) if refusal.code() == "in_use" => {
-                let hint = "--cascade deletes what refers to it, too";
-                return Err(CliError::Problem(Box::new(refusal.with_hint(hint))));
-            }
-            Err(error) => return Err(error),
+            Err(error) => return Err(error.hinted("in_use", "--cascade deletes what refers to it, too")),
         }
         gone.keys.push(key.clone());
     }

@@ -11,10 +11,10 @@ use super::effective;
 use super::history;
 use super::kinds::{BASE, document_path, name_of};
 use super::options::{DocumentOptions, ServerOptions};
-use super::text::{age, cell, member, now_ms, print};
+use super::text::{age, cell, flag, list, member, now_ms, print, whole};
 use super::yaml;
 use crate::exit::{CliError, Exit};
-use crate::output::{Align, Format, render_table, terminal_width};
+use crate::output::{self, Align, Format, terminal_width};
 
 /// Changes that are shown.
 const CHANGES: u64 = 5;
@@ -38,8 +38,7 @@ pub(super) async fn run(options: &DescribeOptions, format: Format) -> Result<Exi
     let key = options.document.key()?;
     let client = Client::of(&options.server)?;
     let description = describe(&client, &key).await?;
-    print(&description, format, |description| text(&key, description, now_ms()))?;
-    Ok(Exit::Done)
+    print(&description, format, |description| text(&key, description, now_ms()))
 }
 
 /// Everything about one document: `document`, `effective` (`null` for a roll-out), `workers` that it concerns with
@@ -84,7 +83,7 @@ fn effective_call(key: &Key) -> Option<Call> {
 
 /// The workers of the layers that a document concerns, each with whether it has the document as it is now.
 fn concerned(key: &Key, document: &Value, effective: Option<&Value>, workers: &Value) -> Vec<Value> {
-    let revision = document.get("revision").and_then(Value::as_u64).unwrap_or(0);
+    let revision = whole(document, "revision");
     let text = |pointer: &str| document.pointer(pointer).and_then(Value::as_str);
     let one: Option<&str> = match key.kind() {
         Kind::Layer => Some(key.name().as_str()),
@@ -99,26 +98,24 @@ fn concerned(key: &Key, document: &Value, effective: Option<&Value>, workers: &V
         (None, Some(listed)) => listed.iter().any(|known| known.as_str() == Some(layer)),
         (None, None) => true,
     };
-    let items = workers.get("items").and_then(Value::as_array);
-    let mut found = Vec::new();
-    for worker in items.into_iter().flatten() {
-        if !is_concerned(worker.get("layer").and_then(Value::as_str).unwrap_or_default()) {
-            continue;
-        }
-        let mut worker = worker.clone();
-        if let Some(members) = worker.as_object_mut() {
-            let has = members.get("revision").and_then(Value::as_u64).unwrap_or(0) >= revision;
-            members.insert("applied".to_owned(), has.into());
-        }
-        found.push(worker);
-    }
-    found
+    let workers = list(workers, "items").iter();
+    let concerned = workers.filter(|worker| is_concerned(&member(worker, "layer")));
+    concerned
+        .map(|worker| {
+            let mut worker = worker.clone();
+            let has = whole(&worker, "revision") >= revision;
+            if let Some(members) = worker.as_object_mut() {
+                members.insert("applied".to_owned(), has.into());
+            }
+            worker
+        })
+        .collect()
 }
 
 fn text(key: &Key, description: &Value, now_ms: i64) -> String {
     let null = Value::Null;
     let part = |name: &str| description.get(name).unwrap_or(&null);
-    let list = |name: &str| part(name).as_array().map_or(&[][..], Vec::as_slice);
+    let entries = |name: &str| list(description, name);
     let document = part("document");
     let mut out = format!(
         "{}, revision {}, changed {} ago by {}, made {} ago\n\n",
@@ -137,35 +134,29 @@ fn text(key: &Key, description: &Value, now_ms: i64) -> String {
         out.push_str("\nEffective configuration\n");
         out.push_str(&effective::text(part("effective")));
     }
-    if !list("workers").is_empty() {
+    if !entries("workers").is_empty() {
         out.push_str("\nWorkers\n");
-        out.push_str(&workers_table(list("workers"), terminal_width()));
+        out.push_str(&workers_table(entries("workers"), terminal_width()));
     }
     out.push_str("\nLast changes\n");
-    out.push_str(&history::table(list("history"), now_ms, terminal_width()));
+    out.push_str(&history::table(entries("history"), now_ms, terminal_width()));
     out
 }
 
 fn workers_table(workers: &[Value], width: Option<u16>) -> String {
-    let columns = [
-        ("WORKER", Align::Left),
-        ("CONNECTED", Align::Left),
-        ("REVISION", Align::Right),
-        ("HAS IT", Align::Left),
-    ];
-    let yes = |value: Option<&Value>| match value.and_then(Value::as_bool) {
-        Some(true) => "yes".to_owned(),
-        Some(false) | None => "no".to_owned(),
-    };
-    let row = |worker: &Value| {
-        vec![
-            format!("{}/{}", member(worker, "layer"), cell(worker.get("node"))),
-            yes(worker.get("connected")),
-            cell(worker.get("revision")),
-            yes(worker.get("applied")),
-        ]
-    };
-    render_table(&columns, workers.iter().map(row).collect(), width)
+    let yes = |worker: &Value, name: &str| (if flag(worker, name) { "yes" } else { "no" }).to_owned();
+    output::table(
+        workers,
+        width,
+        &[
+            ("WORKER", Align::Left, &|worker| {
+                format!("{}/{}", member(worker, "layer"), cell(worker.get("node")))
+            }),
+            ("CONNECTED", Align::Left, &|worker| yes(worker, "connected")),
+            ("REVISION", Align::Right, &|worker| cell(worker.get("revision"))),
+            ("HAS IT", Align::Left, &|worker| yes(worker, "applied")),
+        ],
+    )
 }
 
 #[cfg(test)]

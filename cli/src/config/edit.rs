@@ -7,9 +7,7 @@
 //! The file holds the revision that was read: where it is applied later, it is the precondition.
 //! ```
 
-use std::fs::OpenOptions;
 use std::io::Write as _;
-use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
@@ -57,10 +55,12 @@ pub(super) async fn run(options: &EditOptions, format: Format) -> Result<Exit, C
     match edit(&client, &key, options.force, &editor, &std::env::temp_dir()).await? {
         Some(document) => print(&document, format, |document| {
             format!("{} is at revision {}", name_of(&key), cell(document.get("revision")))
-        })?,
-        None => note(format, "nothing was changed"),
+        }),
+        None => {
+            note(format, "nothing was changed");
+            Ok(Exit::Done)
+        }
     }
-    Ok(Exit::Done)
 }
 
 /// The document after the change; `None` if there is none.
@@ -71,10 +71,9 @@ async fn edit(
     editor: &str,
     directory: &Path,
 ) -> Result<Option<Value>, CliError> {
-    let mut answer = client.document(key, None).await?;
-    let document = std::mem::take(&mut answer.body);
-    let tag = if force { "*".to_owned() } else { client.tag(answer)? };
-    let (before, text) = shown(key, document, force);
+    let answer = client.document(key, None).await?;
+    let tag = client.tag(&answer, force)?;
+    let (before, text) = shown(key, answer.body, force);
     let file = new_file(directory, key, &text)?;
     if let Err(error) = launch(editor, &file).await {
         return Err(not_edited(error, &file, &text));
@@ -115,20 +114,17 @@ fn shown(key: &Key, document: Value, force: bool) -> (Value, String) {
 }
 
 fn new_file(directory: &Path, key: &Key, text: &str) -> Result<PathBuf, CliError> {
-    let name = name_of(key).replace('/', "-");
     let failed = |error: std::io::Error| CliError::Failed(format!("a file in {}: {error}", directory.display()));
-    for number in 0..100 {
-        let file = directory.join(format!("blaze-{name}-{}-{number}.yaml", std::process::id()));
-        match OpenOptions::new().create_new(true).write(true).mode(0o600).open(&file) {
-            Ok(mut open) => {
-                open.write_all(text.as_bytes()).map_err(failed)?;
-                return Ok(file);
-            }
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-            Err(error) => return Err(failed(error)),
-        }
-    }
-    Err(failed(std::io::Error::from(std::io::ErrorKind::AlreadyExists)))
+    let name = format!("blaze-{}-", name_of(key).replace('/', "-"));
+    // Its mode is 0600.
+    let made = tempfile::Builder::new()
+        .prefix(&name)
+        .suffix(".yaml")
+        .tempfile_in(directory);
+    let mut file = made.map_err(failed)?;
+    file.write_all(text.as_bytes()).map_err(failed)?;
+    let (_, path) = file.keep().map_err(|error| failed(error.error))?;
+    Ok(path)
 }
 
 /// Runs the editor; its variable may hold options, as in `code --wait`.
@@ -216,24 +212,17 @@ mod tests {
     }
 
     fn left(directory: &Path) -> Vec<PathBuf> {
-        std::fs::read_dir(directory)
-            .unwrap()
-            .map(|entry| entry.unwrap().path())
-            .collect()
+        let entries = std::fs::read_dir(directory).unwrap();
+        entries.map(|entry| entry.unwrap().path()).collect()
     }
+
+    const TO_MOBILE: &str = "sed -i s/static/mobile/";
 
     #[tokio::test]
     async fn what_was_edited_replaces_what_was_read() {
         let directory = tempfile::tempdir().unwrap();
         let stub = stub(200).await;
-        let done = edit(
-            &stub.client(),
-            &key(),
-            false,
-            "sed -i s/static/mobile/",
-            directory.path(),
-        )
-        .await;
+        let done = edit(&stub.client(), &key(), false, TO_MOBILE, directory.path()).await;
         assert_eq!(done.unwrap().unwrap()["revision"], 412);
         let put = stub.asked().pop().unwrap();
         assert_eq!(put.line(), "PUT /api/v1/nodes/robot-1");
@@ -249,29 +238,15 @@ mod tests {
     async fn nothing_is_sent_where_nothing_was_changed_or_the_editor_failed() {
         let directory = tempfile::tempdir().unwrap();
         let stub = stub(200).await;
-        let client = stub.client();
-        assert!(
-            edit(&client, &key(), false, "true", directory.path())
-                .await
-                .unwrap()
-                .is_none()
-        );
-        let error = edit(&client, &key(), false, "false", directory.path())
-            .await
-            .unwrap_err();
+        let (client, key) = (stub.client(), key());
+        let edited = |editor: &'static str| edit(&client, &key, false, editor, directory.path());
+        assert!(edited("true").await.unwrap().is_none());
+        let error = edited("false").await.unwrap_err();
         assert!(error.to_string().contains("nothing was changed"), "{error}");
         assert!(!error.to_string().contains("What "), "{error}");
         assert!(left(directory.path()).is_empty());
         // It wrote something and failed then.
-        let error = edit(
-            &client,
-            &key(),
-            false,
-            "false $(sed -i s/static/mobile/ \"$1\")",
-            directory.path(),
-        )
-        .await
-        .unwrap_err();
+        let error = edited("false $(sed -i s/static/mobile/ \"$1\")").await.unwrap_err();
         assert!(
             error.to_string().contains("What the editor left behind is in"),
             "{error}"
@@ -280,52 +255,35 @@ mod tests {
         assert!(stub.asked().iter().all(|asked| asked.method == "GET"));
     }
 
+    /// The file is fenced by the revision that was read, except for whoever forces a change: he wants no precondition.
     #[tokio::test]
     async fn a_conflict_keeps_the_file_and_says_how_to_go_on() {
-        let directory = tempfile::tempdir().unwrap();
-        let stub = stub(412).await;
-        let client = stub.client();
-        let error = edit(&client, &key(), true, "sed -i s/static/mobile/", directory.path())
-            .await
-            .unwrap_err();
-        assert_eq!(error.exit() as u8, 5);
-        assert_eq!(stub.asked().pop().unwrap().header("if-match"), Some("*"));
-        let files = left(directory.path());
-        assert!(
-            error
-                .to_string()
-                .contains(&format!("blaze diff -f {}", files[0].display())),
-            "{error}"
-        );
-        let text = std::fs::read_to_string(&files[0]).unwrap();
-        // Whoever forces a change wants no precondition.
-        assert!(text.contains("type: mobile") && !text.contains("revision"), "{text}");
-    }
-
-    #[tokio::test]
-    async fn what_stays_is_fenced_by_the_revision_that_was_read() {
-        let directory = tempfile::tempdir().unwrap();
-        let stub = stub(412).await;
-        let error = edit(
-            &stub.client(),
-            &key(),
-            false,
-            "sed -i s/static/mobile/",
-            directory.path(),
-        )
-        .await
-        .unwrap_err();
-        assert_eq!(error.exit() as u8, 5);
-        // The revision is the precondition of `apply`; here the entity tag is.
-        assert_eq!(stub.asked().pop().unwrap().json().get("revision"), None);
-        let file = left(directory.path()).remove(0);
-        let kept = files::read(&[file]).unwrap();
-        assert_eq!(kept[0].value["revision"], 412);
-        assert_eq!(kept[0].value["spec"]["type"], "mobile");
-        assert!(
-            error.to_string().contains("set its `revision` to the one of now"),
-            "{error}"
-        );
+        for (force, tag, revision, advice) in [
+            (true, "*", Value::Null, "blaze diff -f "),
+            (false, "\"412\"", json!(412), "set its `revision` to the one of now"),
+        ] {
+            let directory = tempfile::tempdir().unwrap();
+            let stub = stub(412).await;
+            let error = edit(&stub.client(), &key(), force, TO_MOBILE, directory.path())
+                .await
+                .unwrap_err();
+            assert_eq!(error.exit() as u8, 5);
+            let put = stub.asked().pop().unwrap();
+            assert_eq!(put.header("if-match"), Some(tag));
+            // The revision is the precondition of `apply`; here the entity tag is.
+            assert_eq!(put.json().get("revision"), None);
+            let file = left(directory.path()).remove(0);
+            let text = error.to_string();
+            assert!(
+                text.contains(advice) && text.contains(&file.display().to_string()),
+                "{text}"
+            );
+            let kept = &files::read(&[file]).unwrap()[0].value;
+            assert_eq!(
+                (&kept["revision"], &kept["spec"]["type"]),
+                (&revision, &json!("mobile"))
+            );
+        }
     }
 
     #[tokio::test]

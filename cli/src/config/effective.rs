@@ -8,10 +8,10 @@ use super::call::Call;
 use super::client::Client;
 use super::kinds::{BASE, key_of, name_of, parse_service};
 use super::options::ServerOptions;
-use super::text::{cell, compact, member, print};
+use super::text::{cell, compact, flag, joined, list, member, print, printable};
 use super::yaml;
 use crate::exit::{CliError, Exit};
-use crate::output::{Align, Format, render_table, terminal_width};
+use crate::output::{self, Align, Format, terminal_width};
 
 /// Options of `blaze effective`.
 #[derive(Debug, Args)]
@@ -71,15 +71,10 @@ fn parse_wanted(text: &str) -> Result<Wanted, String> {
 /// [`CliError`].
 pub(super) async fn run(options: &EffectiveOptions, format: Format) -> Result<Exit, CliError> {
     let client = Client::of(&options.server)?;
-    let answer = client.send(&call(options)?).await.map_err(|error| match error {
-        CliError::Problem(refusal) if refusal.code() == "not_found" => {
-            let hint = "`blaze get services`, `get nodes` and `get layers` list what there is";
-            CliError::Problem(Box::new(refusal.with_hint(hint)))
-        }
-        other => other,
-    })?;
-    print(&answer.body, format, text)?;
-    Ok(Exit::Done)
+    let hint = "`blaze get services`, `get nodes` and `get layers` list what there is";
+    let answer = client.send(&call(options)?).await;
+    let answer = answer.map_err(|error| error.hinted("not_found", hint))?;
+    print(&answer.body, format, text)
 }
 
 fn call(options: &EffectiveOptions) -> Result<Call, CliError> {
@@ -108,14 +103,20 @@ pub(super) fn text(answer: &Value) -> String {
     let config = answer.get("config").unwrap_or(&Value::Null);
     match answer.get("explain").and_then(Value::as_object) {
         Some(explain) => {
-            let columns = [
-                ("KEY", Align::Left),
-                ("VALUE", Align::Left),
-                ("FROM", Align::Left),
-                ("OVERRIDES", Align::Left),
-            ];
-            let rows = explain.iter().map(|(path, entry)| row(path, entry, config)).collect();
-            text.push_str(&render_table(&columns, rows, terminal_width()));
+            let values: Vec<_> = explain.iter().collect();
+            text.push_str(&output::table(
+                &values,
+                terminal_width(),
+                &[
+                    ("KEY", Align::Left, &|(path, _)| printable(path)),
+                    ("VALUE", Align::Left, &|(path, entry)| match flag(entry, "removed") {
+                        true => "(removed)".to_owned(),
+                        false => config.pointer(path).map_or_else(|| "-".to_owned(), compact),
+                    }),
+                    ("FROM", Align::Left, &|(_, entry)| source(entry)),
+                    ("OVERRIDES", Align::Left, &|(_, entry)| overridden(entry)),
+                ],
+            ));
         }
         None => text.push_str(&yaml::document(config)),
     }
@@ -143,38 +144,19 @@ fn heading(answer: &Value) -> String {
     text
 }
 
-fn row(path: &str, entry: &Value, config: &Value) -> Vec<String> {
-    let flag = |name: &str| entry.get(name).and_then(Value::as_bool).unwrap_or(false);
-    let value = if flag("removed") {
-        "(removed)".to_owned()
-    } else {
-        config.pointer(path).map_or_else(|| "-".to_owned(), compact)
+fn overridden(entry: &Value) -> String {
+    let part = |part: &Value| {
+        let value = part.get("value").map(|value| format!("{} ", compact(value)));
+        format!("{}of {}", value.unwrap_or_default(), source(part))
     };
-    let overridden = entry.get("overridden").and_then(Value::as_array);
-    let overridden: Vec<String> = overridden
-        .into_iter()
-        .flatten()
-        .map(|part| {
-            let value = part
-                .get("value")
-                .map(|value| format!("{} ", compact(value)))
-                .unwrap_or_default();
-            format!("{value}of {}", source(part))
-        })
-        .collect();
-    let overridden = if overridden.is_empty() {
-        "-".to_owned()
-    } else {
-        overridden.join("; ")
-    };
-    vec![super::text::printable(path), value, source(entry), overridden]
+    let parts: Vec<String> = list(entry, "overridden").iter().map(part).collect();
+    joined(&parts, "; ")
 }
 
 /// `instance/slam/0 @88`, with a note where it comes from `overrides`.
 fn source(part: &Value) -> String {
     let name = key_of(part).map_or_else(|_| cell(part.get("kind")), |key| name_of(&key));
-    let overrides = part.get("override").and_then(Value::as_bool).unwrap_or(false);
-    let overrides = if overrides { " (overrides)" } else { "" };
+    let overrides = if flag(part, "override") { " (overrides)" } else { "" };
     format!("{name} @{}{overrides}", cell(part.get("revision")))
 }
 

@@ -121,6 +121,16 @@ pub(crate) struct Endpoint {
 }
 
 impl Endpoint {
+    /// A server to which neither certificate nor token is shown.
+    pub(crate) fn at(url: Url) -> Self {
+        Self {
+            url,
+            ca_file: None,
+            client_certificate: None,
+            token: None,
+        }
+    }
+
     /// The server as people write it.
     pub(crate) fn server(&self) -> &str {
         self.url.as_str().trim_end_matches('/')

@@ -1,18 +1,20 @@
 //! `blaze export`: all documents in a form that `apply` takes.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use blaze_domain::LayerName;
-use blaze_domain::config::{Key, Kind};
+use blaze_domain::config::placement::placement;
+use blaze_domain::config::state::State;
+use blaze_domain::config::{Document, Key, Kind};
 use clap::Args;
 use serde_json::Value;
 
 use super::api::{Filter, clean};
-use super::call::Call;
 use super::client::Client;
-use super::kinds::{BASE, key_of};
+use super::kinds::{document_of, key_of};
 use super::options::ServerOptions;
-use super::stream::{Told, Watcher};
+use super::stream::changes_between;
+use super::text::json_pretty;
 use super::yaml;
 use crate::exit::{CliError, Exit};
 use crate::output::{self, Format};
@@ -46,13 +48,11 @@ pub(super) async fn run(options: &ExportOptions, format: Format) -> Result<Exit,
         // A layer that does not exist is no empty one.
         client.document(&Key::layer(layer), None).await?;
     }
-    let (all, revision) = read(&client, options.rollouts).await?;
-    let view = options.layer.as_ref().map(|layer| View::of(layer.as_str(), &all));
-    let documents: Vec<Value> = all
-        .iter()
-        .filter(|(key, document)| view.as_ref().is_none_or(|view| view.sees(key, document)))
-        .map(|(_, document)| clean(document.clone()))
-        .collect();
+    let (mut all, revision) = read(&client, options.rollouts).await?;
+    if let Some(layer) = &options.layer {
+        all = seen_by(layer, all);
+    }
+    let documents: Vec<Value> = all.into_values().map(clean).collect();
     output::print(&match format {
         Format::Table | Format::Yaml => {
             format!(
@@ -61,9 +61,7 @@ pub(super) async fn run(options: &ExportOptions, format: Format) -> Result<Exit,
                 yaml::documents(&documents)
             )
         }
-        Format::Json => {
-            serde_json::to_string_pretty(&documents).map_err(|error| CliError::Failed(error.to_string()))?
-        }
+        Format::Json => json_pretty(&documents)?,
     })?;
     Ok(Exit::Done)
 }
@@ -79,7 +77,7 @@ async fn read(client: &Client, rollouts: bool) -> Result<(BTreeMap<Key, Value>, 
             let revision = listing.revision.ok_or_else(|| client.odd("a list has no revision"))?;
             listed.insert(kind, revision);
             for document in listing.items {
-                let key = key_of(&document).map_err(|reason| client.odd(&format!("a document {reason}")))?;
+                let key = key_of(&document).map_err(|reason| client.odd(format!("a document {reason}")))?;
                 all.insert(key, document);
             }
         }
@@ -103,28 +101,14 @@ async fn catch_up(
     if oldest == newest {
         return Ok(Some(newest));
     }
-    let revision_of = |event: &Value| event.get("revision").and_then(Value::as_u64).unwrap_or(0);
-    let mut watcher = Watcher::new(client, Call::get(format!("{BASE}/watch")), Some(oldest), false);
-    loop {
-        let reached = match watcher.next().await? {
-            Told::Relist(_) => return Ok(None),
-            Told::Bookmark(bookmark) => revision_of(&bookmark),
-            Told::Change(commit) => {
-                let revision = revision_of(&commit);
-                let changes = commit.get("changes").and_then(Value::as_array);
-                for change in changes.into_iter().flatten().filter(|_| revision <= newest) {
-                    let key = key_of(change).map_err(|reason| client.odd(&format!("a change {reason}")))?;
-                    if listed.get(&key.kind()).is_some_and(|list| revision > *list) {
-                        put(all, key, change);
-                    }
-                }
-                revision
-            }
-        };
-        if reached >= newest {
-            return Ok(Some(newest));
+    let is_told = changes_between(client, oldest, newest, |revision, change| {
+        let key = key_of(change).map_err(|reason| client.odd(format!("a change {reason}")))?;
+        if listed.get(&key.kind()).is_some_and(|list| revision > *list) {
+            put(all, key, change);
         }
-    }
+        Ok(())
+    });
+    Ok(is_told.await?.then_some(newest))
 }
 
 fn put(all: &mut BTreeMap<Key, Value>, key: Key, change: &Value) {
@@ -138,59 +122,12 @@ fn put(all: &mut BTreeMap<Key, Value>, key: Key, change: &Value) {
     }
 }
 
-/// What a worker of one layer knows: the same rule as that of its digest.
-struct View<'a> {
-    layer: &'a str,
-    nodes: BTreeSet<&'a str>,
-    services: BTreeSet<&'a str>,
-    all: &'a BTreeMap<Key, Value>,
-}
-
-impl<'a> View<'a> {
-    fn of(layer: &'a str, all: &'a BTreeMap<Key, Value>) -> Self {
-        let names = |kind: Kind, holds: &dyn Fn(&Value) -> bool| -> BTreeSet<&'a str> {
-            let found = all.iter().filter(|entry| entry.0.kind() == kind && holds(entry.1));
-            found.map(|(key, _)| key.name().as_str()).collect()
-        };
-        Self {
-            layer,
-            nodes: names(Kind::Node, &|node| text(node, "/spec/layer") == Some(layer)),
-            services: names(Kind::Service, &|service| {
-                let layers = service.pointer("/spec/layers").and_then(Value::as_array);
-                layers.is_none_or(|layers| layers.iter().any(|known| known.as_str() == Some(layer)))
-            }),
-            all,
-        }
-    }
-
-    fn sees(&self, key: &Key, document: &Value) -> bool {
-        let name = key.name().as_str();
-        match key.kind() {
-            Kind::Layer => name == self.layer,
-            Kind::Node => self.nodes.contains(name),
-            Kind::Service => self.services.contains(name),
-            Kind::Instance => {
-                let placed = match (text(document, "/spec/node"), text(document, "/spec/layer")) {
-                    (Some(node), _) => self.nodes.contains(node),
-                    (None, Some(layer)) => layer == self.layer,
-                    (None, None) => true,
-                };
-                placed
-                    && key
-                        .service_name()
-                        .is_some_and(|service| self.services.contains(service.as_str()))
-            }
-            Kind::Rollout => {
-                let target = document.pointer("/spec/target").and_then(|target| key_of(target).ok());
-                let target = target.filter(|target| target.kind() != Kind::Rollout);
-                target.is_some_and(|target| self.all.get(&target).is_some_and(|found| self.sees(&target, found)))
-            }
-        }
-    }
-}
-
-fn text<'d>(document: &'d Value, pointer: &str) -> Option<&'d str> {
-    document.pointer(pointer)?.as_str()
+/// What a worker of one layer holds: the rule of its digest.
+fn seen_by(layer: &LayerName, mut all: BTreeMap<Key, Value>) -> BTreeMap<Key, Value> {
+    let state = State::new(0, all.values().filter_map(|value| document_of(value).ok()));
+    let sees = |document: &Document| placement(&state, document).visible.contains(layer);
+    all.retain(|key, _| state.get(key).is_some_and(|held| sees(&held.document)));
+    all
 }
 
 #[cfg(test)]
@@ -227,13 +164,8 @@ mod tests {
 
     #[test]
     fn a_layer_gets_what_it_may_see() {
-        let all = all();
-        let view = View::of("edge", &all);
-        let seen: Vec<String> = all
-            .iter()
-            .filter(|(key, document)| view.sees(key, document))
-            .map(|(key, _)| name_of(key))
-            .collect();
+        let seen = seen_by(&"edge".parse().unwrap(), all());
+        let seen: Vec<String> = seen.keys().map(name_of).collect();
         assert_eq!(
             seen,
             [

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use blaze_domain::config::{Key, json};
-use blaze_runtime::config::{LocatedFault, Place, yaml_documents};
+use blaze_runtime::config::{LocatedFault, Place, located_documents};
 use blaze_runtime::state::read_small;
 use serde_json::Value;
 
@@ -190,7 +190,7 @@ fn parse(path: &Path, name: &str, bytes: Vec<u8>) -> Result<Vec<(Value, Origin)>
     let text = text.strip_prefix('\u{feff}').unwrap_or(&text);
     let looks_like_json = text.trim_start().starts_with(['[', '{']);
     let is_json = path.extension().is_some_and(|extension| extension == "json");
-    let (values, lines) = if is_json {
+    let values = if is_json {
         parse_json(text, name)?
     } else if is_stdin(path) && looks_like_json {
         // `{ kind: Layer, … }` and `{…}` behind `---` are YAML.
@@ -201,11 +201,11 @@ fn parse(path: &Path, name: &str, bytes: Vec<u8>) -> Result<Vec<(Value, Origin)>
     } else {
         parse_yaml(text, name)?
     };
-    Ok(located(values, &lines, name))
+    Ok(located(values, name))
 }
 
-/// Documents, and the lines on which they begin, if those are known.
-type Parsed = (Vec<Value>, Vec<usize>);
+/// Documents, and the lines on which they begin; 0 where that is not known.
+type Parsed = Vec<(usize, Value)>;
 
 fn parse_json(text: &str, name: &str) -> Result<Parsed, Vec<String>> {
     let value = json::parse_within(text.as_bytes(), MAX_DEPTH).map_err(|fault| {
@@ -216,17 +216,14 @@ fn parse_json(text: &str, name: &str) -> Result<Parsed, Vec<String>> {
         };
         vec![format!("{name}:{}: {pointer}{}", fault.line, fault.detail)]
     })?;
-    Ok((vec![value], Vec::new()))
+    Ok(vec![(0, value)])
 }
 
 fn parse_yaml(text: &str, name: &str) -> Result<Parsed, Vec<String>> {
-    let values = yaml_documents(text, MAX_DOCUMENTS).map_err(|faults| {
-        faults
-            .into_iter()
-            .map(|fault| in_file(fault, name).to_string())
-            .collect::<Vec<_>>()
-    })?;
-    Ok((values, document_lines(text)))
+    located_documents(text, MAX_DOCUMENTS).map_err(|faults| {
+        let faults = faults.into_iter().map(|fault| in_file(fault, name).to_string());
+        faults.collect()
+    })
 }
 
 /// Whether a text that is neither JSON nor YAML was meant as JSON: its first member has a quoted name.
@@ -249,12 +246,9 @@ fn in_file(mut fault: LocatedFault, name: &str) -> LocatedFault {
 }
 
 /// Takes lists apart (`[…]`, and `{"items": […]}` as `blaze get` prints it) and says where each document comes from.
-fn located(values: Vec<Value>, lines: &[usize], name: &str) -> Vec<(Value, Origin)> {
-    // A document that is `null` in words has a line and is left out: without a line for each there is none for any.
-    let known = lines.len() == values.len();
+fn located(values: Parsed, name: &str) -> Vec<(Value, Origin)> {
     let mut found = Vec::new();
-    for (index, value) in values.into_iter().enumerate() {
-        let line = lines.get(index).copied().filter(|_| known).unwrap_or(0);
+    for (line, value) in values {
         match value {
             Value::Null => {}
             Value::Array(items) => found.extend(items.into_iter().map(|item| (item, line))),
@@ -270,47 +264,16 @@ fn located(values: Vec<Value>, lines: &[usize], name: &str) -> Vec<(Value, Origi
     }
     let several = found.len() > 1;
     let file: Arc<str> = Arc::from(name);
-    let origin = |(index, line): (usize, usize)| Origin {
+    let origin = |line, number| Origin {
         file: Arc::clone(&file),
         line,
-        number: index + 1,
+        number,
         several,
     };
-    found
-        .into_iter()
-        .enumerate()
-        .map(|(index, (value, line))| (value, origin((index, line))))
+    let numbered = (1..).zip(found);
+    numbered
+        .map(|(number, (value, line))| (value, origin(line, number)))
         .collect()
-}
-
-/// The line on which each document of a YAML text begins: that of its first content. Empty ones have none.
-fn document_lines(text: &str) -> Vec<usize> {
-    let mut starts = Vec::new();
-    // Within a document, and whether anything of it came yet.
-    let (mut inside, mut begun) = (false, false);
-    for (index, line) in text.lines().enumerate() {
-        let behind = |mark: &str| {
-            line.strip_prefix(mark)
-                .filter(|rest| rest.is_empty() || rest.starts_with([' ', '\t']))
-        };
-        let is_content = |text: &str| !text.trim().is_empty() && !text.trim_start().starts_with('#');
-        let content = match (behind("---"), behind("...")) {
-            (Some(rest), _) => {
-                (inside, begun) = (true, false);
-                is_content(rest)
-            }
-            (None, Some(_)) => {
-                (inside, begun) = (false, false);
-                false
-            }
-            (None, None) => is_content(line) && (inside || !line.starts_with('%')),
-        };
-        if content && !begun {
-            starts.push(index + 1);
-            (inside, begun) = (true, true);
-        }
-    }
-    starts
 }
 
 #[cfg(test)]

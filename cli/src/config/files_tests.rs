@@ -36,22 +36,6 @@ fn documents_know_where_they_come_from() {
 }
 
 #[test]
-fn lines_of_documents_follow_the_rules_of_yaml() {
-    for (text, lines) in [
-        ("", &[][..]),
-        ("# nothing\n", &[]),
-        ("a: 1\n", &[1]),
-        ("---\na: 1\n--- # x\n# y\nb: 2\n", &[2, 5]),
-        ("--- {a: 1}\n---\n---\nb: 1\n---\n", &[1, 4]),
-        ("a: 1\n...\n# c\nb: 2\n...\n", &[1, 4]),
-        ("%YAML 1.2\n---\na: 1\n", &[3]),
-        ("a: |\n  ---\n  x\n---x: 2\n", &[1]),
-    ] {
-        assert_eq!(document_lines(text), lines, "{text:?}");
-    }
-}
-
-#[test]
 fn every_fault_has_its_place_and_nothing_is_taken() {
     assert!(
         faults("a.yaml", "kind: Node\nname: a\nname: b\n").contains("a.yaml:3"),

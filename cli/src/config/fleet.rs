@@ -9,17 +9,9 @@ use super::call::Call;
 use super::client::Client;
 use super::kinds::{self, BASE, key_of, name_of};
 use super::options::ServerOptions;
-use super::text::{age, cell, member, note, now_ms, parse_duration, print};
+use super::text::{age, cell, list, member, note, now_ms, parse_duration, print};
 use crate::exit::{CliError, Exit};
-use crate::output::{Align, Format, render_table, terminal_width};
-
-/// Options of `blaze workers`.
-#[derive(Debug, Args)]
-pub struct WorkersOptions {
-    /// Which server.
-    #[command(flatten)]
-    pub server: ServerOptions,
-}
+use crate::output::{self, Align, Format, terminal_width};
 
 /// Options of `blaze audit`.
 #[derive(Debug, Args)]
@@ -67,51 +59,36 @@ fn parse_time(text: &str) -> Result<Timestamp, String> {
 ///
 /// # Errors
 /// [`CliError`].
-pub(super) async fn workers(options: &WorkersOptions, format: Format) -> Result<Exit, CliError> {
-    let client = Client::of(&options.server)?;
-    let workers = client.workers().await?;
-    let items = workers.get("items").and_then(Value::as_array);
-    if items.is_none_or(Vec::is_empty) {
+pub(super) async fn workers(server: &ServerOptions, format: Format) -> Result<Exit, CliError> {
+    let workers = Client::of(server)?.workers().await?;
+    let items = list(&workers, "items");
+    if items.is_empty() && format == Format::Table {
         note(format, "no worker has connected yet");
-        if format == Format::Table {
-            return Ok(Exit::Done);
-        }
+        return Ok(Exit::Done);
     }
-    print(&workers, format, |_| {
-        workers_table(items.map_or(&[][..], Vec::as_slice), now_ms(), terminal_width())
-    })?;
-    Ok(Exit::Done)
+    print(&workers, format, |_| workers_table(items, now_ms(), terminal_width()))
 }
 
 fn workers_table(workers: &[Value], now_ms: i64, width: Option<u16>) -> String {
-    let columns = [
-        ("LAYER", Align::Left),
-        ("NODE", Align::Left),
-        ("CONNECTED", Align::Left),
-        ("REVISION", Align::Right),
-        ("IN SYNC", Align::Left),
-        ("SEEN", Align::Right),
-        ("VERSION", Align::Left),
-        ("ID", Align::Left),
-    ];
-    let yes = |value: Option<&Value>| match value.and_then(Value::as_bool) {
+    let yes = |worker: &Value, name: &str| match worker.get(name).and_then(Value::as_bool) {
         Some(true) => "yes".to_owned(),
         Some(false) => "no".to_owned(),
         None => "-".to_owned(),
     };
-    let row = |worker: &Value| {
-        vec![
-            cell(worker.get("layer")),
-            cell(worker.get("node")),
-            yes(worker.get("connected")),
-            cell(worker.get("revision")),
-            yes(worker.get("in_sync")),
-            age(worker.get("last_seen"), now_ms),
-            cell(worker.get("version")),
-            cell(worker.get("worker_id")),
-        ]
-    };
-    render_table(&columns, workers.iter().map(row).collect(), width)
+    output::table(
+        workers,
+        width,
+        &[
+            ("LAYER", Align::Left, &|worker| cell(worker.get("layer"))),
+            ("NODE", Align::Left, &|worker| cell(worker.get("node"))),
+            ("CONNECTED", Align::Left, &|worker| yes(worker, "connected")),
+            ("REVISION", Align::Right, &|worker| cell(worker.get("revision"))),
+            ("IN SYNC", Align::Left, &|worker| yes(worker, "in_sync")),
+            ("SEEN", Align::Right, &|worker| age(worker.get("last_seen"), now_ms)),
+            ("VERSION", Align::Left, &|worker| cell(worker.get("version"))),
+            ("ID", Align::Left, &|worker| cell(worker.get("worker_id"))),
+        ],
+    )
 }
 
 /// Lists who did what.
@@ -135,11 +112,9 @@ pub(super) async fn audit(options: &AuditOptions, format: Format) -> Result<Exit
             .items
             .retain(|entry| entry.get("service").and_then(Value::as_str) == Some(service.as_str()));
     }
-    if listing.items.is_empty() {
+    if listing.items.is_empty() && format == Format::Table {
         note(format, "nothing that was written down matches");
-        if format == Format::Table {
-            return Ok(Exit::Done);
-        }
+        return Ok(Exit::Done);
     }
     if listing.is_cut() {
         note(
@@ -147,12 +122,9 @@ pub(super) async fn audit(options: &AuditOptions, format: Format) -> Result<Exit
             "there are older entries: --limit N shows more, --since and --until fewer",
         );
     }
-    let now = now_ms();
     print(&listing.into_json(), format, |listing| {
-        let items = listing.get("items").and_then(Value::as_array);
-        audit_table(items.map_or(&[][..], Vec::as_slice), now, terminal_width())
-    })?;
-    Ok(Exit::Done)
+        audit_table(list(listing, "items"), now_ms(), terminal_width())
+    })
 }
 
 /// An instance may be given as `SERVICE/NAME`; the server filters by the name alone.
@@ -168,36 +140,24 @@ fn service_and_name(options: &AuditOptions) -> Result<(Option<ServiceName>, Opti
 }
 
 fn audit_table(entries: &[Value], now_ms: i64, width: Option<u16>) -> String {
-    let columns = [
-        ("AGE", Align::Right),
-        ("REVISION", Align::Right),
-        ("SUBJECT", Align::Left),
-        ("ACTION", Align::Left),
-        ("DOCUMENT", Align::Left),
-        ("OUTCOME", Align::Left),
-        ("FROM", Align::Left),
-        ("REQUEST", Align::Left),
-    ];
-    let row = |entry: &Value| {
-        let document = key_of(entry).map_or_else(|_| cell(entry.get("name")), |key| name_of(&key));
-        let code = member(entry, "code");
-        let outcome = if code.is_empty() {
-            cell(entry.get("outcome"))
-        } else {
-            code
-        };
-        vec![
-            age(entry.get("time"), now_ms),
-            cell(entry.get("revision")),
-            cell(entry.get("subject")),
-            cell(entry.get("action")),
-            document,
-            outcome,
-            cell(entry.get("address")),
-            cell(entry.get("request_id")),
-        ]
-    };
-    render_table(&columns, entries.iter().map(row).collect(), width)
+    let document = |entry: &Value| key_of(entry).map_or_else(|_| cell(entry.get("name")), |key| name_of(&key));
+    output::table(
+        entries,
+        width,
+        &[
+            ("AGE", Align::Right, &|entry| age(entry.get("time"), now_ms)),
+            ("REVISION", Align::Right, &|entry| cell(entry.get("revision"))),
+            ("SUBJECT", Align::Left, &|entry| cell(entry.get("subject"))),
+            ("ACTION", Align::Left, &|entry| cell(entry.get("action"))),
+            ("DOCUMENT", Align::Left, &document),
+            ("OUTCOME", Align::Left, &|entry| match member(entry, "code") {
+                code if code.is_empty() => cell(entry.get("outcome")),
+                code => code,
+            }),
+            ("FROM", Align::Left, &|entry| cell(entry.get("address"))),
+            ("REQUEST", Align::Left, &|entry| cell(entry.get("request_id"))),
+        ],
+    )
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use blaze_domain::{LayerName, NodeName, ServiceName};
 use clap::Args;
 use serde_json::Value;
 
-use super::api::{Filter, clean};
+use super::api::{Filter, Listing, clean};
 use super::client::Client;
 use super::kinds::{key_of, name_of};
 use super::options::{DocumentOptions, ServerOptions};
@@ -108,11 +108,20 @@ pub(super) async fn run(options: &GetOptions, output: Output) -> Result<Exit, Cl
     options.check(key.as_ref(), output)?;
     let client = Client::of(&options.server)?;
     let kind = options.document.target.kind;
+    // What follows the first list has no more columns, and no names alone.
+    let format = match output {
+        Output::Table | Output::Wide | Output::Name => Format::Table,
+        Output::Json => Format::Json,
+        Output::Yaml => Format::Yaml,
+    };
     let since = match &key {
         Some(key) => {
             let answer = client.read_document(key, options.revision, options.reveal).await?;
             let document = if options.clean { clean(answer.body) } else { answer.body };
-            show_one(kind, &document, output, options.watch)?;
+            match format {
+                Format::Table => show_rows(kind, std::slice::from_ref(&document), output)?,
+                Format::Json | Format::Yaml => show_value(&document, format, options.watch)?,
+            }
             answer.revision
         }
         None => {
@@ -120,21 +129,10 @@ pub(super) async fn run(options: &GetOptions, output: Output) -> Result<Exit, Cl
             if options.clean {
                 listing.items = listing.items.into_iter().map(clean).collect();
             }
-            if listing.is_cut() && output != Output::Json && output != Output::Yaml {
-                eprintln!(
-                    "blaze: these are the first {}; there are more",
-                    count(listing.items.len(), kind.word())
-                );
-            }
             let revision = listing.revision;
-            if matches!(output, Output::Json | Output::Yaml) {
-                show_value(&listing.into_json(), output, options.watch)?;
-            } else {
-                if listing.items.is_empty() && output != Output::Name && options.is_filtered() {
-                    eprintln!("blaze: no {} match", kind.collection());
-                } else {
-                    show_rows(kind, &listing.items, output)?;
-                }
+            match format {
+                Format::Table => show_listing(kind, &listing, output, options.is_filtered())?,
+                Format::Json | Format::Yaml => show_value(&listing.into_json(), format, options.watch)?,
             }
             revision
         }
@@ -149,29 +147,28 @@ pub(super) async fn run(options: &GetOptions, output: Output) -> Result<Exit, Cl
         layer: options.layer.clone(),
         selector: options.selector.clone(),
     };
-    let format = match output {
-        Output::Table | Output::Wide | Output::Name => Format::Table,
-        Output::Json => Format::Json,
-        Output::Yaml => Format::Yaml,
-    };
     watch::until_interrupted(&client, &scope, since, format, false).await
 }
 
-fn show_one(kind: Kind, document: &Value, output: Output, line: bool) -> Result<(), CliError> {
-    match output {
-        Output::Table | Output::Wide | Output::Name => show_rows(kind, std::slice::from_ref(document), output),
-        Output::Json | Output::Yaml => show_value(document, output, line),
+/// With `line`, JSON stands on one line, because events follow, one a line.
+fn show_value(value: &Value, format: Format, line: bool) -> Result<(), CliError> {
+    match (format, line) {
+        (Format::Json, true) => output::print(&json_line(value)?),
+        (Format::Yaml, true) => output::print(&yaml::documents([value])),
+        _ => print(value, format, |_| String::new()).map(drop),
     }
 }
 
-/// With `line`, JSON stands on one line, because events follow, one a line.
-fn show_value(value: &Value, output: Output, line: bool) -> Result<(), CliError> {
-    match (output, line) {
-        (Output::Json, true) => output::print(&json_line(value)?),
-        (Output::Yaml, true) => output::print(&yaml::documents([value])),
-        (Output::Json, false) => print(value, Format::Json, |_| String::new()),
-        (_, _) => print(value, Format::Yaml, |_| String::new()),
+fn show_listing(kind: Kind, listing: &Listing, output: Output, is_filtered: bool) -> Result<(), CliError> {
+    if listing.is_cut() {
+        let first = count(listing.items.len(), kind.word());
+        eprintln!("blaze: these are the first {first}; there are more");
     }
+    if listing.items.is_empty() && output != Output::Name && is_filtered {
+        eprintln!("blaze: no {} match", kind.collection());
+        return Ok(());
+    }
+    show_rows(kind, &listing.items, output)
 }
 
 fn show_rows(kind: Kind, items: &[Value], output: Output) -> Result<(), CliError> {
@@ -206,23 +203,13 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::args::{Arguments, Command};
+    use crate::args::tests::config;
     use crate::config::ConfigCommand;
-    use clap::Parser as _;
-
-    fn options(line: &str) -> GetOptions {
-        let words = ["blaze", "get"].into_iter().chain(line.split_whitespace());
-        match Arguments::try_parse_from(words).unwrap().command {
-            Command::Config(command) => match *command {
-                ConfigCommand::Get(options) => options,
-                other => panic!("{other:?}"),
-            },
-            other => panic!("{other:?}"),
-        }
-    }
 
     fn check(line: &str, output: Output) -> Result<(), CliError> {
-        let options = options(line);
+        let ConfigCommand::Get(options) = config(&format!("get {line}")).unwrap() else {
+            panic!("{line}");
+        };
         let key = options.document.target.optional_key(options.document.name.as_deref())?;
         options.check(key.as_ref(), output)
     }

@@ -8,9 +8,9 @@ use super::call::Call;
 use super::client::Client;
 use super::kinds::{BASE, document_path, name_of};
 use super::options::{DocumentOptions, ServerOptions};
-use super::text::{age, cell, note, now_ms, print};
+use super::text::{age, cell, list, note, now_ms, print};
 use crate::exit::{CliError, Exit};
-use crate::output::{Align, Format, render_table, terminal_width};
+use crate::output::{self, Align, Format, terminal_width};
 
 /// Options of `blaze history`.
 #[derive(Debug, Args)]
@@ -83,33 +83,24 @@ pub(super) async fn run(options: &HistoryOptions, format: Format) -> Result<Exit
     if listing.is_cut() {
         note(format, "there are older changes: --limit N shows more");
     }
-    let now = now_ms();
     print(&listing.into_json(), format, |listing| {
-        let items = listing.get("items").and_then(Value::as_array);
-        table(items.map_or(&[][..], Vec::as_slice), now, terminal_width())
-    })?;
-    Ok(Exit::Done)
+        table(list(listing, "items"), now_ms(), terminal_width())
+    })
 }
 
 /// One line per change, newest first.
-pub(super) fn table(items: &[Value], now_ms: i64, width: Option<u16>) -> String {
-    let columns = [
-        ("REVISION", Align::Right),
-        ("AGE", Align::Right),
-        ("CHANGE", Align::Left),
-        ("BY", Align::Left),
-        ("PATHS", Align::Left),
-    ];
-    let row = |entry: &Value| {
-        vec![
-            cell(entry.get("revision")),
-            age(entry.get("time"), now_ms),
-            cell(entry.get("op")),
-            cell(entry.get("subject")),
-            cell(entry.get("paths")),
-        ]
-    };
-    render_table(&columns, items.iter().map(row).collect(), width)
+pub(super) fn table(changes: &[Value], now_ms: i64, width: Option<u16>) -> String {
+    output::table(
+        changes,
+        width,
+        &[
+            ("REVISION", Align::Right, &|change| cell(change.get("revision"))),
+            ("AGE", Align::Right, &|change| age(change.get("time"), now_ms)),
+            ("CHANGE", Align::Left, &|change| cell(change.get("op"))),
+            ("BY", Align::Left, &|change| cell(change.get("subject"))),
+            ("PATHS", Align::Left, &|change| cell(change.get("paths"))),
+        ],
+    )
 }
 
 /// Gives a document an older content.
@@ -120,11 +111,8 @@ pub(super) async fn rollback(options: &RollbackOptions, format: Format) -> Resul
     let key = options.document.key()?;
     let client = Client::of(&options.server)?;
     // One that was deleted has no revision to insist on: it is made anew.
-    let tag = match client.existing(&key).await? {
-        Some(answer) if !options.force => Some(client.tag(answer)?),
-        Some(_) => Some("*".to_owned()),
-        None => None,
-    };
+    let existing = client.existing(&key).await?;
+    let tag = existing.map(|read| client.tag(&read, options.force)).transpose()?;
     let call = Call::post(
         format!("{}/rollback", document_path(&key)),
         &json!({ "revision": options.to }),
@@ -138,8 +126,7 @@ pub(super) async fn rollback(options: &RollbackOptions, format: Format) -> Resul
             options.to,
             cell(document.get("revision"))
         )
-    })?;
-    Ok(Exit::Done)
+    })
 }
 
 /// Undoes a revision.
@@ -149,13 +136,9 @@ pub(super) async fn rollback(options: &RollbackOptions, format: Format) -> Resul
 pub(super) async fn revert(options: &RevertOptions, format: Format) -> Result<Exit, CliError> {
     let client = Client::of(&options.server)?;
     let body = json!({ "revision": options.revision, "force": options.force });
-    let answer = match client.send(&Call::post(format!("{BASE}/revert"), &body)).await {
-        Err(CliError::Problem(refusal)) if refusal.code() == "revision_conflict" => {
-            let hint = "--force undoes it also where documents were changed since, and loses those changes";
-            return Err(CliError::Problem(Box::new(refusal.with_hint(hint))));
-        }
-        other => other?.body,
-    };
+    let hint = "--force undoes it also where documents were changed since, and loses those changes";
+    let answer = client.send(&Call::post(format!("{BASE}/revert"), &body)).await;
+    let answer = answer.map_err(|error| error.hinted("revision_conflict", hint))?.body;
     print(&answer, format, apply::table)?;
     note(format, &apply::summary(&answer));
     Ok(Exit::Done)

@@ -1,6 +1,6 @@
 //! How kinds and documents are written on the command line, and where they are in the API.
 
-use blaze_domain::config::{Key, KeyError, Kind};
+use blaze_domain::config::{Document, Key, KeyError, Kind};
 use blaze_domain::{DocumentName, ServiceName};
 use serde_json::Value;
 
@@ -149,6 +149,17 @@ pub(crate) fn key_of(value: &Value) -> Result<Key, String> {
         .transpose()
         .map_err(|error| format!("service {error}"))?;
     Key::new(kind, service, name).map_err(|error: KeyError| error.to_string())
+}
+
+/// A document of the server as far as the rules of the domain need it: what it refers to, and where it counts.
+///
+/// # Errors
+/// In words: what is missing or bad.
+pub(crate) fn document_of(value: &Value) -> Result<Document, String> {
+    Ok(Document {
+        status: value.get("status").cloned(),
+        ..Document::new(key_of(value)?, value.get("spec").cloned().unwrap_or_default())
+    })
 }
 
 fn unknown_kind(found: &str) -> String {

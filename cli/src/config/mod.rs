@@ -60,7 +60,7 @@ pub use diff::DiffOptions;
 pub use edit::EditOptions;
 pub use effective::EffectiveOptions;
 pub use export::ExportOptions;
-pub use fleet::{AuditOptions, WorkersOptions};
+pub use fleet::AuditOptions;
 pub use get::GetOptions;
 pub use history::{HistoryOptions, RevertOptions, RollbackOptions};
 pub use kinds::Target;
@@ -70,9 +70,11 @@ pub use patch::PatchOptions;
 pub use refusal::Refusal;
 pub use rollout::RolloutCommand;
 pub use token::TokenCommand;
-pub use topology::{DigestOptions, TopologyOptions};
+pub use topology::DigestOptions;
 pub use trim::TrimOptions;
 pub use watch::WatchOptions;
+
+pub(crate) use text::parse_duration;
 
 use crate::exit::{CliError, Exit};
 use crate::output::Output;
@@ -111,11 +113,11 @@ pub enum ConfigCommand {
     /// All documents as YAML that `apply` takes, or with -o json as an array
     Export(ExportOptions),
     /// Layers, their nodes, and what runs there
-    Topology(TopologyOptions),
+    Topology(ServerOptions),
     /// A digest of what the worker of a layer should hold
     Digest(DigestOptions),
     /// Workers of all layers, and which revision they have
-    Workers(WorkersOptions),
+    Workers(ServerOptions),
     /// Who changed what, and who was refused
     Audit(AuditOptions),
     /// Remove old history
@@ -151,9 +153,9 @@ pub async fn run(command: ConfigCommand, output: Output) -> Result<Exit, CliErro
         ConfigCommand::Watch(options) => watch::run(&options, output.format()?).await,
         ConfigCommand::Rollout(command) => rollout::run(&command, output.format()?).await,
         ConfigCommand::Export(options) => export::run(&options, output.format()?).await,
-        ConfigCommand::Topology(options) => topology::run(&options, output.format()?).await,
+        ConfigCommand::Topology(server) => topology::run(&server, output.format()?).await,
         ConfigCommand::Digest(options) => topology::digest(&options, output.format()?).await,
-        ConfigCommand::Workers(options) => fleet::workers(&options, output.format()?).await,
+        ConfigCommand::Workers(server) => fleet::workers(&server, output.format()?).await,
         ConfigCommand::Audit(options) => fleet::audit(&options, output.format()?).await,
         ConfigCommand::Trim(options) => trim::run(&options, output.format()?).await,
         ConfigCommand::Token(command) => token::run(&command, output.format()?).await,

@@ -6,7 +6,6 @@ use blaze_domain::config::json;
 use clap::Args;
 use serde_json::Value;
 
-use super::api::Insist;
 use super::call::Call;
 use super::client::Client;
 use super::kinds::{document_path, name_of};
@@ -54,14 +53,12 @@ pub(super) async fn run(options: &PatchOptions, format: Format) -> Result<Exit, 
         parse(&options.patch)?
     };
     let client = Client::of(&options.server)?;
-    let insist = if options.force { Insist::Exists } else { Insist::AsRead };
-    let tag = client.precondition(&key, insist).await?;
+    let tag = client.precondition(&key, options.force).await?;
     let call = Call::patch(document_path(&key), &patch).if_match(Some(tag));
     let document = client.send_about(&key, &call).await?.body;
     print(&document, format, |document| {
         format!("{} is at revision {}", name_of(&key), cell(document.get("revision")))
-    })?;
-    Ok(Exit::Done)
+    })
 }
 
 /// Reads a patch strictly, and catches the slip of leaving `spec` out.

@@ -13,9 +13,9 @@ use super::files;
 use super::kinds::{collection_path, document_path, name_of, parse_key};
 use super::options::ServerOptions;
 use super::tables::{self, Layout};
-use super::text::{cell, member, note, now_ms, print};
+use super::text::{cell, list, member, note, now_ms, print};
 use crate::exit::{CliError, Exit};
-use crate::output::{Align, Format, render_table, terminal_width};
+use crate::output::{self, Align, Format, terminal_width};
 
 /// Commands of `blaze rollout`.
 #[derive(Debug, Subcommand)]
@@ -91,16 +91,14 @@ pub(super) async fn run(command: &RolloutCommand, format: Format) -> Result<Exit
             let document = one_rollout(&options.file)?;
             let client = Client::of(&options.server)?;
             let call = Call::post(collection_path(Kind::Rollout, None), &document);
-            let answer = client
-                .send(&call)
-                .await
-                .map_err(|error| with_other_name(error, &document))?;
-            show(&answer.body, format)
+            let answer = client.send(&call).await;
+            let answer = answer.map_err(|error| with_other_name(error, &document))?;
+            print(&answer.body, format, status)
         }
         RolloutCommand::Status(options) => {
             let client = Client::of(&options.server)?;
             match &options.key {
-                Some(key) => show(&client.document(key, None).await?.body, format),
+                Some(key) => print(&client.document(key, None).await?.body, format, status),
                 None => {
                     let listing = client.list(Kind::Rollout, &Filter::default()).await?;
                     if listing.items.is_empty() && format == Format::Table {
@@ -113,10 +111,8 @@ pub(super) async fn run(command: &RolloutCommand, format: Format) -> Result<Exit
                         now_ms: now_ms(),
                     };
                     print(&listing.into_json(), format, |listing| {
-                        let items = listing.get("items").and_then(Value::as_array);
-                        tables::documents(Kind::Rollout, items.map_or(&[][..], Vec::as_slice), layout)
-                    })?;
-                    Ok(Exit::Done)
+                        tables::documents(Kind::Rollout, list(listing, "items"), layout)
+                    })
                 }
             }
         }
@@ -130,22 +126,17 @@ pub(super) async fn run(command: &RolloutCommand, format: Format) -> Result<Exit
 
 /// A roll-out that has begun is not replaced; what can be done instead.
 fn with_other_name(error: CliError, document: &Value) -> CliError {
-    match error {
-        CliError::Problem(refusal) if refusal.code() == "already_exists" => {
-            let name = member(document, "name");
-            CliError::Problem(Box::new(refusal.with_hint(format!(
-                "a roll-out that has begun is not replaced: give this one another name; or end that one with `blaze rollout promote {name}` or `blaze rollout abort {name}`, and delete it with `blaze delete rollout {name}`"
-            ))))
-        }
-        other => other,
-    }
+    let name = member(document, "name");
+    error.hinted("already_exists", &format!(
+        "a roll-out that has begun is not replaced: give this one another name; or end that one with `blaze rollout promote {name}` or `blaze rollout abort {name}`, and delete it with `blaze delete rollout {name}`"
+    ))
 }
 
 async fn act(server: &ServerOptions, key: &Key, action: &str, body: &Value, format: Format) -> Result<Exit, CliError> {
     let client = Client::of(server)?;
     let call = Call::post(format!("{}/{action}", document_path(key)), body);
     let document = client.send_about(key, &call).await?.body;
-    show(&document, format)
+    print(&document, format, status)
 }
 
 /// The one roll-out of a file, without what a server would have set.
@@ -168,11 +159,6 @@ fn one_rollout(file: &std::path::Path) -> Result<Value, CliError> {
     }
 }
 
-fn show(document: &Value, format: Format) -> Result<Exit, CliError> {
-    print(document, format, status)?;
-    Ok(Exit::Done)
-}
-
 /// How a roll-out stands: phase, target, then its canary nodes.
 fn status(document: &Value) -> String {
     let phase = cell(document.pointer("/status/phase"));
@@ -184,32 +170,22 @@ fn status(document: &Value) -> String {
         _ => format!("it is about {target}"),
     };
     let mut text = format!("{} is {phase}; {so}\n", member(document, "name"));
-    let reason = document
-        .get("status")
-        .map(|status| member(status, "reason"))
-        .unwrap_or_default();
+    let of_server = document.get("status").unwrap_or(&Value::Null);
+    let reason = member(of_server, "reason");
     if !reason.is_empty() {
         text.push_str(&format!("Reason: {reason}\n"));
     }
-    let canaries = document.pointer("/status/canaries").and_then(Value::as_array);
-    let canaries = canaries.map_or(&[][..], Vec::as_slice);
+    let canaries = list(of_server, "canaries");
     if !canaries.is_empty() {
-        let columns = [
-            ("NODE", Align::Left),
-            ("PHASE", Align::Left),
-            ("REVISION", Align::Right),
-            ("REASON", Align::Left),
-        ];
-        let row = |canary: &Value| {
-            ["node", "phase", "revision", "reason"]
-                .iter()
-                .map(|name| cell(canary.get(*name)))
-                .collect()
-        };
-        text.push_str(&render_table(
-            &columns,
-            canaries.iter().map(row).collect(),
+        text.push_str(&output::table(
+            canaries,
             terminal_width(),
+            &[
+                ("NODE", Align::Left, &|canary| cell(canary.get("node"))),
+                ("PHASE", Align::Left, &|canary| cell(canary.get("phase"))),
+                ("REVISION", Align::Right, &|canary| cell(canary.get("revision"))),
+                ("REASON", Align::Left, &|canary| cell(canary.get("reason"))),
+            ],
         ));
     }
     text

@@ -10,6 +10,7 @@ use super::client::Client;
 use super::endpoint::{Endpoint, parse_server};
 use super::files::Source;
 use super::kinds::{document_path, key_of};
+use super::text::whole;
 use crate::exit::CliError;
 
 /// A client of a main service without tokens.
@@ -17,12 +18,8 @@ use crate::exit::CliError;
 /// # Errors
 /// As [`Client::new`].
 pub(crate) fn client(rest: SocketAddr) -> Result<Client, CliError> {
-    Client::new(Endpoint {
-        url: parse_server(&format!("http://{rest}")).map_err(CliError::Failed)?,
-        ca_file: None,
-        client_certificate: None,
-        token: None,
-    })
+    let url = parse_server(&format!("http://{rest}")).map_err(CliError::Failed)?;
+    Client::new(Endpoint::at(url))
 }
 
 /// Makes those of `own` that are not there, then applies `sources`. Gives the revision after it.
@@ -40,14 +37,13 @@ pub(crate) async fn apply(rest: SocketAddr, own: &[Value], sources: &[Source]) -
             None => missing.push(document.clone()),
         }
     }
-    let told = |answer: &Value| answer.get("revision").and_then(Value::as_u64).unwrap_or(0);
     if !missing.is_empty() {
         let answer = send_array(&client, &Value::Array(missing), &Request::default()).await?;
-        revision = revision.max(told(&answer));
+        revision = revision.max(whole(&answer, "revision"));
     }
     if !sources.is_empty() {
         let answer = send(&client, sources, &Request::default()).await?;
-        revision = revision.max(told(&answer));
+        revision = revision.max(whole(&answer, "revision"));
     }
     Ok(revision)
 }

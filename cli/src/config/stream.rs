@@ -16,8 +16,10 @@ use tokio::time::{sleep, timeout};
 
 use super::call::Call;
 use super::client::{Client, reason};
+use super::kinds::BASE;
 use super::refusal::Refusal;
 use super::sse::{Event, Parser};
+use super::text::{list, whole};
 use crate::exit::CliError;
 
 /// Bookmarks come every 15 s; after four that did not come, the connection is dead.
@@ -169,7 +171,7 @@ impl<'c> Watcher<'c> {
     fn judge(&mut self, event: Event) -> Result<Option<Told>, CliError> {
         let parsed = serde_json::from_str::<Value>(&event.data).ok().filter(Value::is_object);
         let Some(data) = parsed else {
-            return Err(self.client.odd(&format!("an event {:?} is no JSON object", event.name)));
+            return Err(self.client.odd(format!("an event {:?} is no JSON object", event.name)));
         };
         match event.name.as_str() {
             "change" | "bookmark" => {
@@ -217,6 +219,36 @@ impl<'c> Watcher<'c> {
                 "blaze: the watch of {} was interrupted: {reason}; going on",
                 self.client.server()
             );
+        }
+    }
+}
+
+/// Gives `take` each change of the commits after one revision up to another, with its revision. Whether the history reaches
+/// back that far.
+///
+/// # Errors
+/// As [`Watcher::next`], and whatever `take` says.
+pub(crate) async fn changes_between(
+    client: &Client,
+    since: u64,
+    until: u64,
+    mut take: impl FnMut(u64, &Value) -> Result<(), CliError>,
+) -> Result<bool, CliError> {
+    let mut watcher = Watcher::new(client, Call::get(format!("{BASE}/watch")), Some(since), false);
+    loop {
+        let reached = match watcher.next().await? {
+            Told::Relist(_) => return Ok(false),
+            Told::Bookmark(bookmark) => whole(&bookmark, "revision"),
+            Told::Change(commit) => {
+                let revision = whole(&commit, "revision");
+                for change in list(&commit, "changes").iter().filter(|_| revision <= until) {
+                    take(revision, change)?;
+                }
+                revision
+            }
+        };
+        if reached >= until {
+            return Ok(true);
         }
     }
 }

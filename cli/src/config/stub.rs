@@ -134,10 +134,8 @@ impl Stub {
     /// A client of it.
     pub(crate) fn client_with(&self, token: Option<&str>) -> Client {
         Client::new(Endpoint {
-            url: parse_server(&self.url).unwrap(),
-            ca_file: None,
-            client_certificate: None,
             token: token.map(|text| TokenSource::Variable(Token::of(text))),
+            ..Endpoint::at(parse_server(&self.url).unwrap())
         })
         .unwrap()
     }

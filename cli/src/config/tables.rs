@@ -3,8 +3,8 @@
 use blaze_domain::config::Kind;
 use serde_json::Value;
 
-use super::text::{age, cell, member};
-use crate::output::{Align, render_table};
+use super::text::{age, cell, joined, member};
+use crate::output::{Align, Column, table};
 
 /// How a table is laid out.
 #[derive(Debug, Clone, Copy)]
@@ -17,97 +17,89 @@ pub(crate) struct Layout {
     pub(crate) now_ms: i64,
 }
 
-/// One column: its heading, where its content stands, and what it shows of a document.
-type Column = (&'static str, Align, fn(&Value) -> String);
+const NAME: Column<'_, Value> = ("NAME", Align::Left, &|document| member(document, "name"));
 
-fn left(name: &'static str, show: fn(&Value) -> String) -> Column {
-    (name, Align::Left, show)
+const LAYER: &[Column<'_, Value>] = &[NAME, ("KIND", Align::Left, &|document| spec(document, "kind"))];
+
+const NODE: &[Column<'_, Value>] = &[
+    NAME,
+    ("LAYER", Align::Left, &|document| spec(document, "layer")),
+    ("TYPE", Align::Left, &|document| or(spec(document, "type"), "static")),
+];
+
+const SERVICE: &[Column<'_, Value>] = &[
+    NAME,
+    ("LAYERS", Align::Left, &|document| or(spec(document, "layers"), "all")),
+    ("SCHEMA", Align::Left, &|document| {
+        let has = document.pointer("/spec/schema").is_some_and(|schema| !schema.is_null());
+        (if has { "yes" } else { "-" }).to_owned()
+    }),
+];
+
+const INSTANCE: &[Column<'_, Value>] = &[
+    ("SERVICE", Align::Left, &|document| member(document, "service")),
+    NAME,
+    ("PLACED ON", Align::Left, &placement),
+];
+
+const ROLLOUT: &[Column<'_, Value>] = &[
+    NAME,
+    ("TARGET", Align::Left, &target),
+    ("PHASE", Align::Left, &|document| {
+        cell(document.pointer("/status/phase"))
+    }),
+    ("CANARIES", Align::Right, &|document| {
+        let canaries = document.pointer("/status/canaries").and_then(Value::as_array);
+        canaries.map_or_else(|| "-".to_owned(), |canaries| canaries.len().to_string())
+    }),
+];
+
+const WIDE_NODE: &[Column<'_, Value>] = &[
+    ("ADDRESSES", Align::Left, &|document| spec(document, "addresses")),
+    ("RESOURCES", Align::Left, &resources),
+];
+
+const WIDE_SERVICE: &[Column<'_, Value>] = &[("DESCRIPTION", Align::Left, &|document| spec(document, "description"))];
+
+const WIDE_ROLLOUT: &[Column<'_, Value>] = &[("CANARY", Align::Left, &|document| {
+    cell(document.pointer("/spec/canary/node_selector"))
+})];
+
+/// The columns of a kind, and those that a wide table has beside them.
+fn columns_of(kind: Kind) -> [&'static [Column<'static, Value>]; 2] {
+    match kind {
+        Kind::Layer => [LAYER, &[]],
+        Kind::Node => [NODE, WIDE_NODE],
+        Kind::Service => [SERVICE, WIDE_SERVICE],
+        Kind::Instance => [INSTANCE, &[]],
+        Kind::Rollout => [ROLLOUT, WIDE_ROLLOUT],
+    }
 }
 
-fn right(name: &'static str, show: fn(&Value) -> String) -> Column {
-    (name, Align::Right, show)
+fn or(cell: String, absent: &str) -> String {
+    if cell == "-" { absent.to_owned() } else { cell }
 }
 
 /// A table of documents of one kind.
 pub(crate) fn documents(kind: Kind, items: &[Value], layout: Layout) -> String {
-    let mut columns: Vec<(&str, Align)> = own_columns(kind)
-        .iter()
-        .map(|(name, align, _)| (*name, *align))
-        .collect();
-    columns.extend([("REVISION", Align::Right), ("AGE", Align::Right)]);
-    let wide = if layout.wide { wide_columns(kind) } else { Vec::new() };
-    columns.extend(wide.iter().map(|(name, align, _)| (*name, *align)));
+    let made = |document: &Value| age(document.get("create_time"), layout.now_ms);
+    let changed = |document: &Value| age(document.get("update_time"), layout.now_ms);
+    let common: [Column<'_, Value>; 2] = [
+        ("REVISION", Align::Right, &|document| cell(document.get("revision"))),
+        ("AGE", Align::Right, &made),
+    ];
+    let always: [Column<'_, Value>; 3] = [
+        ("LABELS", Align::Left, &labels),
+        ("CHANGED", Align::Right, &changed),
+        ("BY", Align::Left, &|document| cell(document.get("updated_by"))),
+    ];
+    let [own, wide] = columns_of(kind);
+    let mut columns = [own, &common].concat();
     if layout.wide {
-        columns.extend([("LABELS", Align::Left), ("CHANGED", Align::Right), ("BY", Align::Left)]);
+        columns.extend(wide);
+        columns.extend(always);
     }
-    let row = |document: &Value| {
-        let mut cells: Vec<String> = own_columns(kind).iter().map(|(_, _, show)| show(document)).collect();
-        cells.push(cell(document.get("revision")));
-        cells.push(age(document.get("create_time"), layout.now_ms));
-        cells.extend(wide.iter().map(|(_, _, show)| show(document)));
-        if layout.wide {
-            cells.push(labels(document));
-            cells.push(age(document.get("update_time"), layout.now_ms));
-            cells.push(cell(document.get("updated_by")));
-        }
-        cells
-    };
-    render_table(&columns, items.iter().map(row).collect(), layout.width)
-}
-
-fn own_columns(kind: Kind) -> Vec<Column> {
-    let name = left("NAME", |document| member(document, "name"));
-    match kind {
-        Kind::Layer => vec![name, left("KIND", |document| spec(document, "kind"))],
-        Kind::Node => vec![
-            name,
-            left("LAYER", |document| spec(document, "layer")),
-            left("TYPE", |document| match spec(document, "type").as_str() {
-                "-" => "static".to_owned(),
-                other => other.to_owned(),
-            }),
-        ],
-        Kind::Service => vec![
-            name,
-            left("LAYERS", |document| match spec(document, "layers").as_str() {
-                "-" => "all".to_owned(),
-                other => other.to_owned(),
-            }),
-            left("SCHEMA", |document| {
-                let has = document.pointer("/spec/schema").is_some_and(|schema| !schema.is_null());
-                let word = if has { "yes" } else { "-" };
-                word.to_owned()
-            }),
-        ],
-        Kind::Instance => vec![
-            left("SERVICE", |document| member(document, "service")),
-            name,
-            left("PLACED ON", placement),
-        ],
-        Kind::Rollout => vec![
-            name,
-            left("TARGET", target),
-            left("PHASE", |document| cell(document.pointer("/status/phase"))),
-            right("CANARIES", |document| {
-                let canaries = document.pointer("/status/canaries").and_then(Value::as_array);
-                canaries.map_or_else(|| "-".to_owned(), |canaries| canaries.len().to_string())
-            }),
-        ],
-    }
-}
-
-fn wide_columns(kind: Kind) -> Vec<Column> {
-    match kind {
-        Kind::Layer | Kind::Instance => Vec::new(),
-        Kind::Node => vec![
-            left("ADDRESSES", |document| spec(document, "addresses")),
-            left("RESOURCES", resources),
-        ],
-        Kind::Service => vec![left("DESCRIPTION", |document| spec(document, "description"))],
-        Kind::Rollout => vec![left("CANARY", |document| {
-            cell(document.pointer("/spec/canary/node_selector"))
-        })],
-    }
+    table(items, layout.width, &columns)
 }
 
 fn spec(document: &Value, name: &str) -> String {
@@ -162,11 +154,7 @@ fn resources(document: &Value) -> String {
     if !arch.is_empty() {
         parts.push(arch);
     }
-    if parts.is_empty() {
-        "-".to_owned()
-    } else {
-        parts.join(", ")
-    }
+    joined(&parts, ", ")
 }
 
 fn labels(document: &Value) -> String {

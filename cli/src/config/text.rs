@@ -3,10 +3,11 @@
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use blaze_domain::config::Timestamp;
+use serde::Serialize;
 use serde_json::Value;
 
 use super::yaml;
-use crate::exit::CliError;
+use crate::exit::{CliError, Exit};
 use crate::output::{self, Format};
 
 /// Longest value in a table or a listing of differences, in characters.
@@ -82,6 +83,29 @@ pub(crate) fn member(value: &Value, name: &str) -> String {
         .unwrap_or_default()
 }
 
+/// The entries of a member that is a list; none where there is none.
+pub(crate) fn list<'v>(value: &'v Value, name: &str) -> &'v [Value] {
+    value.get(name).and_then(Value::as_array).map_or(&[][..], Vec::as_slice)
+}
+
+/// A member that is a whole number; 0 where there is none.
+pub(crate) fn whole(value: &Value, name: &str) -> u64 {
+    value.get(name).and_then(Value::as_u64).unwrap_or(0)
+}
+
+/// Whether a member is `true`.
+pub(crate) fn flag(value: &Value, name: &str) -> bool {
+    value.get(name).and_then(Value::as_bool).unwrap_or(false)
+}
+
+/// Texts joined, or a dash where there are none.
+pub(crate) fn joined(texts: &[String], separator: &str) -> String {
+    match texts {
+        [] => "-".to_owned(),
+        texts => texts.join(separator),
+    }
+}
+
 /// A member as one cell: texts as they are, `null` and what is absent as a dash, the rest as JSON.
 pub(crate) fn cell(value: Option<&Value>) -> String {
     match value {
@@ -90,11 +114,7 @@ pub(crate) fn cell(value: Option<&Value>) -> String {
         Some(Value::String(text)) => shortened(&printable(text)),
         Some(Value::Array(items)) if items.iter().all(|item| !item.is_array() && !item.is_object()) => {
             let items: Vec<String> = items.iter().map(|item| cell(Some(item))).collect();
-            if items.is_empty() {
-                "-".to_owned()
-            } else {
-                shortened(&items.join(","))
-            }
+            shortened(&joined(&items, ","))
         }
         Some(other) => compact(other),
     }
@@ -129,12 +149,18 @@ pub(crate) fn note(format: Format, text: &str) {
 }
 
 /// Prints a value: as JSON or YAML, or what `table` makes of it for people.
-pub(crate) fn print(value: &Value, format: Format, table: impl FnOnce(&Value) -> String) -> Result<(), CliError> {
+pub(crate) fn print(value: &Value, format: Format, table: impl FnOnce(&Value) -> String) -> Result<Exit, CliError> {
     output::print(&match format {
         Format::Table => table(value),
-        Format::Json => serde_json::to_string_pretty(value).map_err(|error| CliError::Failed(error.to_string()))?,
+        Format::Json => json_pretty(value)?,
         Format::Yaml => yaml::document(value),
-    })
+    })?;
+    Ok(Exit::Done)
+}
+
+/// JSON on several lines.
+pub(crate) fn json_pretty(value: &impl Serialize) -> Result<String, CliError> {
+    serde_json::to_string_pretty(value).map_err(|error| CliError::Failed(error.to_string()))
 }
 
 /// JSON on one line.

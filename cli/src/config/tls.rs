@@ -191,13 +191,11 @@ mod tests {
 
     fn endpoint(with_certificate: bool) -> Endpoint {
         Endpoint {
-            url: parse_server("https://robot.example").unwrap(),
-            ca_file: None,
             client_certificate: with_certificate.then(|| ClientCertificate {
                 cert_file: PathBuf::from("client.pem"),
                 key_file: None,
             }),
-            token: None,
+            ..Endpoint::at(parse_server("https://robot.example").unwrap())
         }
     }
 

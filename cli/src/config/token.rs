@@ -17,7 +17,7 @@ use super::options::ServerOptions;
 use super::text::{age, cell, note, now_ms, parse_duration, print};
 use super::token_local::{self, KeyUse, LocalToken, parse_algorithm};
 use crate::exit::{CliError, Exit};
-use crate::output::{Align, Format, render_table, terminal_width};
+use crate::output::{self, Align, Format, terminal_width};
 
 /// Longest life of a token: a year.
 const LONGEST: Duration = Duration::from_secs(31_536_000);
@@ -28,7 +28,7 @@ pub enum TokenCommand {
     /// Make a token. The server signs it; with --key-file you do, without a server
     Create(CreateOptions),
     /// Tokens that the server has made, without their text
-    List(ListOptions),
+    List(ServerOptions),
     /// Take a token back: within seconds it is refused everywhere
     Revoke(RevokeOptions),
     /// What a token says; its signature is not checked
@@ -96,14 +96,6 @@ pub struct SigningOptions {
     pub audience: String,
 }
 
-/// Options of `blaze token list`.
-#[derive(Debug, Args)]
-pub struct ListOptions {
-    /// Which server.
-    #[command(flatten)]
-    pub server: ServerOptions,
-}
-
 /// Options of `blaze token revoke`.
 #[derive(Debug, Args)]
 pub struct RevokeOptions {
@@ -162,15 +154,12 @@ pub(super) async fn run(command: &TokenCommand, format: Format) -> Result<Exit, 
             let answer = create(options).await?;
             // The token alone, so that it can go to a file.
             print(&answer, format, |answer| {
-                answer
-                    .get("token")
-                    .and_then(Value::as_str)
-                    .unwrap_or_default()
-                    .to_owned()
-            })?;
+                let token = answer.get("token").and_then(Value::as_str);
+                token.unwrap_or_default().to_owned()
+            })
         }
-        TokenCommand::List(options) => {
-            let client = Client::of(&options.server)?;
+        TokenCommand::List(server) => {
+            let client = Client::of(server)?;
             let answer = client.send(&Call::get(format!("{BASE}/tokens"))).await?.body;
             let items = answer
                 .get("items")
@@ -180,22 +169,21 @@ pub(super) async fn run(command: &TokenCommand, format: Format) -> Result<Exit, 
                 note(format, "no token was made by the server");
                 return Ok(Exit::Done);
             }
-            print(&answer, format, |_| table(items, now_ms(), terminal_width()))?;
+            print(&answer, format, |_| table(items, now_ms(), terminal_width()))
         }
         TokenCommand::Revoke(options) => {
             let client = Client::of(&options.server)?;
-            client
-                .send(&Call::delete(format!("{BASE}/tokens/{}", options.id)))
-                .await?;
+            let call = Call::delete(format!("{BASE}/tokens/{}", options.id));
+            client.send(&call).await?;
             print(&json!({ "revoked": options.id }), format, |_| {
                 format!("{} is revoked; it is refused everywhere within 5 s", options.id)
-            })?;
+            })
         }
         TokenCommand::Inspect(options) => {
             let inspected = token_local::look_into(&token_of(options)?)?;
             print(&inspected, format, |inspected| {
                 token_local::description(inspected, now_ms())
-            })?;
+            })
         }
         TokenCommand::Keygen(options) => {
             let made = token_local::keygen(options.alg, &options.out)?;
@@ -203,10 +191,9 @@ pub(super) async fn run(command: &TokenCommand, format: Format) -> Result<Exit, 
                 let public = made.get("public_file").and_then(Value::as_str);
                 let public = public.map_or_else(String::new, |file| format!(", its public part {file}"));
                 format!("the key is {}{public}", options.out.display())
-            })?;
+            })
         }
     }
-    Ok(Exit::Done)
 }
 
 async fn create(options: &CreateOptions) -> Result<Value, CliError> {
@@ -300,27 +287,19 @@ fn token_of(options: &InspectOptions) -> Result<String, CliError> {
 }
 
 fn table(tokens: &[Value], now_ms: i64, width: Option<u16>) -> String {
-    let columns = [
-        ("ID", Align::Left),
-        ("SUBJECT", Align::Left),
-        ("ROLES", Align::Left),
-        ("LAYER", Align::Left),
-        ("AGE", Align::Right),
-        ("UNTIL", Align::Left),
-        ("REVOKED", Align::Left),
-    ];
-    let row = |token: &Value| {
-        vec![
-            cell(token.get("id")),
-            cell(token.get("subject")),
-            cell(token.get("roles")),
-            cell(token.get("layer")),
-            age(token.get("create_time"), now_ms),
-            cell(token.get("expire_time")),
-            cell(token.get("revoke_time")),
-        ]
-    };
-    render_table(&columns, tokens.iter().map(row).collect(), width)
+    output::table(
+        tokens,
+        width,
+        &[
+            ("ID", Align::Left, &|token| cell(token.get("id"))),
+            ("SUBJECT", Align::Left, &|token| cell(token.get("subject"))),
+            ("ROLES", Align::Left, &|token| cell(token.get("roles"))),
+            ("LAYER", Align::Left, &|token| cell(token.get("layer"))),
+            ("AGE", Align::Right, &|token| age(token.get("create_time"), now_ms)),
+            ("UNTIL", Align::Left, &|token| cell(token.get("expire_time"))),
+            ("REVOKED", Align::Left, &|token| cell(token.get("revoke_time"))),
+        ],
+    )
 }
 
 #[cfg(test)]

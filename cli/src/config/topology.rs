@@ -8,17 +8,9 @@ use super::call::Call;
 use super::client::Client;
 use super::kinds::BASE;
 use super::options::ServerOptions;
-use super::text::{cell, member, note, print};
+use super::text::{cell, joined, list, member, note, print};
 use crate::exit::{CliError, Exit};
-use crate::output::{Align, Format, render_table, terminal_width};
-
-/// Options of `blaze topology`.
-#[derive(Debug, Args)]
-pub struct TopologyOptions {
-    /// Which server.
-    #[command(flatten)]
-    pub server: ServerOptions,
-}
+use crate::output::{self, Align, Format, terminal_width};
 
 /// Options of `blaze digest`.
 #[derive(Debug, Args)]
@@ -35,8 +27,8 @@ pub struct DigestOptions {
 ///
 /// # Errors
 /// [`CliError`].
-pub(super) async fn run(options: &TopologyOptions, format: Format) -> Result<Exit, CliError> {
-    let client = Client::of(&options.server)?;
+pub(super) async fn run(server: &ServerOptions, format: Format) -> Result<Exit, CliError> {
+    let client = Client::of(server)?;
     let answer = client.send(&Call::get(format!("{BASE}/topology"))).await?.body;
     let layers = answer
         .get("layers")
@@ -46,8 +38,7 @@ pub(super) async fn run(options: &TopologyOptions, format: Format) -> Result<Exi
         note(format, "there are no layers");
         return Ok(Exit::Done);
     }
-    print(&answer, format, |answer| table(answer, terminal_width()))?;
-    Ok(Exit::Done)
+    print(&answer, format, |answer| table(answer, terminal_width()))
 }
 
 /// Shows the digest of what a layer sees.
@@ -68,61 +59,47 @@ pub(super) async fn digest(options: &DigestOptions, format: Format) -> Result<Ex
             options.layer,
             cell(answer.get("revision"))
         )
-    })?;
-    Ok(Exit::Done)
-}
-
-fn list<'v>(value: &'v Value, name: &str) -> &'v [Value] {
-    value.get(name).and_then(Value::as_array).map_or(&[][..], Vec::as_slice)
+    })
 }
 
 /// One line per node; below it the links between nodes, where some are known.
 fn table(answer: &Value, width: Option<u16>) -> String {
-    let columns = [
-        ("LAYER", Align::Left),
-        ("KIND", Align::Left),
-        ("NODE", Align::Left),
-        ("TYPE", Align::Left),
-        ("WORKER", Align::Left),
-        ("REVISION", Align::Right),
-        ("RUNS", Align::Left),
-    ];
-    let mut rows = Vec::new();
+    let mut nodes: Vec<(&Value, Option<&Value>)> = Vec::new();
     for layer in list(answer, "layers") {
-        let of_layer = [cell(layer.get("name")), cell(layer.get("kind"))];
-        let nodes = list(layer, "nodes");
-        if nodes.is_empty() {
-            rows.push(of_layer.into_iter().chain((0..5).map(|_| "-".to_owned())).collect());
-            continue;
-        }
-        for node in nodes {
-            let of_node = [
-                cell(node.get("name")),
-                cell(node.get("type")),
-                worker(node.get("worker")).to_owned(),
-                cell(node.pointer("/worker/revision")),
-                runs(node),
-            ];
-            rows.push(of_layer.iter().cloned().chain(of_node).collect());
-        }
+        let of_layer = list(layer, "nodes");
+        nodes.extend(of_layer.iter().map(|node| (layer, Some(node))));
+        // A layer without nodes has a line, too.
+        nodes.extend(of_layer.is_empty().then_some((layer, None)));
     }
-    let mut text = render_table(&columns, rows, width);
+    let at = |node: &Option<&Value>, pointer: &str| cell(node.and_then(|node| node.pointer(pointer)));
+    let mut text = output::table(
+        &nodes,
+        width,
+        &[
+            ("LAYER", Align::Left, &|(layer, _)| cell(layer.get("name"))),
+            ("KIND", Align::Left, &|(layer, _)| cell(layer.get("kind"))),
+            ("NODE", Align::Left, &|(_, node)| at(node, "/name")),
+            ("TYPE", Align::Left, &|(_, node)| at(node, "/type")),
+            ("WORKER", Align::Left, &|(_, node)| {
+                worker(node.and_then(|node| node.get("worker"))).to_owned()
+            }),
+            ("REVISION", Align::Right, &|(_, node)| at(node, "/worker/revision")),
+            ("RUNS", Align::Left, &|(_, node)| runs(node.unwrap_or(&Value::Null))),
+        ],
+    );
     let links = list(answer, "links");
     if !links.is_empty() {
-        let columns = [
-            ("FROM", Align::Left),
-            ("TO", Align::Left),
-            ("LATENCY MS", Align::Right),
-            ("LOSS", Align::Right),
-        ];
-        let row = |link: &Value| {
-            ["from_node", "to_node", "latency_ms", "loss"]
-                .iter()
-                .map(|name| cell(link.get(*name)))
-                .collect()
-        };
         text.push('\n');
-        text.push_str(&render_table(&columns, links.iter().map(row).collect(), width));
+        text.push_str(&output::table(
+            links,
+            width,
+            &[
+                ("FROM", Align::Left, &|link| cell(link.get("from_node"))),
+                ("TO", Align::Left, &|link| cell(link.get("to_node"))),
+                ("LATENCY MS", Align::Right, &|link| cell(link.get("latency_ms"))),
+                ("LOSS", Align::Right, &|link| cell(link.get("loss"))),
+            ],
+        ));
     }
     text
 }
@@ -149,11 +126,7 @@ fn runs(node: &Value) -> String {
             }
         })
         .collect();
-    if services.is_empty() {
-        "-".to_owned()
-    } else {
-        services.join(", ")
-    }
+    joined(&services, ", ")
 }
 
 #[cfg(test)]

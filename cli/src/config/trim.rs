@@ -8,7 +8,7 @@ use super::call::Call;
 use super::client::Client;
 use super::kinds::BASE;
 use super::options::ServerOptions;
-use super::text::print;
+use super::text::{print, whole};
 use crate::exit::{CliError, Exit};
 use crate::output::Format;
 
@@ -37,8 +37,7 @@ pub(super) async fn run(options: &TrimOptions, format: Format) -> Result<Exit, C
         return Err(CliError::Failed("nothing was removed".to_owned()));
     }
     let answer = send(&client, options.before).await?;
-    print(&answer, format, text)?;
-    Ok(Exit::Done)
+    print(&answer, format, text)
 }
 
 fn question(before: u64) -> String {
@@ -58,7 +57,7 @@ async fn send(client: &Client, before: u64) -> Result<Value, CliError> {
 }
 
 fn text(answer: &Value) -> String {
-    let oldest = answer.get("oldest_revision").and_then(Value::as_u64).unwrap_or(0);
+    let oldest = whole(answer, "oldest_revision");
     format!(
         "the history begins with revision {}; a watch can begin with --since {oldest}\n",
         oldest.saturating_add(1)

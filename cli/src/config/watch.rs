@@ -13,10 +13,10 @@ use super::client::Client;
 use super::kinds::{self, BASE, Target, key_of, name_of};
 use super::options::ServerOptions;
 use super::stream::{Lost, Told, Watcher};
-use super::text::{json_line, member, note};
+use super::text::{json_line, list, member, note, whole};
 use super::yaml;
+use crate::ends::interrupted;
 use crate::exit::{CliError, Exit};
-use crate::local::interrupted;
 use crate::output::{self, Format};
 
 /// Options of `blaze watch`.
@@ -246,7 +246,7 @@ pub(crate) async fn follow(
 
 /// What of a commit the last list does not show yet.
 fn above(mut commit: Value, floors: &mut BTreeMap<Kind, u64>) -> Option<Value> {
-    let revision = commit.get("revision").and_then(Value::as_u64).unwrap_or(0);
+    let revision = whole(&commit, "revision");
     // Revisions only grow: a list that is behind is of no more use.
     floors.retain(|_, floor| *floor >= revision);
     if floors.is_empty() {
@@ -278,23 +278,19 @@ fn lines(shown: &Shown) -> String {
         let name = key_of(document).map_or_else(|_| "-".to_owned(), |key| name_of(&key));
         format!("{revision:>8}  {op:<6}  {name}{by}\n")
     };
-    let revision_of = |value: &Value| value.get("revision").and_then(Value::as_u64).unwrap_or(0);
     match shown {
         Shown::Commit(commit) => {
-            let subject = member(commit, "subject");
-            let by = if subject.is_empty() {
-                String::new()
-            } else {
-                format!("  by {subject}")
+            let by = match member(commit, "subject") {
+                subject if subject.is_empty() => subject,
+                subject => format!("  by {subject}"),
             };
-            let changes = commit.get("changes").and_then(Value::as_array);
+            let revision = whole(commit, "revision");
+            let changes = list(commit, "changes").iter();
             changes
-                .into_iter()
-                .flatten()
-                .map(|change| line(revision_of(commit), &member(change, "op"), change, &by))
+                .map(|change| line(revision, &member(change, "op"), change, &by))
                 .collect()
         }
-        Shown::Bookmark(bookmark) => format!("{:>8}  up to here\n", revision_of(bookmark)),
+        Shown::Bookmark(bookmark) => format!("{:>8}  up to here\n", whole(bookmark, "revision")),
         // People are told on stderr.
         Shown::Relist(_) => String::new(),
         Shown::Listed { revision, items, .. } => items.iter().map(|item| line(*revision, "exists", item, "")).collect(),

@@ -82,7 +82,7 @@ fn rows_show_the_last_second_and_the_whole() {
     assert_eq!(total[0].duplicated, 2);
     assert_eq!(total[0].dropped, BTreeMap::from([("lifespan".to_owned(), 3)]));
     assert_eq!((total[0].received, total[0].sent, total[0].lost), (100, Some(100), 0));
-    assert!((total[0].latency_ms.p99.unwrap() - 2.0).abs() < 0.1);
+    assert!((total[0].latency_ms.p99.unwrap() - 2.0).abs() < 0.25);
     assert_eq!(board.first_message_s(), BTreeMap::from([("cloud", 0.001)]));
 }
 
@@ -132,7 +132,7 @@ fn the_age_counts_where_clocks_may_differ() {
             .unwrap();
         board.frame_arrived(id, &frame, 1_500_000_000, start);
         let p50 = board.total(start)[0].latency_ms.p50.unwrap();
-        assert!((p50 / expected_ms - 1.0).abs() < 0.04, "{p50}");
+        assert!((p50 / expected_ms - 1.0).abs() < 0.125, "{p50}");
     }
 }
 

@@ -65,7 +65,7 @@ pub struct ChangePlan {
 }
 
 /// A change and what it did; part of the summary.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Change {
     /// The document that was put.
     pub document: String,
@@ -234,18 +234,10 @@ impl<S: Stage> Changing<'_, S> {
 impl Change {
     fn of(taken: &Taken) -> Self {
         Self {
-            document: String::new(),
-            setting: "",
-            from: 0.0,
-            to: 0.0,
-            at: String::new(),
-            service: "",
             revision: taken.revision,
             accepted_ms: ms(taken.accepted),
             callback_ms: ms(taken.called_back),
-            effect: "",
-            before_per_s: 0.0,
-            after_per_s: 0.0,
+            ..Self::default()
         }
     }
 

@@ -27,7 +27,7 @@ use super::options::DemoNode;
 use super::roles::{MOVING_SERVICE, PUBLISHING_NODE};
 use crate::config::seed;
 use crate::embedded::{Worker, follow, start_main};
-use crate::exit::CliError;
+use crate::exit::{CliError, lines};
 
 /// How long workers may take to have what the demo begins with.
 const READY: Duration = Duration::from_secs(15);
@@ -70,10 +70,7 @@ impl Configuration {
             let mut tree = place.file;
             tree["config"] = json!({ "server": format!("http://{}", addresses.grpc) });
             let read = blaze_domain::node_file::NodeFile::read(&tree);
-            let (mut file, _) = read.map_err(|faults| {
-                let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
-                CliError::Failed(lines.join("; "))
-            })?;
+            let (mut file, _) = read.map_err(|faults| CliError::Failed(lines(&faults)))?;
             file.brokers.node = Some(place.broker_section);
             workers.push(Worker::start(&file, Arc::clone(&place.broker), None, false, &supervisor).await?);
             if place.node == PUBLISHING_NODE {

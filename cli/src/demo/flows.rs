@@ -161,7 +161,7 @@ mod tests {
         }
     }
 
-    fn bridge(from: &str, to: &str, layer: Option<&str>, dropped: &Value) -> Value {
+    fn bridge(from: &str, to: &str, layer: &str, dropped: &Value) -> Value {
         let end = |label: &str| {
             let (scope, broker) = label.split_once(':').unwrap();
             json!({"scope": scope, "broker": broker})
@@ -172,33 +172,21 @@ mod tests {
     }
 
     fn demo() -> FlowView {
-        view(&[
+        use DemoNode::{Cloud1, Edge2, Robot1};
+        let bridges = [
+            (Robot1, "node:memory", "layer:memory", "edge", json!({})),
+            (Robot1, "node:memory", "inter:dds", "fog", json!({"rate_limit": 3})),
+            (Robot1, "node:memory", "inter:dds", "cloud", json!({"rate_limit": 7})),
+            (Edge2, "layer:memory", "node:memory", "edge", json!({"echo": 1})),
             (
-                DemoNode::Robot1,
-                bridge("node:memory", "layer:memory", Some("edge"), &json!({})),
+                Cloud1,
+                "inter:dds",
+                "layer:memory",
+                "cloud",
+                json!({"rate_limit": 1, "lifespan": 2}),
             ),
-            (
-                DemoNode::Robot1,
-                bridge("node:memory", "inter:dds", Some("fog"), &json!({"rate_limit": 3})),
-            ),
-            (
-                DemoNode::Robot1,
-                bridge("node:memory", "inter:dds", Some("cloud"), &json!({"rate_limit": 7})),
-            ),
-            (
-                DemoNode::Edge2,
-                bridge("layer:memory", "node:memory", Some("edge"), &json!({"echo": 1})),
-            ),
-            (
-                DemoNode::Cloud1,
-                bridge(
-                    "inter:dds",
-                    "layer:memory",
-                    Some("cloud"),
-                    &json!({"rate_limit": 1, "lifespan": 2}),
-                ),
-            ),
-        ])
+        ];
+        view(&bridges.map(|(node, from, to, layer, dropped)| (node, bridge(from, to, layer, &dropped))))
     }
 
     #[test]
@@ -237,7 +225,7 @@ mod tests {
     fn the_part_of_this_process_is_shown_alone() {
         let here = view(&[(
             DemoNode::Cloud1,
-            bridge("inter:dds", "layer:memory", Some("cloud"), &json!({})),
+            bridge("inter:dds", "layer:memory", "cloud", &json!({})),
         )]);
         let path = here
             .path(

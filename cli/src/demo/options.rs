@@ -166,21 +166,7 @@ impl DemoOptions {
 }
 
 fn parse_duration(text: &str) -> Result<Duration, String> {
-    let split = text
-        .find(|c: char| !c.is_ascii_digit() && c != '.')
-        .unwrap_or(text.len());
-    let (number, unit) = text.split_at(split);
-    let scale = match unit {
-        "ms" => 0.001,
-        "" | "s" => 1.0,
-        "m" | "min" => 60.0,
-        "h" => 3600.0,
-        _ => return Err(format!("unit {unit:?} is not one of ms, s, m, h")),
-    };
-    let value: f64 = number
-        .parse()
-        .map_err(|_| format!("{text:?} is no time, for example 30s"))?;
-    let duration = Duration::try_from_secs_f64(value * scale).map_err(|error| error.to_string())?;
+    let duration = crate::config::parse_duration(text)?;
     if DURATION_RANGE.contains(&duration) {
         Ok(duration)
     } else {
@@ -191,12 +177,10 @@ fn parse_duration(text: &str) -> Result<Duration, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::args::{Arguments, Command};
-    use clap::Parser as _;
+    use crate::args::{Command, tests};
 
-    fn parse(line: &[&str]) -> Result<DemoOptions, clap::Error> {
-        let words = ["blaze", "demo"].iter().chain(line);
-        match Arguments::try_parse_from(words)?.command {
+    fn parse(line: &str) -> Result<DemoOptions, clap::Error> {
+        match tests::parse(&format!("demo {line}"))?.command {
             Command::Demo(options) => Ok(options),
             other => panic!("{other:?}"),
         }
@@ -204,7 +188,7 @@ mod tests {
 
     #[test]
     fn defaults_are_those_of_the_contract() {
-        let options = parse(&[]).unwrap();
+        let options = parse("").unwrap();
         assert_eq!(options.duration, Duration::from_secs(30));
         assert_eq!(options.brokers, Brokers::Memory);
         assert!(options.is_complete());
@@ -213,23 +197,10 @@ mod tests {
 
     #[test]
     fn all_options_are_read() {
-        let options = parse(&[
-            "--duration",
-            "1.5m",
-            "--only",
-            "robot-1,edge-2",
-            "--listen",
-            "10.0.1.1",
-            "--peer",
-            "10.0.3.1",
-            "--peer",
-            "10.0.4.1",
-            "--set",
-            "flow.bandwidth.limit_mbps=40",
-            "--record",
-            "a.mcap",
-            "b.mcap",
-        ])
+        let options = parse(
+            "--duration 1.5m --only robot-1,edge-2 --listen 10.0.1.1 --peer 10.0.3.1 --peer 10.0.4.1 \
+             --set flow.bandwidth.limit_mbps=40 --record a.mcap b.mcap",
+        )
         .unwrap();
         assert_eq!(options.duration, Duration::from_secs(90));
         assert_eq!(options.nodes(), [DemoNode::Robot1, DemoNode::Edge2]);
@@ -242,15 +213,15 @@ mod tests {
     #[test]
     fn bad_values_are_refused_with_a_reason() {
         for (line, why) in [
-            (&["--duration", "0s"][..], "1 s to 24 h"),
-            (&["--duration", "3 weeks"], "not one of ms, s, m, h"),
-            (&["--duration", "1e9"], "not one of"),
-            (&["--only", "robot-9"], "robot-1"),
-            (&["--set", "flow"], "KEY=VALUE"),
-            (&["--set", "node.name=x"], "--only"),
-            (&["--set", "flow..x=1"], "is no key"),
-            (&["--set", "a.b=[1"], "no YAML"),
-            (&["--listen", "here"], "invalid IP"),
+            ("--duration 0s", "1 s to 24 h"),
+            ("--duration 3weeks", "not one of ms, s, m, h"),
+            ("--duration 1e9", "not one of"),
+            ("--only robot-9", "robot-1"),
+            ("--set flow", "KEY=VALUE"),
+            ("--set node.name=x", "--only"),
+            ("--set flow..x=1", "is no key"),
+            ("--set a.b=[1", "no YAML"),
+            ("--listen here", "invalid IP"),
         ] {
             let error = parse(line).unwrap_err();
             assert!(error.to_string().contains(why), "{line:?}: {error}");
@@ -260,10 +231,7 @@ mod tests {
 
     #[test]
     fn bad_combinations_are_refused_with_a_reason() {
-        for (line, why) in [
-            (&["--listen", "0.0.0.0"][..], "one interface"),
-            (&["--peer", "::1"], "IPv4 only"),
-        ] {
+        for (line, why) in [("--listen 0.0.0.0", "one interface"), ("--peer ::1", "IPv4 only")] {
             let error = parse(line).unwrap().check().unwrap_err();
             assert!(error.to_string().contains(why), "{line:?}: {error}");
             assert_eq!(error.exit() as u8, 2);

@@ -41,6 +41,18 @@ fn write(
     writer.finish().unwrap();
 }
 
+/// What is read of a file of these messages.
+fn recorded(
+    compression: Option<mcap::Compression>,
+    channel: ChannelText<'_>,
+    messages: &[(usize, u64, Vec<u8>)],
+) -> Recording {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("a.mcap");
+    write(&path, compression, &[channel], messages);
+    load_all(&[path]).unwrap().remove(0)
+}
+
 fn payload(message: &RecordedMessage) -> &Bytes {
     match &message.body {
         Body::Ready(bytes) => bytes,
@@ -135,14 +147,11 @@ fn pictures_beyond_the_budget_stay_jpeg() {
 
 #[test]
 fn recordings_keep_their_pace_in_any_compression() {
-    let directory = tempfile::tempdir().unwrap();
     let messages: Vec<_> = (0..5)
         .map(|index| (0, second(100) + index * 20_000_000, vec![index as u8; 9]))
         .collect();
     for compression in [None, Some(mcap::Compression::Zstd), Some(mcap::Compression::Lz4)] {
-        let path = directory.path().join("a.mcap");
-        write(&path, compression, &[IMU], &messages);
-        let recording = &load_all(&[path]).unwrap()[0];
+        let recording = recorded(compression, IMU, &messages);
         assert_eq!(recording.period, Duration::from_millis(100));
         assert_eq!(recording.messages[4].offset, Duration::from_millis(80));
         assert_eq!(payload(&recording.messages[3]), &vec![3; 9]);
@@ -152,29 +161,16 @@ fn recordings_keep_their_pace_in_any_compression() {
 
 #[test]
 fn messages_are_ordered_by_time() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("a.mcap");
-    write(
-        &path,
-        None,
-        &[IMU],
-        &[
-            (0, second(3), vec![3]),
-            (0, second(1), vec![1]),
-            (0, second(2), vec![2]),
-        ],
-    );
-    let recording = &load_all(&[path]).unwrap()[0];
+    let messages = [3, 1, 2].map(|number| (0, second(number), vec![number as u8]));
+    let recording = recorded(None, IMU, &messages);
     let order: Vec<u8> = recording.messages.iter().map(|message| payload(message)[0]).collect();
     assert_eq!(order, [1, 2, 3]);
 }
 
 #[test]
 fn a_single_message_repeats_each_second() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("a.mcap");
-    write(&path, None, &[IMU], &[(0, second(7), vec![1])]);
-    assert_eq!(load_all(&[path]).unwrap()[0].period, Duration::from_secs(1));
+    let recording = recorded(None, IMU, &[(0, second(7), vec![1])]);
+    assert_eq!(recording.period, Duration::from_secs(1));
 }
 
 #[test]
@@ -267,8 +263,6 @@ fn any_damage_is_an_error_and_no_panic() {
 
 #[test]
 fn a_broken_picture_is_left_out() {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("c.mcap");
     let whole = read_file(&data("camera.mcap"), &[]).unwrap();
     let frame = |index: usize| match &whole.messages[index].2 {
         Body::Ready(bytes) | Body::Jpeg(bytes) => bytes.to_vec(),
@@ -276,13 +270,8 @@ fn a_broken_picture_is_left_out() {
     let mut no_jpeg = frame(1);
     no_jpeg.truncate(40);
     let channel = ("/c/compressed", "sensor_msgs/msg/CompressedImage", "ros2msg", "cdr");
-    write(
-        &path,
-        None,
-        &[channel],
-        &[(0, 0, frame(0)), (0, second(1), no_jpeg), (0, second(2), frame(2))],
-    );
-    let recording = &load_all(std::slice::from_ref(&path)).unwrap()[0];
+    let messages = [(0, 0, frame(0)), (0, second(1), no_jpeg), (0, second(2), frame(2))];
+    let recording = recorded(None, channel, &messages);
     assert_eq!((recording.messages.len(), recording.unusable_messages), (2, 1));
     assert_eq!(recording.topics[0].name.as_str(), "c");
 }

@@ -1,6 +1,5 @@
 //! What the demo prints: a live table on a terminal, plain lines elsewhere, JSON lines for programs.
 
-use std::collections::BTreeMap;
 use std::io::Write;
 use std::time::Duration;
 
@@ -8,8 +7,9 @@ use serde::Serialize;
 
 use super::board::TopicRow;
 use super::verdict::Summary;
+use crate::admin::dropped_text;
 use crate::exit::CliError;
-use crate::output::{Align, Format, bytes, number, render_table, terminal_width};
+use crate::output::{self, Align, Format, bytes, number, terminal_width, write_text};
 
 /// Plain lines come every so many seconds.
 const LINES_PERIOD_S: u64 = 5;
@@ -83,10 +83,10 @@ impl<Out: Write, Err: Write> Report<Out, Err> {
         match self.style {
             Style::Live { .. } => {
                 let clear = self.clear();
-                write(&mut self.out, &format!("{clear}{line}"))
+                write_text(&mut self.out, &format!("{clear}{line}"))
             }
-            Style::Lines => write(&mut self.out, &line),
-            Style::Json => write(&mut self.err, &line),
+            Style::Lines => write_text(&mut self.out, &line),
+            Style::Json => write_text(&mut self.err, &line),
         }
     }
 
@@ -100,11 +100,11 @@ impl<Out: Write, Err: Write> Report<Out, Err> {
                 let text = live_table(at, rows, width);
                 let clear = self.clear();
                 self.drawn = text.lines().count();
-                write(&mut self.out, &format!("{clear}{text}"))
+                write_text(&mut self.out, &format!("{clear}{text}"))
             }
             Style::Lines if at.as_secs().is_multiple_of(LINES_PERIOD_S) => {
                 let text: String = rows.iter().map(|row| plain_line(at, row)).collect();
-                write(&mut self.out, &text)
+                write_text(&mut self.out, &text)
             }
             Style::Lines => Ok(()),
             Style::Json => rows.iter().try_for_each(|row| self.json(&Line::Row(row))),
@@ -122,12 +122,12 @@ impl<Out: Write, Err: Write> Report<Out, Err> {
             Style::Lines => None,
         };
         let clear = self.clear();
-        write(&mut self.out, &format!("{clear}{}", summary_text(summary, width)))
+        write_text(&mut self.out, &format!("{clear}{}", summary_text(summary, width)))
     }
 
     fn json(&mut self, line: &Line<'_>) -> Result<(), CliError> {
         let text = serde_json::to_string(line).map_err(|error| CliError::Failed(error.to_string()))?;
-        write(&mut self.out, &format!("{text}\n"))
+        write_text(&mut self.out, &format!("{text}\n"))
     }
 
     /// Moves to the first line of the table that stands there and clears to the end of the screen.
@@ -139,49 +139,25 @@ impl<Out: Write, Err: Write> Report<Out, Err> {
     }
 }
 
-fn write(to: &mut impl Write, text: &str) -> Result<(), CliError> {
-    to.write_all(text.as_bytes())
-        .and_then(|()| to.flush())
-        .map_err(|error| match error.kind() {
-            std::io::ErrorKind::BrokenPipe => CliError::OutputClosed,
-            _ => CliError::Failed(format!("standard output: {error}")),
-        })
-}
-
-const LIVE_COLUMNS: [(&str, Align); 10] = [
-    ("TOPIC", Align::Left),
-    ("FROM", Align::Left),
-    ("TO", Align::Left),
-    ("ROUTE", Align::Left),
-    ("IN/Hz", Align::Right),
-    ("OUT/Hz", Align::Right),
-    ("BYTES/s", Align::Right),
-    ("p50/ms", Align::Right),
-    ("p99/ms", Align::Right),
-    ("DROPPED", Align::Left),
-];
-
 fn live_table(at: Duration, rows: &[TopicRow], width: u16) -> String {
-    let cells = rows
-        .iter()
-        .take(MAX_LIVE_ROWS)
-        .map(|row| {
-            vec![
-                row.topic.clone(),
-                row.from.clone(),
-                to_text(row),
-                row.route.join(" "),
-                number(row.rate_in_hz, 1),
-                number(Some(row.rate_out_hz), 1),
-                bytes(row.bytes_per_s),
-                number(row.latency_ms.p50, 1),
-                number(row.latency_ms.p99, 1),
-                dropped_text(&row.dropped),
-            ]
-        })
-        .collect();
     let mut text = format!("{} s, the last second:\n", at.as_secs());
-    text.push_str(&render_table(&LIVE_COLUMNS, cells, Some(width)));
+    let shown = rows.get(..MAX_LIVE_ROWS).unwrap_or(rows);
+    text.push_str(&output::table(
+        shown,
+        Some(width),
+        &[
+            ("TOPIC", Align::Left, &|row| row.topic.clone()),
+            ("FROM", Align::Left, &|row| row.from.clone()),
+            ("TO", Align::Left, &to_text),
+            ("ROUTE", Align::Left, &|row| row.route.join(" ")),
+            ("IN/Hz", Align::Right, &|row| number(row.rate_in_hz, 1)),
+            ("OUT/Hz", Align::Right, &|row| number(Some(row.rate_out_hz), 1)),
+            ("BYTES/s", Align::Right, &|row| bytes(row.bytes_per_s)),
+            ("p50/ms", Align::Right, &|row| number(row.latency_ms.p50, 1)),
+            ("p99/ms", Align::Right, &|row| number(row.latency_ms.p99, 1)),
+            ("DROPPED", Align::Left, &|row| dropped_text(&row.dropped)),
+        ],
+    ));
     if let Some(more) = rows.len().checked_sub(MAX_LIVE_ROWS).filter(|more| *more > 0) {
         text.push_str(&format!("… and {more} more\n"));
     }
@@ -213,44 +189,26 @@ fn to_text(row: &TopicRow) -> String {
     }
 }
 
-fn dropped_text(dropped: &BTreeMap<String, u64>) -> String {
-    crate::admin::dropped_text(dropped)
-}
-
-const SUMMARY_COLUMNS: [(&str, Align); 10] = [
-    ("TOPIC", Align::Left),
-    ("TO", Align::Left),
-    ("SENT", Align::Right),
-    ("RECEIVED", Align::Right),
-    ("LOST", Align::Right),
-    ("TWICE", Align::Right),
-    ("REORDERED", Align::Right),
-    ("p50/ms", Align::Right),
-    ("p99/ms", Align::Right),
-    ("DROPPED", Align::Left),
-];
-
 fn summary_text(summary: &Summary, width: Option<u16>) -> String {
-    let cells = summary
-        .topics
-        .iter()
-        .map(|row| {
-            vec![
-                row.topic.clone(),
-                to_text(row),
-                row.sent.map_or_else(|| "-".to_owned(), |sent| sent.to_string()),
-                row.received.to_string(),
-                row.lost.to_string(),
-                row.duplicated.to_string(),
-                row.reordered.to_string(),
-                number(row.latency_ms.p50, 2),
-                number(row.latency_ms.p99, 2),
-                dropped_text(&row.dropped),
-            ]
-        })
-        .collect();
     let mut text = format!("\nAfter {:.1} s:\n", summary.duration_s);
-    text.push_str(&render_table(&SUMMARY_COLUMNS, cells, width));
+    text.push_str(&output::table(
+        &summary.topics,
+        width,
+        &[
+            ("TOPIC", Align::Left, &|row| row.topic.clone()),
+            ("TO", Align::Left, &to_text),
+            ("SENT", Align::Right, &|row| {
+                row.sent.map_or_else(|| "-".to_owned(), |sent| sent.to_string())
+            }),
+            ("RECEIVED", Align::Right, &|row| row.received.to_string()),
+            ("LOST", Align::Right, &|row| row.lost.to_string()),
+            ("TWICE", Align::Right, &|row| row.duplicated.to_string()),
+            ("REORDERED", Align::Right, &|row| row.reordered.to_string()),
+            ("p50/ms", Align::Right, &|row| number(row.latency_ms.p50, 2)),
+            ("p99/ms", Align::Right, &|row| number(row.latency_ms.p99, 2)),
+            ("DROPPED", Align::Left, &|row| dropped_text(&row.dropped)),
+        ],
+    ));
     text.push('\n');
     let first: Vec<String> = summary
         .first_message_s

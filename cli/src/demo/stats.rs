@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::time::{Duration, Instant};
 
 use blaze_domain::WriterId;
+use blaze_flow::lane::measure::{LatencyHistogram, micros};
 
 /// Gaps that are remembered per writer; the oldest are settled as lost.
 const MAX_GAPS: usize = 4_096;
@@ -32,7 +33,6 @@ pub struct Arrival {
 pub struct SequenceTracker {
     /// Ranges that have come, first → last, none adjacent.
     ranges: BTreeMap<u64, u64>,
-    distinct: u64,
     duplicated: u64,
     reordered: u64,
     /// All below it is settled: what is missing there is lost.
@@ -58,7 +58,6 @@ impl SequenceTracker {
             self.duplicated += 1;
             return;
         }
-        self.distinct += 1;
         let after = self
             .ranges
             .range(sequence..)
@@ -101,12 +100,6 @@ impl SequenceTracker {
         self.settled_lost + gaps.map(|((_, last), (next, _))| next - last - 1).sum::<u64>()
     }
 
-    /// Numbers that came, each counted once.
-    #[must_use]
-    pub fn distinct(&self) -> u64 {
-        self.distinct
-    }
-
     /// Numbers that came again.
     #[must_use]
     pub fn duplicated(&self) -> u64 {
@@ -117,81 +110,6 @@ impl SequenceTracker {
     #[must_use]
     pub fn reordered(&self) -> u64 {
         self.reordered
-    }
-}
-
-/// Times in logarithmic buckets: 16 to a power of two, so that a percentile is right within 3.2 %.
-#[derive(Debug, Clone)]
-pub struct Histogram {
-    buckets: Vec<u64>,
-    count: u64,
-}
-
-const SUB_BITS: u32 = 4;
-const SUB: u64 = 1 << SUB_BITS;
-/// Times from 2^40 µs (12 days) on share the last bucket.
-const MAX_BITS: u32 = 40;
-
-impl Default for Histogram {
-    fn default() -> Self {
-        let powers = (MAX_BITS - SUB_BITS) as usize;
-        Self {
-            buckets: vec![0; SUB as usize * (powers + 1)],
-            count: 0,
-        }
-    }
-}
-
-impl Histogram {
-    /// Notes one time.
-    pub fn add(&mut self, time: Duration) {
-        let micros = u64::try_from(time.as_micros())
-            .unwrap_or(u64::MAX)
-            .min((1 << MAX_BITS) - 1);
-        if let Some(bucket) = self.buckets.get_mut(Self::bucket(micros)) {
-            *bucket += 1;
-            self.count += 1;
-        }
-    }
-
-    fn bucket(micros: u64) -> usize {
-        if micros < SUB {
-            return micros as usize;
-        }
-        let shift = micros.ilog2() - SUB_BITS;
-        (u64::from(shift + 1) * SUB + (micros >> shift) - SUB) as usize
-    }
-
-    /// The middle of a bucket, in microseconds.
-    fn middle(bucket: usize) -> f64 {
-        let bucket = bucket as u64;
-        if bucket < SUB {
-            return bucket as f64;
-        }
-        let shift = bucket / SUB - 1;
-        let first = (bucket % SUB + SUB) << shift;
-        first as f64 + ((1u64 << shift) - 1) as f64 / 2.0
-    }
-
-    /// The time that a share (0 to 1) of all times does not exceed, in milliseconds; `None` without any time.
-    #[must_use]
-    pub fn percentile_ms(&self, share: f64) -> Option<f64> {
-        if self.count == 0 {
-            return None;
-        }
-        let rank = ((share * self.count as f64).ceil() as u64).clamp(1, self.count);
-        let mut below = 0;
-        let bucket = self.buckets.iter().position(|count| {
-            below += count;
-            below >= rank
-        })?;
-        Some(Self::middle(bucket) / 1_000.0)
-    }
-
-    /// Forgets all times.
-    pub fn clear(&mut self) {
-        self.buckets.fill(0);
-        self.count = 0;
     }
 }
 
@@ -230,8 +148,8 @@ pub struct SubscriptionStats {
     writers: HashMap<WriterId, SequenceTracker>,
     received: u64,
     bytes: u64,
-    all: Histogram,
-    recent: Histogram,
+    all: LatencyHistogram,
+    recent: LatencyHistogram,
     looked: Instant,
     before: Counters,
     /// When the first message came, and its publication.
@@ -249,8 +167,8 @@ impl SubscriptionStats {
             writers: HashMap::new(),
             received: 0,
             bytes: 0,
-            all: Histogram::default(),
-            recent: Histogram::default(),
+            all: LatencyHistogram::default(),
+            recent: LatencyHistogram::default(),
             looked: now,
             before: Counters::default(),
             first: None,
@@ -262,8 +180,9 @@ impl SubscriptionStats {
     pub fn add(&mut self, arrival: &Arrival, now: Instant) {
         self.received += 1;
         self.bytes += arrival.bytes as u64;
-        self.all.add(arrival.latency);
-        self.recent.add(arrival.latency);
+        let latency_us = micros(arrival.latency);
+        self.all.record(latency_us);
+        self.recent.record(latency_us);
         self.first.get_or_insert((now, arrival.publish_time_ns));
         self.last = Some((now, arrival.publish_time_ns));
         if self.writers.len() < MAX_WRITERS || self.writers.contains_key(&arrival.writer) {
@@ -291,8 +210,8 @@ impl SubscriptionStats {
         Period {
             seconds: end.saturating_duration_since(from).as_secs_f64(),
             counters: self.counters(),
-            p50_ms: self.all.percentile_ms(0.5),
-            p99_ms: self.all.percentile_ms(0.99),
+            p50_ms: self.all.quantile_ms(0.5),
+            p99_ms: self.all.quantile_ms(0.99),
         }
     }
 
@@ -309,11 +228,11 @@ impl SubscriptionStats {
                 duplicated: counters.duplicated - before.duplicated,
                 reordered: counters.reordered - before.reordered,
             },
-            p50_ms: self.recent.percentile_ms(0.5),
-            p99_ms: self.recent.percentile_ms(0.99),
+            p50_ms: self.recent.quantile_ms(0.5),
+            p99_ms: self.recent.quantile_ms(0.99),
         };
         self.looked = now;
-        self.recent.clear();
+        self.recent = LatencyHistogram::default();
         period
     }
 }

@@ -9,7 +9,7 @@ use blaze_runtime::config::Sources;
 use clap::Args;
 use serde_json::{Value, json};
 
-use crate::config::node::options::has_password;
+use crate::config::node::options::{has_password, is_redis};
 use crate::demo::options::Setting;
 use crate::exit::CliError;
 use crate::node_file;
@@ -64,12 +64,7 @@ impl FromStr for DevBroker {
             url if has_password(url) => {
                 Err("a password does not belong here: --set brokers.node.redis.password_file=FILE".to_owned())
             }
-            url if ["redis://", "rediss://", "redis+unix://", "unix://"]
-                .iter()
-                .any(|scheme| url.starts_with(scheme)) =>
-            {
-                Ok(Self::Redis(url.to_owned()))
-            }
+            url if is_redis(url) => Ok(Self::Redis(url.to_owned())),
             _ => Err("it is memory, redis or redis://HOST:PORT".to_owned()),
         }
     }
@@ -134,14 +129,11 @@ impl DevOptions {
 
 #[cfg(test)]
 mod tests {
-    use clap::Parser as _;
-
     use super::*;
-    use crate::args::{Arguments, Command};
+    use crate::args::{Command, tests};
 
-    fn parse(line: &[&str]) -> Result<DevOptions, clap::Error> {
-        let words = ["blaze", "dev"].iter().chain(line);
-        match Arguments::try_parse_from(words)?.command {
+    fn parse(line: &str) -> Result<DevOptions, clap::Error> {
+        match tests::parse(&format!("dev {line}"))?.command {
             Command::Dev(options) => Ok(*options),
             other => panic!("{other:?}"),
         }
@@ -149,24 +141,24 @@ mod tests {
 
     #[test]
     fn a_broker_is_named_without_its_password() {
-        let refused = parse(&["--broker", "redis://me:secret@127.0.0.1:6379"]).unwrap_err();
+        let refused = parse("--broker redis://me:secret@127.0.0.1:6379").unwrap_err();
         assert!(refused.to_string().contains("password_file"), "{refused}");
-        assert!(parse(&["--broker", "redis://127.0.0.1:6379"]).is_ok());
+        assert!(parse("--broker redis://127.0.0.1:6379").is_ok());
     }
 
     #[test]
     fn the_node_file_says_what_the_options_say() {
-        let options = parse(&["--layer", "fog", "--node", "pc", "--set", "flow.bandwidth.limit_mbps=7"]).unwrap();
+        let options = parse("--layer fog --node pc --set flow.bandwidth.limit_mbps=7").unwrap();
         let (file, tree) = options.node_file(None, Some("127.0.0.1:7".parse().unwrap())).unwrap();
         assert_eq!(tree["layer"], json!({ "name": "fog", "kind": "fog" }));
         assert_eq!(tree["config"]["server"], "http://127.0.0.1:7");
         assert_eq!((file.flow.bandwidth.limit_mbps, options.kind()), (7.0, "fog"));
         assert!(file.state_dir.is_none());
-        let kept = parse(&["--data", "kept"]).unwrap();
+        let kept = parse("--data kept").unwrap();
         let (_, tree) = kept.node_file(Some("redis://127.0.0.1:1"), None).unwrap();
         assert_eq!(tree["control_plane"]["store"]["sqlite"]["path"], "kept/blaze-config.db");
         assert_eq!(tree["brokers"]["node"]["redis"]["url"], "redis://127.0.0.1:1");
-        let faulty = parse(&["--set", "flow.bandwith.limit_mbps=7"]).unwrap();
+        let faulty = parse("--set flow.bandwith.limit_mbps=7").unwrap();
         assert_eq!(faulty.node_file(None, None).unwrap_err().exit() as u8, 2);
     }
 
@@ -179,11 +171,7 @@ mod tests {
         ] {
             assert_eq!(text.parse(), Ok(broker));
         }
-        assert!(
-            parse(&["--broker", "kafka"])
-                .unwrap_err()
-                .to_string()
-                .contains("redis://HOST:PORT")
-        );
+        let refused = parse("--broker kafka").unwrap_err();
+        assert!(refused.to_string().contains("redis://HOST:PORT"), "{refused}");
     }
 }

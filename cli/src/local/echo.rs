@@ -1,16 +1,17 @@
 //! `blaze echo`.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD as BASE64;
-use blaze_domain::Reliability;
 use blaze_sdk::{Message, Request, SubscribeOptions};
 use clap::Args;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
-use super::{LocalService, LocalTopic, interrupted, lease_error};
+use super::{LocalService, LocalTopic, reliability};
+use crate::ends::interrupted;
 use crate::exit::{CliError, Exit};
 use crate::output::{self, Format};
 
@@ -48,42 +49,24 @@ pub async fn run(options: EchoOptions, format: Format) -> Result<Exit, CliError>
 }
 
 async fn print_all(service: &LocalService, options: &EchoOptions, format: Format) -> Result<(), CliError> {
-    let topic = &options.target.topic;
     let (tell, mut told) = mpsc::channel(WAITING);
-    let dropped = Arc::new(std::sync::atomic::AtomicU64::new(0));
+    let dropped = Arc::new(AtomicU64::new(0));
     let counted = Arc::clone(&dropped);
-    let subscription = service
-        .manager
-        .broker()
-        .subscribe(
-            topic,
-            SubscribeOptions {
-                max_rate_hz: options.max_rate,
-                ..SubscribeOptions::default()
-            },
-            move |message| {
-                if tell.try_send(message).is_err() {
-                    counted.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-                }
-            },
-        )
-        .await
-        .map_err(|error| CliError::Failed(format!("subscribe {topic}: {error}")))?;
+    let subscribe = SubscribeOptions {
+        max_rate_hz: options.max_rate,
+        ..SubscribeOptions::default()
+    };
     let request = Request {
         max_rate_hz: options.max_rate,
-        reliability: if options.reliable {
-            Reliability::Reliable
-        } else {
-            Reliability::BestEffort
-        },
-        ..Request::new(topic.clone())
+        reliability: reliability(options.reliable),
+        ..Request::new(options.target.topic.clone())
     };
-    let lease = service
-        .manager
-        .flow()
-        .request(request)
-        .await
-        .map_err(|error| lease_error("request", topic, service.broker.kind(), &error))?;
+    let take = move |message| {
+        if tell.try_send(message).is_err() {
+            counted.fetch_add(1, Ordering::Relaxed);
+        }
+    };
+    let (subscription, lease) = service.listen(subscribe, request, take).await?;
     let interruption = interrupted();
     tokio::pin!(interruption);
     let mut printed = 0;
@@ -101,7 +84,7 @@ async fn print_all(service: &LocalService, options: &EchoOptions, format: Format
     }
     let _ = lease.withdraw().await;
     drop(subscription);
-    let lost = dropped.load(std::sync::atomic::Ordering::Relaxed);
+    let lost = dropped.load(Ordering::Relaxed);
     if lost > 0 {
         eprintln!("blaze: {lost} messages came faster than they could be printed and were left out");
     }

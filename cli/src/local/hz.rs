@@ -4,12 +4,14 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_sdk::{Request, SubscribeOptions, SubscriptionStats};
+use blaze_sdk::{Message, Request, SubscribeOptions, SubscriptionStats};
 use clap::Args;
 use parking_lot::Mutex;
 use serde_json::{Value, json};
 
-use super::{LocalService, LocalTopic, interrupted, lease_error};
+use super::{LocalService, LocalTopic};
+use crate::args::parse_seconds;
+use crate::ends::interrupted;
 use crate::exit::{CliError, Exit};
 use crate::output::{self, Format};
 
@@ -23,18 +25,11 @@ pub struct HzOptions {
     #[command(flatten)]
     pub target: LocalTopic,
     /// Seconds that a figure looks back
-    #[arg(long, value_name = "S", default_value_t = 5.0, value_parser = parse_window)]
+    #[arg(long, value_name = "S", default_value_t = 5.0, value_parser = parse_seconds)]
     pub window: f64,
     /// End after this many figures; one a second
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub count: Option<u64>,
-}
-
-fn parse_window(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(seconds) if (0.1..=3600.0).contains(&seconds) => Ok(seconds),
-        _ => Err("a window is 0.1 to 3600 seconds".to_owned()),
-    }
 }
 
 /// One message as it arrived.
@@ -71,28 +66,19 @@ async fn measure(service: &LocalService, options: &HzOptions, format: Format) ->
     let topic = &options.target.topic;
     let arrivals: Arc<Mutex<VecDeque<Arrival>>> = Arc::default();
     let noted = Arc::clone(&arrivals);
-    let subscription = service
-        .manager
-        .broker()
-        .subscribe(topic, SubscribeOptions::default(), move |message| {
-            let mut noted = noted.lock();
-            if noted.len() == MAX_WINDOW {
-                noted.pop_front();
-            }
-            noted.push_back(Arrival {
-                at: Instant::now(),
-                bytes: message.payload().len(),
-                age: message.age(),
-            });
-        })
-        .await
-        .map_err(|error| CliError::Failed(format!("subscribe {topic}: {error}")))?;
-    let lease = service
-        .manager
-        .flow()
-        .request(Request::new(topic.clone()))
-        .await
-        .map_err(|error| lease_error("request", topic, service.broker.kind(), &error))?;
+    let take = move |message: Message| {
+        let mut noted = noted.lock();
+        if noted.len() == MAX_WINDOW {
+            noted.pop_front();
+        }
+        noted.push_back(Arrival {
+            at: Instant::now(),
+            bytes: message.payload().len(),
+            age: message.age(),
+        });
+    };
+    let request = Request::new(topic.clone());
+    let (subscription, lease) = service.listen(SubscribeOptions::default(), request, take).await?;
     let window = Duration::from_secs_f64(options.window);
     let interruption = interrupted();
     tokio::pin!(interruption);

@@ -14,11 +14,10 @@ use std::time::Duration;
 
 use blaze_brokers::{Broker, BrokerKind, Health, OpenError, Role, open_layer, open_node};
 use blaze_domain::node_file::{LayerBroker, NodeBroker, NodeFile};
-use blaze_domain::{InstanceName, Scope, ServiceName, TopicName};
+use blaze_domain::{InstanceName, Reliability, Scope, ServiceName, TopicName};
 use blaze_runtime::config::Sources;
-use blaze_sdk::{FlowError, ServiceManager, ServiceOptions};
+use blaze_sdk::{FlowError, Lease, Message, Request, ServiceManager, ServiceOptions, SubscribeOptions, Subscription};
 use clap::Args;
-use tokio::signal::unix::{SignalKind, signal};
 
 use crate::args::parse_topic;
 use crate::exit::CliError;
@@ -32,6 +31,14 @@ pub use publish::{PublishOptions, run as publish};
 const CONNECT_WITHIN: Duration = Duration::from_secs(5);
 /// How long a flow may take to answer.
 const ANSWER_WITHIN: Duration = Duration::from_secs(5);
+
+/// Whether messages that are lost are sent again.
+fn reliability(reliable: bool) -> Reliability {
+    match reliable {
+        true => Reliability::Reliable,
+        false => Reliability::BestEffort,
+    }
+}
 
 /// Which broker, and which topic.
 #[derive(Debug, Args)]
@@ -76,6 +83,21 @@ impl LocalService {
         Ok(Self { manager, broker })
     }
 
+    /// Subscribes to the topic and requests it.
+    async fn listen(
+        &self,
+        options: SubscribeOptions,
+        request: Request,
+        take: impl Fn(Message) + Send + Sync + 'static,
+    ) -> Result<(Subscription, Lease), CliError> {
+        let topic = request.topic.clone();
+        let subscribed = self.manager.broker().subscribe(&topic, options, take).await;
+        let subscription = subscribed.map_err(|error| CliError::Failed(format!("subscribe {topic}: {error}")))?;
+        let requested = self.manager.flow().request(request).await;
+        let lease = requested.map_err(|error| lease_error("request", &topic, self.broker.kind(), &error))?;
+        Ok((subscription, lease))
+    }
+
     /// Withdraws what was leased, delivers what was taken and disconnects.
     async fn end(self) {
         self.manager.shutdown().await;
@@ -85,13 +107,11 @@ impl LocalService {
 
 fn open(file: &NodeFile) -> Result<(Arc<dyn Broker>, Scope), CliError> {
     let role = Role::Service;
-    let memory = || {
-        Err(OpenError::InProcess).map_err(|error: OpenError| {
-            CliError::Usage(format!("brokers: {error}. Name redis, kafka or dds in the node file."))
-        })
-    };
     match (&file.brokers.node, &file.brokers.layer) {
-        (Some(NodeBroker::Memory), _) | (None, Some(LayerBroker::Memory)) => memory(),
+        (Some(NodeBroker::Memory), _) | (None, Some(LayerBroker::Memory)) => Err(CliError::Usage(format!(
+            "brokers: {}. Name redis, kafka or dds in the node file.",
+            OpenError::InProcess
+        ))),
         (Some(node), _) => Ok((open_node(node, &role).map_err(|e| refused("node", &e))?, Scope::Node)),
         (None, Some(layer)) => Ok((
             open_layer(layer, &role).map_err(|e| refused("layer", &e))?,
@@ -137,16 +157,4 @@ fn lease_error(what: &str, topic: &TopicName, kind: BrokerKind, error: &FlowErro
         FlowError::Refused { .. } | FlowError::Invalid { .. } => CliError::Invalid(format!("{what} {topic}: {error}")),
         _ => CliError::Failed(format!("{what} {topic}: {error}")),
     }
-}
-
-/// Waits for Ctrl-C or SIGTERM.
-pub(crate) async fn interrupted() -> Result<(), CliError> {
-    let fault = |error: std::io::Error| CliError::Failed(format!("no signal handlers: {error}"));
-    let mut interrupt = signal(SignalKind::interrupt()).map_err(fault)?;
-    let mut terminate = signal(SignalKind::terminate()).map_err(fault)?;
-    tokio::select! {
-        _ = interrupt.recv() => {}
-        _ = terminate.recv() => {}
-    }
-    Ok(())
 }

@@ -10,7 +10,8 @@ use serde_json::json;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout_at};
 
-use super::{LocalService, LocalTopic, interrupted, lease_error};
+use super::{LocalService, LocalTopic, lease_error, reliability};
+use crate::ends::interrupted;
 use crate::exit::{CliError, Exit};
 use crate::output::{self, Format};
 
@@ -81,11 +82,7 @@ struct Sent {
 async fn publish(service: &LocalService, options: &PublishOptions) -> Result<Sent, CliError> {
     let topic = &options.target.topic;
     let kind = service.broker.kind();
-    let reliability = if options.reliable {
-        blaze_domain::Reliability::Reliable
-    } else {
-        blaze_domain::Reliability::BestEffort
-    };
+    let reliability = reliability(options.reliable);
     let mut events = service.manager.flow().events();
     let advertise = Advertise {
         rate_hz: options.rate,

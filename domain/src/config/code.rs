@@ -3,6 +3,8 @@
 use std::fmt;
 use std::str::FromStr;
 
+use serde::{Serialize, Serializer};
+
 macro_rules! codes {
     ($($(#[$doc:meta])* $variant:ident = $text:literal, $http:literal, $grpc:literal, $title:literal;)+) => {
         /// What went wrong, as a closed set.
@@ -87,6 +89,12 @@ codes! {
     Overloaded = "overloaded", 503, 14, "The service has too much to do.";
     ShuttingDown = "shutting_down", 503, 14, "The service is ending.";
     DeadlineExceeded = "deadline_exceeded", 504, 4, "It took too long.";
+}
+
+impl Serialize for Code {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.as_str())
+    }
 }
 
 impl fmt::Display for Code {

@@ -6,7 +6,8 @@
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 
-use serde_json::{Map, Value};
+use serde::Serialize;
+use serde_json::{Map, Value, json};
 
 use super::json::append;
 use super::{Document, Labels, secret};
@@ -23,15 +24,17 @@ const MAX_PATH_BYTES: usize = 64 * 1024;
 const EMPTY_IF_ABSENT: [&str; 2] = ["config", "overrides"];
 
 /// One difference.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Delta {
     /// `add`, `remove` or `replace`.
     pub op: &'static str,
     /// Where, as a JSON pointer.
     pub path: String,
     /// What was there; not of `add`.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub old: Option<Value>,
     /// What is there now; not of `remove`.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub value: Option<Value>,
 }
 
@@ -53,15 +56,7 @@ impl Delta {
     /// The members of the contract; `old` and `value` as far as they are there, for `null` is a value.
     #[must_use]
     pub fn to_json(&self) -> Value {
-        let mut out = Map::new();
-        out.insert("op".to_owned(), self.op.into());
-        out.insert("path".to_owned(), self.path.as_str().into());
-        for (name, value) in [("old", &self.old), ("value", &self.value)] {
-            if let Some(value) = value {
-                out.insert(name.to_owned(), value.clone());
-            }
-        }
-        Value::Object(out)
+        json!(self)
     }
 
     /// The difference that [`Delta::to_json`] wrote.
@@ -109,18 +104,13 @@ fn annotations(document: &Document) -> &Labels {
 }
 
 fn object(labels: Option<&Labels>) -> Value {
-    let members = labels.into_iter().flatten();
-    Value::Object(
-        members
-            .map(|(key, value)| (key.clone(), value.as_str().into()))
-            .collect(),
-    )
+    labels.map_or_else(|| json!({}), |labels| json!(labels))
 }
 
 fn redacted_spec(document: Option<&Document>) -> Cow<'_, Value> {
     match document {
         Some(document) => secret::redact(&document.spec),
-        None => Cow::Owned(Value::Object(Map::new())),
+        None => Cow::Owned(json!({})),
     }
 }
 

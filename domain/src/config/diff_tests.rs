@@ -1,10 +1,7 @@
-use std::sync::Arc;
-
 use proptest::prelude::*;
 use serde_json::json;
 
 use super::*;
-use crate::config::Timestamp;
 use crate::config::arbitrary::{any_json, any_part};
 
 fn lines(deltas: &[Delta]) -> Vec<String> {
@@ -22,20 +19,12 @@ fn lines(deltas: &[Delta]) -> Vec<String> {
 }
 
 fn document(labels: &[(&str, &str)], spec: Value) -> Document {
+    let pairs = labels.iter();
     Document {
-        key: "Layer/edge".parse().unwrap(),
-        uid: "u".to_owned(),
-        revision: 1,
-        create_time: Timestamp::default(),
-        update_time: Timestamp::default(),
-        updated_by: "ops".to_owned(),
-        labels: labels
-            .iter()
+        labels: pairs
             .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
             .collect(),
-        annotations: Labels::new(),
-        spec: Arc::new(spec),
-        status: None,
+        ..Document::new("Layer/edge".parse().unwrap(), spec)
     }
 }
 

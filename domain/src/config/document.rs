@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use serde_json::{Map, Value};
+use serde_json::{Map, Value, json};
 
 use super::{Key, Kind, Timestamp};
 
@@ -37,6 +37,23 @@ pub struct Document {
 }
 
 impl Document {
+    /// A document that no store has yet: without labels, and without what the server sets.
+    #[must_use]
+    pub fn new(key: Key, spec: Value) -> Self {
+        Self {
+            key,
+            uid: String::new(),
+            revision: 0,
+            create_time: Timestamp::default(),
+            update_time: Timestamp::default(),
+            updated_by: String::new(),
+            labels: Labels::new(),
+            annotations: Labels::new(),
+            spec: Arc::new(spec),
+            status: None,
+        }
+    }
+
     /// The envelope as JSON, members in the order of the contract.
     #[must_use]
     pub fn to_json(&self) -> Value {
@@ -63,8 +80,8 @@ impl Document {
         if let Some(service) = self.key.service_name() {
             members.insert("service".to_owned(), service.as_str().into());
         }
-        members.insert("labels".to_owned(), object(&self.labels));
-        members.insert("annotations".to_owned(), object(&self.annotations));
+        members.insert("labels".to_owned(), json!(self.labels));
+        members.insert("annotations".to_owned(), json!(self.annotations));
         members.insert("spec".to_owned(), (*self.spec).clone());
         Value::Object(members)
     }
@@ -119,11 +136,4 @@ impl Document {
             _ => true,
         }
     }
-}
-
-fn object(labels: &Labels) -> Value {
-    let members = labels
-        .iter()
-        .map(|(key, value)| (key.clone(), Value::from(value.as_str())));
-    Value::Object(members.collect())
 }

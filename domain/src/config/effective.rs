@@ -157,9 +157,7 @@ impl Sources {
             .zip(&values)
             .map(|((document, is_override, _), value)| Part {
                 source: Source {
-                    kind: document.key.kind(),
-                    service: document.key.service_name().map(ToString::to_string),
-                    name: document.key.name().to_string(),
+                    key: document.key.clone(),
                     revision: document.revision,
                     is_override: *is_override,
                 },

@@ -9,20 +9,16 @@
 
 use std::collections::BTreeMap;
 
-use serde_json::{Map, Value};
+use serde_json::{Map, Value, json};
 
 use super::json::append;
-use super::{Kind, secret};
+use super::{Key, secret};
 
 /// Where a part of an effective configuration stands.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Source {
-    /// Kind of the document.
-    pub kind: Kind,
-    /// Service of an instance.
-    pub service: Option<String>,
-    /// Name of the document.
-    pub name: String,
+    /// The document.
+    pub key: Key,
     /// Its revision.
     pub revision: u64,
     /// Whether it is an entry of `overrides` instead of `config`.
@@ -31,11 +27,11 @@ pub struct Source {
 
 impl Source {
     fn write_to(&self, out: &mut Map<String, Value>) {
-        out.insert("kind".to_owned(), self.kind.as_str().into());
-        if let Some(service) = &self.service {
-            out.insert("service".to_owned(), service.as_str().into());
+        out.insert("kind".to_owned(), json!(self.key.kind()));
+        if let Some(service) = self.key.service_name() {
+            out.insert("service".to_owned(), json!(service));
         }
-        out.insert("name".to_owned(), self.name.as_str().into());
+        out.insert("name".to_owned(), json!(self.key.name()));
         out.insert("revision".to_owned(), self.revision.into());
         if self.is_override {
             out.insert("override".to_owned(), true.into());
@@ -84,16 +80,6 @@ fn plain_object(value: &Value) -> Option<&Map<String, Value>> {
     value
         .as_object()
         .filter(|members| !members.contains_key(secret::MEMBER))
-}
-
-/// The effective configuration of parts, weakest first: an object without `null` outside arrays.
-#[must_use]
-pub fn effective(parts: &[Part<'_>]) -> Value {
-    let mut out = Value::Object(Map::new());
-    for part in parts.iter().filter(|part| plain_object(part.value).is_some()) {
-        merge_patch(&mut out, part.value);
-    }
-    out
 }
 
 /// Where each key of the effective configuration of parts (weakest first) comes from: JSON pointer → source.

@@ -8,7 +8,6 @@
 //!
 //! The main service and the worker share all of it, so that both come to the same configuration and the same hash.
 
-mod ack;
 #[cfg(test)]
 mod arbitrary;
 pub mod canonical;
@@ -26,13 +25,14 @@ pub mod selector;
 pub mod spec;
 pub mod state;
 mod time;
+mod words;
 
-pub use ack::AckStatus;
 pub use code::Code;
 pub use document::{Document, Labels};
 pub use key::{Key, KeyError, Kind};
 pub use problem::{Applied, FieldFault, Problem};
 pub use time::Timestamp;
+pub use words::{AckStatus, ConfigScope, ConfigSource, ServiceState};
 
 /// Largest document, in bytes of its compact JSON (256 KiB).
 pub const MAX_DOCUMENT_BYTES: usize = 256 * 1024;

@@ -76,7 +76,9 @@ pub fn placement(state: &State, document: &Document) -> Placement {
         },
         Kind::Instance => instance(state, document),
         Kind::Rollout => {
-            let target = rollout_target(document).and_then(|key| state.get(&key).cloned());
+            // A roll-out of a roll-out is refused; it would lead in a circle.
+            let target = rollout_target(document).filter(|key| key.kind() != Kind::Rollout);
+            let target = target.and_then(|key| state.get(&key).cloned());
             let visible = target.map_or(Visible::In(Vec::new()), |held| placement(state, &held.document).visible);
             Placement {
                 visible,

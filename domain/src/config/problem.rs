@@ -2,7 +2,8 @@
 
 use std::fmt;
 
-use serde_json::{Map, Value};
+use serde::Serialize;
+use serde_json::{Map, Value, json};
 
 use super::Code;
 
@@ -27,7 +28,7 @@ impl Applied {
 }
 
 /// One fault of several.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct FieldFault {
     /// Where in the document, as a JSON pointer (RFC 6901).
     pub pointer: String,
@@ -36,6 +37,7 @@ pub struct FieldFault {
     /// In words; never holds a secret.
     pub detail: String,
     /// Which document of the request, from 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub document: Option<usize>,
 }
 
@@ -141,7 +143,7 @@ impl Problem {
         put("request_id", request_id.into());
         put("applied", self.applied.as_str().into());
         if !self.errors.is_empty() {
-            put("errors", self.errors.iter().map(fault_json).collect());
+            put("errors", json!(self.errors));
         }
         for (name, value) in [
             ("revision", self.revision),
@@ -162,17 +164,6 @@ fn told(pointer: &str, detail: &str) -> String {
         "" => detail.to_owned(),
         pointer => format!("{pointer}: {detail}"),
     }
-}
-
-fn fault_json(fault: &FieldFault) -> Value {
-    let mut out = Map::new();
-    out.insert("pointer".to_owned(), fault.pointer.as_str().into());
-    out.insert("code".to_owned(), fault.code.as_str().into());
-    out.insert("detail".to_owned(), fault.detail.as_str().into());
-    if let Some(document) = fault.document {
-        out.insert("document".to_owned(), document.into());
-    }
-    Value::Object(out)
 }
 
 impl fmt::Display for Problem {

@@ -54,7 +54,13 @@ mod tests {
         assert_eq!(time.to_string(), "2026-11-21T07:01:12.345Z");
         assert_eq!("2026-11-21T07:01:12.345Z".parse(), Ok(time));
         assert_eq!("2026-11-21T08:01:12.345+01:00".parse(), Ok(time));
-        assert_eq!(Timestamp::from_millis(0).to_string(), "1970-01-01T00:00:00.000Z");
+        for (ms, text) in [
+            (0, "1970-01-01T00:00:00.000Z"),
+            (951_782_400_000, "2000-02-29T00:00:00.000Z"),
+            (1_709_251_199_999, "2024-02-29T23:59:59.999Z"),
+        ] {
+            assert_eq!(Timestamp::from_millis(ms).to_string(), text);
+        }
         for edge in [i64::MIN, i64::MAX] {
             let text = Timestamp::from_millis(edge).to_string();
             assert_eq!(text.parse(), Ok(Timestamp::from_millis(edge)), "{text}");

@@ -1,6 +1,7 @@
 //! Control messages as types, and as JSON.
 
-use serde_json::{Map, Value};
+use serde::Serialize;
+use serde_json::Value;
 
 use super::words::LeaseKind;
 use super::{DEFAULT_TTL_S, MAX_CONTROL_OBJECTS};
@@ -8,7 +9,8 @@ use crate::names::{ChannelName, InstanceName, LayerName, NodeName, ServiceName, 
 use crate::qos::{Durability, Priority, Reliability};
 
 /// What a service tells its flow.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "op", rename_all = "snake_case")]
 pub enum ControlMessage {
     /// It publishes a topic.
     Advertise(AdvertiseMessage),
@@ -19,7 +21,7 @@ pub enum ControlMessage {
 }
 
 /// Fields of every control message.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Common {
     /// The topic.
     pub topic: TopicName,
@@ -28,25 +30,33 @@ pub struct Common {
     /// Its instance; `0` unless given.
     pub instance: InstanceName,
     /// Its layer; `None` = where the message is received.
+    #[serde(skip_serializing_if = "is_default")]
     pub layer: Option<LayerName>,
     /// Its node; `None` = where the message is received, or none on a layer scope.
+    #[serde(skip_serializing_if = "is_default")]
     pub node: Option<NodeName>,
     /// Its life: larger is newer; 0 unless given.
+    #[serde(skip_serializing_if = "is_default")]
     pub epoch: u64,
     /// Comes back in the answer.
+    #[serde(skip_serializing_if = "is_default")]
     pub id: Option<String>,
     /// Where the answer goes; `None` = no answer is wanted.
+    #[serde(skip_serializing_if = "is_default")]
     pub reply_to: Option<ChannelName>,
 }
 
 /// Type and quality of service, common to advertisements and requests.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Quality {
     /// Media type; `None` = not said.
+    #[serde(skip_serializing_if = "is_default")]
     pub encoding: Option<String>,
     /// ROS type, or empty.
+    #[serde(rename = "type", skip_serializing_if = "is_default")]
     pub type_name: String,
     /// RIHS01 hash of the type, or empty.
+    #[serde(skip_serializing_if = "is_default")]
     pub type_hash: String,
     /// Whether losses are repaired.
     pub reliability: Reliability,
@@ -55,8 +65,10 @@ pub struct Quality {
     /// Samples kept per writer, at least 1.
     pub depth: u32,
     /// Class; `None` = by size.
+    #[serde(skip_serializing_if = "is_default")]
     pub priority: Option<Priority>,
     /// Milliseconds after which a message is worthless; 0 = never.
+    #[serde(skip_serializing_if = "is_default")]
     pub lifespan_ms: u32,
 }
 
@@ -76,54 +88,68 @@ impl Default for Quality {
 }
 
 /// A service publishes a topic.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct AdvertiseMessage {
     /// Who and what.
+    #[serde(flatten)]
     pub common: Common,
     /// Lifetime in seconds; 0 = until withdrawn.
     pub ttl_s: u32,
     /// Messages per second; `None` = to be measured.
+    #[serde(skip_serializing_if = "is_default")]
     pub rate_hz: Option<f64>,
     /// Largest payload in bytes; `None` = to be measured.
+    #[serde(skip_serializing_if = "is_default")]
     pub max_bytes: Option<u64>,
     /// Type and quality of service.
+    #[serde(flatten)]
     pub quality: Quality,
 }
 
 /// A service wants a topic.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RequestMessage {
     /// Who and what.
+    #[serde(flatten)]
     pub common: Common,
     /// Lifetime in seconds; 0 = until withdrawn.
     pub ttl_s: u32,
     /// Most messages per second; `None` = all.
+    #[serde(skip_serializing_if = "is_default")]
     pub max_rate_hz: Option<f64>,
     /// It wants payloads without a header.
+    #[serde(skip_serializing_if = "is_default")]
     pub bare: bool,
     /// Only messages of that origin.
+    #[serde(skip_serializing_if = "is_default")]
     pub from: OriginSelector,
     /// Expected type, and quality of service asked for.
+    #[serde(flatten)]
     pub quality: Quality,
 }
 
 /// A service no longer publishes or wants a topic.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct WithdrawMessage {
     /// Who and what.
+    #[serde(flatten)]
     pub common: Common,
     /// Which lease; `None` = both.
+    #[serde(skip_serializing_if = "is_default")]
     pub kind: Option<LeaseKind>,
 }
 
 /// Origin that a request asks for; an absent part matches everything.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct OriginSelector {
     /// Layer of the publisher.
+    #[serde(skip_serializing_if = "is_default")]
     pub layer: Option<LayerName>,
     /// Node of the publisher.
+    #[serde(skip_serializing_if = "is_default")]
     pub node: Option<NodeName>,
     /// Service of the publisher.
+    #[serde(skip_serializing_if = "is_default")]
     pub service: Option<ServiceName>,
 }
 
@@ -148,43 +174,6 @@ impl Common {
             epoch: 0,
             id: None,
             reply_to: None,
-        }
-    }
-
-    fn write(&self, op: &str, json: &mut Map<String, Value>) {
-        json.insert("op".into(), op.into());
-        json.insert("topic".into(), self.topic.as_str().into());
-        json.insert("service".into(), self.service.as_str().into());
-        json.insert("instance".into(), self.instance.as_str().into());
-        put_text(json, "layer", self.layer.as_ref().map(LayerName::as_str));
-        put_text(json, "node", self.node.as_ref().map(NodeName::as_str));
-        if self.epoch != 0 {
-            json.insert("epoch".into(), self.epoch.into());
-        }
-        put_text(json, "id", self.id.as_deref());
-        put_text(json, "reply_to", self.reply_to.as_ref().map(ChannelName::as_str));
-    }
-}
-
-impl Quality {
-    fn write(&self, json: &mut Map<String, Value>) {
-        put_text(json, "encoding", self.encoding.as_deref());
-        put_text(
-            json,
-            "type",
-            Some(self.type_name.as_str()).filter(|text| !text.is_empty()),
-        );
-        put_text(
-            json,
-            "type_hash",
-            Some(self.type_hash.as_str()).filter(|text| !text.is_empty()),
-        );
-        json.insert("reliability".into(), self.reliability.as_str().into());
-        json.insert("durability".into(), self.durability.as_str().into());
-        json.insert("depth".into(), self.depth.into());
-        put_text(json, "priority", self.priority.map(Priority::as_str));
-        if self.lifespan_ms != 0 {
-            json.insert("lifespan_ms".into(), self.lifespan_ms.into());
         }
     }
 }
@@ -253,43 +242,7 @@ impl ControlMessage {
     /// The JSON object that [`super::parse_payload`] reads back as the same message.
     #[must_use]
     pub fn to_json(&self) -> Value {
-        let mut json = Map::new();
-        match self {
-            Self::Advertise(message) => {
-                message.common.write("advertise", &mut json);
-                json.insert("ttl_s".into(), message.ttl_s.into());
-                put_number(&mut json, "rate_hz", message.rate_hz);
-                if let Some(bytes) = message.max_bytes {
-                    json.insert("max_bytes".into(), bytes.into());
-                }
-                message.quality.write(&mut json);
-            }
-            Self::Request(message) => {
-                message.common.write("request", &mut json);
-                json.insert("ttl_s".into(), message.ttl_s.into());
-                put_number(&mut json, "max_rate_hz", message.max_rate_hz);
-                if message.bare {
-                    json.insert("bare".into(), true.into());
-                }
-                if !message.from.is_any() {
-                    let mut from = Map::new();
-                    put_text(&mut from, "layer", message.from.layer.as_ref().map(LayerName::as_str));
-                    put_text(&mut from, "node", message.from.node.as_ref().map(NodeName::as_str));
-                    put_text(
-                        &mut from,
-                        "service",
-                        message.from.service.as_ref().map(ServiceName::as_str),
-                    );
-                    json.insert("from".into(), from.into());
-                }
-                message.quality.write(&mut json);
-            }
-            Self::Withdraw(message) => {
-                message.common.write("withdraw", &mut json);
-                put_text(&mut json, "kind", message.kind.map(LeaseKind::as_str));
-            }
-        }
-        Value::Object(json)
+        serde_json::to_value(self).unwrap_or_default()
     }
 
     /// Payloads that carry all these messages, each within the limits of one payload.
@@ -322,14 +275,7 @@ impl ControlMessage {
     }
 }
 
-fn put_text(json: &mut Map<String, Value>, key: &str, value: Option<&str>) {
-    if let Some(text) = value {
-        json.insert(key.into(), text.into());
-    }
-}
-
-fn put_number(json: &mut Map<String, Value>, key: &str, value: Option<f64>) {
-    if let Some(number) = value {
-        json.insert(key.into(), number.into());
-    }
+/// Whether a field has the value that it has when it is absent.
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }

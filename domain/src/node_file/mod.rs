@@ -49,6 +49,7 @@ use crate::MAX_PAYLOAD_BYTES;
 use crate::identity::FlowId;
 use crate::names::{LayerName, NodeName};
 use crate::qos::LayerKind;
+pub(crate) use readers::words;
 use readers::{parsed, path};
 use walk::{Node, Report, Section};
 pub(crate) use walk::{describe, nearest};
@@ -68,6 +69,13 @@ pub struct Fault {
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}: {}", self.path, self.detail)
+    }
+}
+
+/// Path and detail, as schemas of a configuration have them.
+impl From<Fault> for (String, String) {
+    fn from(fault: Fault) -> Self {
+        (fault.path, fault.detail)
     }
 }
 

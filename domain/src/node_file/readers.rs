@@ -51,16 +51,17 @@ where
     let text = text(node)?;
     match text.parse() {
         Ok(value) => Some(value),
-        Err(error) => {
-            let error = error.to_string();
-            // Errors of names do not repeat the name, those of words do.
-            let shown = if error.starts_with('"') {
-                error
-            } else {
-                format!("{text:?} {error}")
-            };
-            node.fault(shown)
-        }
+        Err(error) => node.fault(words(&text, &error)),
+    }
+}
+
+/// Words of an error for a text. Errors of names do not repeat the text, those of words do.
+pub(crate) fn words(text: &str, error: &impl std::fmt::Display) -> String {
+    let error = error.to_string();
+    if error.starts_with('"') {
+        error
+    } else {
+        format!("{text:?} {error}")
     }
 }
 

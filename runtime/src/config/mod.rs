@@ -35,13 +35,24 @@ pub use follow::{Follower, Keys, follow};
 pub use overlay::{Overlay, Verdict};
 pub use place::{LocatedFault, Place};
 pub use watch::{Current, WatchSettings, watch, watch_with};
-pub use yaml::yaml_documents;
+pub use yaml::{located_documents, yaml_documents};
 
 /// A path and what is to be said of it.
 pub type Remark = (String, String);
 
 /// Reads a tree into a type: the value and warnings, or every fault.
 pub type Schema<T> = Arc<dyn Fn(&Value) -> Result<(T, Vec<Remark>), Vec<Remark>> + Send + Sync>;
+
+/// A schema of a function whose faults and warnings are remarks.
+pub fn schema<T: 'static, F: Into<Remark> + 'static>(
+    read: impl Fn(&Value) -> Result<(T, Vec<F>), Vec<F>> + Send + Sync + 'static,
+) -> Schema<T> {
+    let remarks = |faults: Vec<F>| faults.into_iter().map(Into::into).collect();
+    Arc::new(move |tree| match read(tree) {
+        Ok((value, warnings)) => Ok((value, remarks(warnings))),
+        Err(faults) => Err(remarks(faults)),
+    })
+}
 
 /// A configuration that has no fault.
 #[derive(Debug, Clone)]

@@ -77,6 +77,15 @@ pub(super) fn parse(text: &str, origin: &Origin, root: &str) -> Parsed {
 /// Every fault of form: what is no YAML, repeated keys, anchors, aliases, tags, directives other than `%YAML 1.2`, nesting
 /// deeper than 32, numbers that cannot be held. More than `max_documents` are one fault ([`LocatedFault::is_too_many_documents`]).
 pub fn yaml_documents(text: &str, max_documents: usize) -> Result<Vec<Value>, Vec<LocatedFault>> {
+    let located = located_documents(text, max_documents)?;
+    Ok(located.into_iter().map(|(_, value)| value).collect())
+}
+
+/// The same, each with the line on which its content begins.
+///
+/// # Errors
+/// As [`yaml_documents`].
+pub fn located_documents(text: &str, max_documents: usize) -> Result<Vec<(usize, Value)>, Vec<LocatedFault>> {
     let documents = Documents::Many {
         limit: max_documents,
         finished: Vec::new(),
@@ -168,8 +177,8 @@ enum Documents {
     One,
     Many {
         limit: usize,
-        /// Those that are complete and not empty.
-        finished: Vec<Value>,
+        /// Those that are complete and not empty, with their lines.
+        finished: Vec<(usize, Value)>,
     },
 }
 
@@ -179,6 +188,8 @@ struct Builder<'a> {
     /// What is open, from the root on; together they are the path of what is read now.
     stack: Vec<Open>,
     document: Option<Value>,
+    /// Line on which the content of the document begins.
+    begins: usize,
     documents: Documents,
     started: usize,
     /// `None`: nobody asks for them.
@@ -193,6 +204,7 @@ impl<'a> Builder<'a> {
             root,
             stack: Vec::new(),
             document: None,
+            begins: 0,
             documents,
             started: 0,
             places,
@@ -294,7 +306,7 @@ impl<'a> Builder<'a> {
                 Err(Stop)
             }
             Some(document) => {
-                finished.push(document);
+                finished.push((self.begins, document));
                 Ok(())
             }
         }
@@ -410,6 +422,9 @@ impl<'a> Builder<'a> {
     /// Notes where the next value stands. The first place of a path stays, so that a repeated key does not hide the first
     /// one.
     fn note_place(&mut self, line: usize) {
+        if self.stack.is_empty() {
+            self.begins = line;
+        }
         if self.places.is_none() {
             return;
         }

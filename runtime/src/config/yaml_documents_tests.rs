@@ -1,7 +1,7 @@
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
-use super::yaml_documents;
+use super::{located_documents, yaml_documents};
 
 fn read(text: &str) -> Vec<Value> {
     yaml_documents(text, 100).unwrap_or_else(|faults| panic!("{text:?}: {faults:?}"))
@@ -38,6 +38,27 @@ fn empty_documents_are_left_out() {
     }
     assert_eq!(read("---\n# first\n---\na: 1\n---\n"), [json!({ "a": 1 })]);
     assert_eq!(read("a: |\n  ---x\n  b\n"), [json!({ "a": "---x\nb\n" })]);
+}
+
+#[test]
+fn documents_have_the_line_of_their_content() {
+    for (text, lines) in [
+        ("# nothing\n", &[][..]),
+        ("a: 1\n", &[1]),
+        ("---\na: 1\n--- # x\n# y\nb: 2\n", &[2, 5]),
+        ("--- {a: 1}\n---\n---\nb: 1\n---\n", &[1, 4]),
+        ("--- null\n---\n- a\n", &[3]),
+        ("a: 1\n...\n# c\nb: 2\n...\n", &[1, 4]),
+        ("%YAML 1.2\n---\na: 1\n", &[3]),
+        ("a: |\n  ---\n  x\n---x: 2\n", &[1]),
+    ] {
+        let located = located_documents(text, 10).unwrap();
+        assert_eq!(
+            located.into_iter().map(|(line, _)| line).collect::<Vec<_>>(),
+            lines,
+            "{text:?}"
+        );
+    }
 }
 
 #[test]

@@ -77,13 +77,18 @@ impl Supervisor {
     }
 }
 
-struct Signals {
+/// SIGTERM and SIGINT, from its making on.
+pub struct Signals {
     terminate: Signal,
     interrupt: Signal,
 }
 
 impl Signals {
-    fn new() -> std::io::Result<Self> {
+    /// Begins to listen; from then on they do not end the process by themselves.
+    ///
+    /// # Errors
+    /// If the system gives no handlers.
+    pub fn new() -> std::io::Result<Self> {
         Ok(Self {
             terminate: signal(SignalKind::terminate())?,
             interrupt: signal(SignalKind::interrupt())?,
@@ -91,7 +96,7 @@ impl Signals {
     }
 
     /// Name and number of the next signal.
-    async fn recv(&mut self) -> (&'static str, i32) {
+    pub async fn recv(&mut self) -> (&'static str, i32) {
         tokio::select! {
             Some(()) = self.terminate.recv() => ("SIGTERM", SignalKind::terminate().as_raw_value()),
             Some(()) = self.interrupt.recv() => ("SIGINT", SignalKind::interrupt().as_raw_value()),

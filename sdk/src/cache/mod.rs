@@ -15,21 +15,21 @@ mod watchdog;
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use blaze_brokers::Broker;
 use blaze_brokers::redis::KeyError;
 use blaze_domain::ServiceName;
+pub use blaze_domain::config::ServiceState;
 use blaze_runtime::{Supervisor, TaskPolicy};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::{Notify, watch};
 
-pub use record::ServiceState;
 pub(crate) use store::Store;
 
 use crate::config::Shown;
-use crate::service::Identity;
+use crate::service::{Identity, now_ms};
 
 /// Between two looks at the records of those that are waited for.
 const LOOK: Duration = Duration::from_millis(250);
@@ -271,11 +271,4 @@ impl CacheManager {
         });
         let _ = tokio::time::timeout(within, has_ended).await;
     }
-}
-
-fn now_ms() -> u64 {
-    let since_epoch = SystemTime::now()
-        .duration_since(SystemTime::UNIX_EPOCH)
-        .unwrap_or_default();
-    u64::try_from(since_epoch.as_millis()).unwrap_or(u64::MAX)
 }

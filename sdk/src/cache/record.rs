@@ -3,7 +3,9 @@
 use std::time::Duration;
 
 use blaze_brokers::redis::Record;
-use serde_json::{Map, Value};
+use blaze_domain::NodeName;
+use blaze_domain::config::ServiceState;
+use serde_json::Value;
 
 use crate::config::Held;
 use crate::service::Identity;
@@ -14,32 +16,6 @@ const MAX_MESSAGE_BYTES: usize = 64 * 1024;
 const DEFAULT_TTL_MS: u64 = 15_000;
 /// Longest that one may count, in ms (an hour).
 const MAX_TTL_MS: u64 = 3_600_000;
-
-/// How a service is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum ServiceState {
-    /// It begins.
-    Starting,
-    /// It works.
-    Ready,
-    /// It runs, and not well.
-    Unhealthy,
-    /// It ends.
-    Stopping,
-}
-
-impl ServiceState {
-    /// The word in records.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Starting => "starting",
-            Self::Ready => "ready",
-            Self::Unhealthy => "unhealthy",
-            Self::Stopping => "stopping",
-        }
-    }
-}
 
 /// Key of the records of a service, up to its node.
 pub(super) fn beginning(service: &str) -> String {
@@ -71,53 +47,38 @@ pub(super) struct Sign<'a> {
 }
 
 impl Sign<'_> {
-    fn texts(&self) -> [(&'static str, String); 6] {
-        let node = self.identity.node.as_ref().map(ToString::to_string).unwrap_or_default();
+    fn members(&self) -> [(&'static str, Value); 10] {
+        let identity = self.identity;
+        let (revision, hash) = self.config.clone().unwrap_or_default();
         [
-            ("layer", self.identity.layer.to_string()),
-            ("node", node),
-            ("service", self.identity.service.to_string()),
-            ("instance", self.identity.instance.to_string()),
-            ("state", self.state.as_str().to_owned()),
-            ("version", self.version.to_owned()),
+            ("layer", identity.layer.as_str().into()),
+            ("node", identity.node.as_ref().map_or("", NodeName::as_str).into()),
+            ("service", identity.service.as_str().into()),
+            ("instance", identity.instance.as_str().into()),
+            ("state", self.state.as_str().into()),
+            ("version", self.version.into()),
+            ("epoch", self.epoch.into()),
+            ("since_ms", self.since_ms.into()),
+            ("config_revision", revision.into()),
+            ("config_hash", hash.into()),
         ]
-    }
-
-    fn numbers(&self) -> [(&'static str, u64); 3] {
-        let revision = self.config.as_ref().map_or(0, |(revision, _)| *revision);
-        [
-            ("epoch", self.epoch),
-            ("since_ms", self.since_ms),
-            ("config_revision", revision),
-        ]
-    }
-
-    fn hash(&self) -> String {
-        self.config.as_ref().map(|(_, hash)| hash.clone()).unwrap_or_default()
     }
 
     /// As it stands in Redis, where all are texts.
     pub(super) fn record(&self) -> Record {
-        let numbers = self.numbers().map(|(name, number)| (name, number.to_string()));
-        let all = self
-            .texts()
-            .into_iter()
-            .chain(numbers)
-            .chain([("config_hash", self.hash())]);
-        all.map(|(name, value)| (name.to_owned(), value)).collect()
+        let text = |value: Value| match value {
+            Value::String(text) => text,
+            other => other.to_string(),
+        };
+        let members = self.members().into_iter();
+        members.map(|(name, value)| (name.to_owned(), text(value))).collect()
     }
 
     /// As it goes as a message that counts for so long.
     pub(super) fn message(&self, ttl: Duration) -> String {
-        let mut out = Map::new();
-        for (name, text) in self.texts().into_iter().chain([("config_hash", self.hash())]) {
-            out.insert(name.to_owned(), text.into());
-        }
         let ttl_ms = u64::try_from(ttl.as_millis()).unwrap_or(MAX_TTL_MS).max(1);
-        for (name, number) in self.numbers().into_iter().chain([("ttl_ms", ttl_ms)]) {
-            out.insert(name.to_owned(), number.into());
-        }
-        Value::Object(out).to_string()
+        let members = self.members().into_iter().chain([("ttl_ms", ttl_ms.into())]);
+        members.collect::<Value>().to_string()
     }
 }
 
@@ -174,20 +135,11 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-
-    fn identity() -> Identity {
-        Identity {
-            layer: "edge".parse().unwrap(),
-            node: Some("robot-1".parse().unwrap()),
-            service: "slam".parse().unwrap(),
-            instance: "0".parse().unwrap(),
-            epoch: 17,
-        }
-    }
+    use crate::service::slam;
 
     #[test]
     fn record_and_message_have_the_members_of_the_contract() {
-        let identity = identity();
+        let identity = slam();
         let sign = Sign {
             identity: &identity,
             epoch: 17,

@@ -11,6 +11,7 @@ use tokio::time::Instant;
 use super::*;
 use crate::config::ConfigManager;
 use crate::pool::Pool;
+use crate::service::slam;
 
 const TTL: Duration = Duration::from_secs(15);
 
@@ -125,11 +126,9 @@ impl World {
 
     fn service_by(&self, name: &str, epoch: u64, has_keys: bool, by_clock: bool) -> CacheManager {
         let identity = Identity {
-            layer: "edge".parse().unwrap(),
-            node: Some("robot-1".parse().unwrap()),
             service: name.parse().unwrap(),
-            instance: "0".parse().unwrap(),
             epoch,
+            ..slam()
         };
         let broker: Arc<dyn Broker> = Arc::new(self.hub.broker());
         let config = ConfigManager::start(

@@ -5,8 +5,9 @@ use std::time::Instant;
 
 use blaze_brokers::redis::Record;
 use blaze_domain::ServiceName;
+use blaze_domain::config::ServiceState;
 
-use super::record::{Heard, ServiceState};
+use super::record::Heard;
 
 /// Instances that are remembered while a service waits, at most.
 const MAX_INSTANCES: usize = 4_096;
@@ -101,15 +102,5 @@ mod tests {
             [flow],
             "it was started anew, and the old process does not count any more"
         );
-    }
-
-    #[test]
-    fn the_word_of_an_older_process_does_not_count() {
-        let flow: ServiceName = "flow".parse().unwrap();
-        let mut roll = Roll::new(std::slice::from_ref(&flow));
-        let now = Instant::now();
-        roll.hear(heard("flow", 2, true), now);
-        roll.hear(heard("flow", 1, false), now);
-        assert!(roll.missing(now).is_empty());
     }
 }

@@ -3,14 +3,16 @@
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use blaze_brokers::BrokerError;
+use blaze_brokers::{BrokerError, Received};
+use blaze_domain::ServiceName;
 use bytes::Bytes;
+use parking_lot::Mutex;
 use tokio::time::Instant;
 
 use super::record::{self, Heard, Sign};
 use super::store::Store;
 use super::{Liveness, Said, Shared};
-use crate::reserved::{bare, channel, speaking, subscribe};
+use crate::reserved::{bare, channel, now, speaking, subscribe};
 
 const WATCHDOG: &str = "blaze/watchdog";
 /// Longest pause before a record that could not be written is tried again.
@@ -129,9 +131,8 @@ async fn by_messages(shared: &Shared) -> Result<Liveness, BrokerError> {
                     if count == 0 {
                         return Err(BrokerError::Closed);
                     }
-                    let mut signs = heard.drain(..).filter_map(bare).filter_map(|payload| Heard::parse(&payload));
                     let own = &shared.identity;
-                    if signs.any(|sign| sign.is_of(own) && sign.epoch > own.epoch) {
+                    if signs_of(&mut heard).any(|sign| sign.is_of(own) && sign.epoch > own.epoch) {
                         return Ok(Liveness::Superseded);
                     }
                 }
@@ -165,8 +166,8 @@ impl Shared {
 /// Waits until each service has an instance that is ready. Never returns otherwise; `missing` has those that are not.
 pub(super) async fn wait(
     shared: &Shared,
-    services: &[blaze_domain::ServiceName],
-    missing: &parking_lot::Mutex<Vec<blaze_domain::ServiceName>>,
+    services: &[ServiceName],
+    missing: &Mutex<Vec<ServiceName>>,
 ) -> Result<(), BrokerError> {
     match &shared.store {
         Some(store) => wait_for_records(store.as_ref(), services, missing).await,
@@ -175,11 +176,20 @@ pub(super) async fn wait(
     Ok(())
 }
 
-async fn wait_for_records(
-    store: &dyn Store,
-    services: &[blaze_domain::ServiceName],
-    missing: &parking_lot::Mutex<Vec<blaze_domain::ServiceName>>,
-) {
+/// Notes who is missing. Returns whether nobody is.
+fn nobody(missing: &Mutex<Vec<ServiceName>>, absent: Vec<ServiceName>) -> bool {
+    let is_done = absent.is_empty();
+    *missing.lock() = absent;
+    is_done
+}
+
+/// The signs of life among messages.
+fn signs_of(heard: &mut Vec<Received>) -> impl Iterator<Item = Heard> {
+    let payloads = heard.drain(..).filter_map(bare);
+    payloads.filter_map(|payload| Heard::parse(&payload))
+}
+
+async fn wait_for_records(store: &dyn Store, services: &[ServiceName], missing: &Mutex<Vec<ServiceName>>) {
     loop {
         let mut absent = Vec::new();
         for service in services {
@@ -197,9 +207,7 @@ async fn wait_for_records(
                 absent.push(service.clone());
             }
         }
-        let is_done = absent.is_empty();
-        *missing.lock() = absent;
-        if is_done {
+        if nobody(missing, absent) {
             return;
         }
         tokio::time::sleep(super::LOOK).await;
@@ -208,29 +216,21 @@ async fn wait_for_records(
 
 async fn wait_for_messages(
     shared: &Shared,
-    services: &[blaze_domain::ServiceName],
-    missing: &parking_lot::Mutex<Vec<blaze_domain::ServiceName>>,
+    services: &[ServiceName],
+    missing: &Mutex<Vec<ServiceName>>,
 ) -> Result<(), BrokerError> {
     let mut signs = subscribe(shared.broker.as_ref(), &channel(WATCHDOG)?).await?;
     let mut roll = super::wait::Roll::new(services);
     let mut heard = Vec::new();
     loop {
-        let now = crate::reserved::now();
-        let absent = roll.missing(now);
-        let is_done = absent.is_empty();
-        *missing.lock() = absent;
-        if is_done {
+        if nobody(missing, roll.missing(now())) {
             return Ok(());
         }
         if signs.receive(&mut heard, BATCH).await == 0 {
             return Err(BrokerError::Closed);
         }
-        for sign in heard
-            .drain(..)
-            .filter_map(bare)
-            .filter_map(|payload| Heard::parse(&payload))
-        {
-            roll.hear(sign, crate::reserved::now());
+        for sign in signs_of(&mut heard) {
+            roll.hear(sign, now());
         }
     }
 }

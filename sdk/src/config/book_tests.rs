@@ -4,16 +4,14 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use super::*;
+use crate::service::slam;
 
 const LIFE: u64 = 0x7f;
 
 fn book(node: Option<&str>, scope: Scope) -> (ConfigBook, Instant) {
     let identity = Identity {
-        layer: "edge".parse().unwrap(),
         node: node.map(|node| node.parse().unwrap()),
-        service: "slam".parse().unwrap(),
-        instance: "0".parse().unwrap(),
-        epoch: 1,
+        ..slam()
     };
     let now = Instant::now();
     (
@@ -102,16 +100,6 @@ fn a_change_that_was_found_by_asking_says_what_is_different_and_may_be_of_any_sc
     assert!(second.scopes.is_empty() && second.is_of(ConfigScope::Layer));
     assert_eq!(book.on_reply(&given(3, &json!({"rate": 20, "a": {"b": 1}})), now), None);
     assert_eq!(book.standing().revision(), Some(3));
-}
-
-#[test]
-fn a_notice_says_its_scopes() {
-    let (mut book, now) = ours();
-    book.on_reply(&given(1, &json!({"rate": 10})), now);
-    let change = book.on_notice(&bytes(&notice(2, &json!({"rate": 20}))), now).unwrap();
-    assert_eq!(change.scopes, [ConfigScope::Node]);
-    assert!(change.is_of(ConfigScope::Node) && !change.is_of(ConfigScope::Service));
-    assert_eq!(*change.old.unwrap(), json!({"rate": 10}));
 }
 
 #[test]

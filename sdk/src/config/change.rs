@@ -3,69 +3,8 @@
 use std::fmt;
 use std::sync::Arc;
 
+pub use blaze_domain::config::{ConfigScope, ConfigSource};
 use serde_json::Value;
-
-/// Which kind of document a change came from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum ConfigScope {
-    /// The layer's.
-    Layer,
-    /// The node's.
-    Node,
-    /// The service's.
-    Service,
-    /// The one of this instance of the service.
-    Instance,
-}
-
-impl ConfigScope {
-    const ALL: [Self; 4] = [Self::Layer, Self::Node, Self::Service, Self::Instance];
-
-    /// The word in notices.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Layer => "layer",
-            Self::Node => "node",
-            Self::Service => "service",
-            Self::Instance => "instance",
-        }
-    }
-
-    /// The scope of a word; `None` for one that a later version may know.
-    pub(super) fn of_word(word: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|scope| scope.as_str() == word)
-    }
-}
-
-/// From where the worker has what it serves.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum ConfigSource {
-    /// The main service: the worker is connected and in sync.
-    Main,
-    /// A copy: its local database or last-known-good file.
-    Copy,
-    /// The file that was mounted for the worker.
-    File,
-}
-
-impl ConfigSource {
-    const ALL: [Self; 3] = [Self::Main, Self::Copy, Self::File];
-
-    /// The word in answers.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Main => "main",
-            Self::Copy => "copy",
-            Self::File => "file",
-        }
-    }
-
-    pub(super) fn of_word(word: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|source| source.as_str() == word)
-    }
-}
 
 /// A configuration that a worker gave.
 #[derive(Clone, PartialEq)]
@@ -149,12 +88,12 @@ impl fmt::Debug for ConfigChange {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use serde_json::json;
 
     use super::*;
 
-    fn change(revision: u64, scopes: &[ConfigScope], paths: &[&str]) -> ConfigChange {
+    pub(in crate::config) fn change(revision: u64, scopes: &[ConfigScope], paths: &[&str]) -> ConfigChange {
         ConfigChange {
             old: Some(Arc::new(json!({ "n": revision - 1 }))),
             new: Some(Arc::new(json!({ "n": revision, "password": "geheim" }))),

@@ -145,35 +145,12 @@ impl Job for Inner {
 
 #[cfg(test)]
 mod tests {
-    use std::time::{Duration, Instant};
-
     use blaze_runtime::Supervisor;
-    use serde_json::json;
 
     use super::*;
+    use crate::config::change::tests::change;
     use crate::pool::Pool;
-
-    const DEADLINE: Duration = Duration::from_secs(20);
-
-    fn change(revision: u64, scopes: &[ConfigScope]) -> ConfigChange {
-        ConfigChange {
-            old: Some(Arc::new(json!({ "n": revision - 1 }))),
-            new: Some(Arc::new(json!({ "n": revision }))),
-            revision,
-            hash: Some(format!("sha256:{revision}")),
-            paths: vec!["/n".to_owned()],
-            scopes: scopes.to_vec(),
-            deleted: false,
-        }
-    }
-
-    fn eventually(mut holds: impl FnMut() -> bool) {
-        let until = Instant::now() + DEADLINE;
-        while !holds() {
-            assert!(Instant::now() < until, "not within {DEADLINE:?}");
-            std::thread::sleep(Duration::from_millis(2));
-        }
-    }
+    use crate::pool::tests::eventually;
 
     #[tokio::test]
     async fn a_slow_callback_sees_fewer_steps_in_order_and_the_last_state() {
@@ -194,7 +171,7 @@ mod tests {
         let closed = gate.lock();
         let all = 3 * MAX_WAITING as u64;
         for revision in 1..=all {
-            listeners.tell(&change(revision, &[]));
+            listeners.tell(&change(revision, &[], &[]));
         }
         drop(closed);
         eventually(|| seen.lock().last().is_some_and(|(_, new)| *new == all));
@@ -221,13 +198,13 @@ mod tests {
                 assert_ne!(change.revision, 2, "on purpose");
             }),
         );
-        listeners.tell(&change(1, &[ConfigScope::Service]));
-        listeners.tell(&change(2, &[ConfigScope::Node]));
-        listeners.tell(&change(3, &[]));
+        listeners.tell(&change(1, &[ConfigScope::Service], &[]));
+        listeners.tell(&change(2, &[ConfigScope::Node], &[]));
+        listeners.tell(&change(3, &[], &[]));
         eventually(|| seen.lock().len() == 2 && listener.panicked() == 1);
         assert_eq!(*seen.lock(), [2, 3]);
         drop(listener);
-        listeners.tell(&change(4, &[]));
+        listeners.tell(&change(4, &[], &[]));
         assert!(listeners.all.lock().is_empty());
     }
 }

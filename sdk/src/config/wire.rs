@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use blaze_domain::config::{AckStatus, MAX_EFFECTIVE_BYTES};
 use serde::Deserialize;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 
 use super::change::{ConfigScope, ConfigSource, Held};
 use crate::service::Identity;
@@ -88,7 +88,7 @@ impl Members {
     /// The source; one of a later version counts as the best, which changes nothing but what is shown.
     fn source(&self) -> ConfigSource {
         let word = self.source.as_deref().unwrap_or_default();
-        ConfigSource::of_word(word).unwrap_or(ConfigSource::Main)
+        word.parse().unwrap_or(ConfigSource::Main)
     }
 
     fn held(&mut self) -> Option<Held> {
@@ -141,23 +141,14 @@ pub(super) fn notice(payload: &[u8]) -> Option<Notice> {
         revision: members.revision?,
         held,
         paths: members.paths,
-        scopes: members
-            .scopes
-            .iter()
-            .filter_map(|word| ConfigScope::of_word(word))
-            .collect(),
+        scopes: members.scopes.iter().filter_map(|word| word.parse().ok()).collect(),
     })
 }
 
 /// A request; `hash` is that of what the service has.
 pub(super) fn request(identity: &Identity, id: &str, reply_to: &str, hash: Option<&str>) -> String {
-    let mut out = begin(identity);
-    out.insert("id".to_owned(), id.into());
-    out.insert("reply_to".to_owned(), reply_to.into());
-    if let Some(hash) = hash {
-        out.insert("hash".to_owned(), hash.into());
-    }
-    Value::Object(out).to_string()
+    let members = [("id", json!(id)), ("reply_to", json!(reply_to)), ("hash", json!(hash))];
+    spoken(identity, members)
 }
 
 /// An acknowledgement of a revision and its hash. A detail that is too long is cut, and control characters become spaces: a worker reads neither.
@@ -169,29 +160,31 @@ pub(super) fn ack(identity: &Identity, of: Option<(u64, &str)>, status: AckStatu
     let plain = |letter: char| if letter.is_control() { ' ' } else { letter };
     // A control character may be longer than the space that replaces it, never shorter.
     let detail: String = detail[..end].chars().map(plain).collect();
-    let mut out = begin(identity);
-    if let Some((revision, hash)) = of {
-        out.insert("revision".to_owned(), revision.into());
-        out.insert("hash".to_owned(), hash.into());
-    }
-    out.insert("status".to_owned(), status.as_str().into());
-    out.insert("detail".to_owned(), json!(detail));
-    Value::Object(out).to_string()
+    let (revision, hash) = of.unzip();
+    let members = [
+        ("revision", json!(revision)),
+        ("hash", json!(hash)),
+        ("status", json!(status)),
+        ("detail", json!(detail)),
+    ];
+    spoken(identity, members)
 }
 
-fn begin(identity: &Identity) -> Map<String, Value> {
-    let mut out = Map::new();
-    out.insert("service".to_owned(), identity.service.as_str().into());
-    out.insert("instance".to_owned(), identity.instance.as_str().into());
-    if let Some(node) = &identity.node {
-        out.insert("node".to_owned(), node.as_str().into());
-    }
-    out
+/// A message of the service; members that are null are left out.
+fn spoken(identity: &Identity, members: impl IntoIterator<Item = (&'static str, Value)>) -> String {
+    let who = [
+        ("service", json!(identity.service)),
+        ("instance", json!(identity.instance)),
+        ("node", json!(identity.node)),
+    ];
+    let all = who.into_iter().chain(members);
+    all.filter(|(_, value)| !value.is_null()).collect::<Value>().to_string()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::service::slam;
 
     fn read(value: &Value) -> Option<Answer> {
         answer(value.to_string().as_bytes(), "7f-")
@@ -239,15 +232,8 @@ mod tests {
 
     #[test]
     fn a_detail_is_made_such_that_a_worker_reads_it() {
-        let identity = Identity {
-            layer: "edge".parse().unwrap(),
-            node: None,
-            service: "slam".parse().unwrap(),
-            instance: "0".parse().unwrap(),
-            epoch: 1,
-        };
         let long = format!("a\nb{}", "ä".repeat(MAX_DETAIL_BYTES));
-        let text = ack(&identity, None, AckStatus::Rejected, &long);
+        let text = ack(&slam(), None, AckStatus::Rejected, &long);
         let value: Value = serde_json::from_str(&text).unwrap();
         let detail = value["detail"].as_str().unwrap();
         assert!(detail.starts_with("a bä") && detail.len() <= MAX_DETAIL_BYTES);

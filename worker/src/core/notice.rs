@@ -3,6 +3,7 @@
 use std::fmt;
 use std::sync::Arc;
 
+pub use blaze_domain::config::ConfigScope as Scope;
 use blaze_domain::config::diff::{self, diff};
 use blaze_domain::config::effective::{At, Sources};
 use blaze_domain::config::{Document, json, secret};
@@ -36,32 +37,6 @@ impl Config {
     #[must_use]
     pub fn value(&self) -> &Value {
         &self.0
-    }
-}
-
-/// A kind of document that counts for a configuration, in the order in which notices name them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Scope {
-    /// The layer's.
-    Layer,
-    /// The node's.
-    Node,
-    /// The service's.
-    Service,
-    /// The instance's.
-    Instance,
-}
-
-impl Scope {
-    /// The word in messages.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Layer => "layer",
-            Self::Node => "node",
-            Self::Service => "service",
-            Self::Instance => "instance",
-        }
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+pub use blaze_domain::config::ConfigSource as Source;
 use blaze_domain::config::effective::At;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Key, Kind};
@@ -62,35 +63,6 @@ impl fmt::Display for Place {
             Some(node) => write!(f, " at {node}"),
             None => Ok(()),
         }
-    }
-}
-
-/// Where the documents come from, the weakest first.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum Source {
-    /// The mounted file.
-    File,
-    /// The local database or the last-known-good file; also what the main service told before it was lost.
-    Copy,
-    /// The main service.
-    Main,
-}
-
-impl Source {
-    /// The word in messages.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::File => "file",
-            Self::Copy => "copy",
-            Self::Main => "main",
-        }
-    }
-}
-
-impl fmt::Display for Source {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
     }
 }
 

@@ -2,8 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use blaze_domain::DocumentName;
-use blaze_domain::config::{Key, Kind};
+use blaze_domain::config::Key;
 use blaze_runtime::state::read_small;
 use serde_json::{Value, json};
 
@@ -90,7 +89,7 @@ async fn prepare(
     place: TokenPlace,
 ) -> Result<Plan, CliError> {
     let kind = kind_of(options, client).await?;
-    let key = key_of(Kind::Node, options.name.as_str())?;
+    let key = Key::node(&options.name);
     let existing = client.existing(&key).await?;
     // Whoever joins again need not say again where the node is.
     let addresses = match &existing {
@@ -124,7 +123,7 @@ async fn prepare(
     let revision = existing
         .as_ref()
         .and_then(|answer| answer.body.get("revision").cloned());
-    let tag = existing.map(|answer| client.tag(answer)).transpose()?;
+    let tag = existing.map(|answer| client.tag(&answer, false)).transpose()?;
     Ok(Plan {
         key,
         node,
@@ -140,8 +139,7 @@ async fn prepare(
 /// The kind of the layer. Without the layer there is nothing to join.
 async fn kind_of(options: &JoinOptions, client: &Client) -> Result<String, CliError> {
     let layer = &options.layer;
-    let key = key_of(Kind::Layer, layer.as_str())?;
-    let read = client.document(&key, None).await.map_err(|error| match error {
+    let read = client.document(&Key::layer(layer), None).await.map_err(|error| match error {
         CliError::Problem(refusal) if refusal.code() == "not_found" => CliError::Problem(refusal).advised(format!(
             "A node joins a layer that is there. Make it first: echo '{{kind: Layer, name: {layer}, spec: {{kind: edge}}}}' | blaze apply -f -"
         )),
@@ -150,13 +148,6 @@ async fn kind_of(options: &JoinOptions, client: &Client) -> Result<String, CliEr
     let kind = read.body.pointer("/spec/kind").and_then(Value::as_str);
     kind.map(str::to_owned)
         .ok_or_else(|| client.odd("a layer has no `spec.kind`"))
-}
-
-fn key_of(kind: Kind, name: &str) -> Result<Key, CliError> {
-    let name: DocumentName = name
-        .parse()
-        .map_err(|error| CliError::Usage(format!("{name} {error}")))?;
-    Key::new(kind, None, name).map_err(|error| CliError::Usage(error.to_string()))
 }
 
 /// Makes the document, or changes what was read. What somebody else did in between is a conflict.

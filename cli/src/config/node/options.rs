@@ -5,8 +5,9 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
+use blaze_domain::config::spec::NodeType;
 use blaze_domain::{LayerName, NodeName};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use reqwest::Url;
 use serde_json::{Value, json};
 
@@ -25,8 +26,8 @@ pub struct JoinOptions {
     /// Layer that it stands in; the Layer document must be there
     #[arg(long, value_name = "LAYER")]
     pub layer: LayerName,
-    /// What it is; a new node is static where nothing is said
-    #[arg(long = "type", value_enum, value_name = "TYPE")]
+    /// What it is: static, gateway (it connects others) or mobile (it moves); a new node is static where nothing is said
+    #[arg(long = "type", value_name = "TYPE")]
     pub node_type: Option<NodeType>,
     /// Its address, may be repeated; the first IPv4 address is that of its interface for other layers and its own
     #[arg(long = "address", value_name = "IP")]
@@ -93,28 +94,6 @@ pub struct JoinOptions {
     pub server: ServerOptions,
 }
 
-/// What a node is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum NodeType {
-    /// It stays where it is
-    Static,
-    /// It connects others
-    Gateway,
-    /// It moves
-    Mobile,
-}
-
-impl NodeType {
-    /// The word of the document.
-    pub(super) fn as_str(self) -> &'static str {
-        match self {
-            Self::Static => "static",
-            Self::Gateway => "gateway",
-            Self::Mobile => "mobile",
-        }
-    }
-}
-
 /// The broker of the node scope.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum NodeBrokerChoice {
@@ -127,17 +106,14 @@ pub enum NodeBrokerChoice {
 impl FromStr for NodeBrokerChoice {
     type Err = String;
     fn from_str(text: &str) -> Result<Self, String> {
-        let is_redis = ["redis://", "rediss://", "redis+unix://", "unix://"]
-            .iter()
-            .any(|scheme| text.starts_with(scheme));
         match text {
             "none" => Ok(Self::None),
             "memory" => Ok(Self::Section(json!({ "memory": {} }))),
             // It would stand in the list of processes, and in the printed file.
-            url if is_redis && has_password(url) => {
+            url if is_redis(url) && has_password(url) => {
                 Err("a password does not belong here: write password_file into the node file".to_owned())
             }
-            url if is_redis => Ok(Self::Section(json!({ "redis": { "url": url } }))),
+            url if is_redis(url) => Ok(Self::Section(json!({ "redis": { "url": url } }))),
             _ => Err("it is redis://HOST:PORT, memory or none".to_owned()),
         }
     }
@@ -170,6 +146,12 @@ impl FromStr for LayerBrokerChoice {
             _ => Err(form()),
         }
     }
+}
+
+/// Whether a text is the URL of a Redis.
+pub(crate) fn is_redis(text: &str) -> bool {
+    let mut schemes = ["redis://", "rediss://", "redis+unix://", "unix://"].into_iter();
+    schemes.any(|scheme| text.starts_with(scheme))
 }
 
 /// Whether a URL of Redis names a user or a password.

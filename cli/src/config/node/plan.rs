@@ -11,7 +11,8 @@ use reqwest::Url;
 use serde_json::{Map, Value, json};
 
 use super::options::{JoinOptions, LayerBrokerChoice, NodeBrokerChoice};
-use crate::exit::CliError;
+use crate::config::endpoint::is_loopback;
+use crate::exit::{CliError, lines};
 
 /// gRPC port of the main service where nothing else is said.
 const GRPC_PORT: u16 = 50_051;
@@ -142,10 +143,9 @@ pub(super) fn node_file(options: &JoinOptions, around: &Around<'_>) -> Result<(V
     if faults.is_empty() {
         return Ok((file, notes));
     }
-    let lines: Vec<String> = faults.iter().map(ToString::to_string).collect();
     Err(CliError::Invalid(format!(
         "the programs of the node would not start with what these options say:\n  {}",
-        lines.join("\n  ")
+        lines(&faults)
     )))
 }
 
@@ -161,8 +161,7 @@ fn grpc(options: &JoinOptions, around: &Around<'_>, notes: &mut Vec<String>) -> 
         }
     };
     let host = url.host_str().unwrap_or_default().trim_matches(['[', ']']);
-    let is_here = host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback());
-    if is_here {
+    if is_loopback(&url) {
         notes.push(format!(
             "config.server is {host}: the node file is for this machine; for another one give --grpc https://HOST:PORT"
         ));

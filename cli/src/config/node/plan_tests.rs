@@ -1,31 +1,20 @@
-use clap::Parser as _;
-
 use super::*;
-use crate::args::{Arguments, Command};
+use crate::args::tests::config;
 use crate::config::{ConfigCommand, NodeCommand};
 
 fn options(line: &str) -> JoinOptions {
-    let words = format!("blaze node join robot-1 --layer edge {line}");
-    match Arguments::try_parse_from(words.split_whitespace()).unwrap().command {
-        Command::Config(command) => match *command {
-            ConfigCommand::Node(NodeCommand::Join(options)) => *options,
-            other => panic!("{other:?}"),
-        },
+    match config(&format!("node join robot-1 --layer edge {line}")).unwrap() {
+        ConfigCommand::Node(NodeCommand::Join(options)) => *options,
         other => panic!("{other:?}"),
     }
 }
 
 fn file(line: &str, kind: &str) -> Result<(Value, Vec<String>), CliError> {
     let options = options(line);
-    file_at(&options, kind, &options.addresses)
+    file_of(&options, kind, &options.addresses, false)
 }
 
-fn file_at(options: &JoinOptions, kind: &str, addresses: &[IpAddr]) -> Result<(Value, Vec<String>), CliError> {
-    file_from(options, kind, addresses, false)
-}
-
-/// The same where the administrator's client certificate was shown.
-fn file_from(
+fn file_of(
     options: &JoinOptions,
     kind: &str,
     addresses: &[IpAddr],
@@ -74,7 +63,7 @@ fn whoever_joins_again_without_an_address_gets_the_same_file() {
     let first = "--address fe80::1 --address 10.0.1.1 --peer 10.0.3.1";
     let there = document(&options(first), None).unwrap().body;
     let addresses = addresses_of(&there);
-    let again = file_at(&options("--peer 10.0.3.1"), "edge", &addresses).unwrap();
+    let again = file_of(&options("--peer 10.0.3.1"), "edge", &addresses, false).unwrap();
     assert_eq!(again, file(first, "edge").unwrap());
     for none in [json!({}), json!({ "spec": { "addresses": ["robot-1.local", 7] } })] {
         assert_eq!(addresses_of(&none), [] as [IpAddr; 0]);
@@ -83,18 +72,17 @@ fn whoever_joins_again_without_an_address_gets_the_same_file() {
 
 #[test]
 fn a_worker_has_a_certificate_of_its_own_or_it_is_said_that_it_needs_one() {
-    let (file, notes) = file_from(&options("--address 10.0.1.1"), "edge", &[], true).unwrap();
+    let (file, notes) = file_of(&options("--address 10.0.1.1"), "edge", &[], true).unwrap();
     assert_eq!(file["config"].get("cert_file"), None);
     assert!(notes.iter().any(|note| note.contains("--cert-path")), "{notes:?}");
     let line = "--address 10.0.1.1 --cert-path /etc/blaze/own.pem --key-path /etc/blaze/own.key";
-    let (file, notes) = file_from(&options(line), "edge", &[], true).unwrap();
+    let (file, notes) = file_of(&options(line), "edge", &[], true).unwrap();
     assert_eq!(
         (&file["config"]["cert_file"], &file["config"]["key_file"]),
         (&json!("/etc/blaze/own.pem"), &json!("/etc/blaze/own.key"))
     );
     assert!(!notes.iter().any(|note| note.contains("--cert-path")), "{notes:?}");
-    let half = "blaze node join robot-1 --layer edge --cert-path /own.pem";
-    assert!(Arguments::try_parse_from(half.split_whitespace()).is_err());
+    assert!(config("node join robot-1 --layer edge --cert-path /own.pem").is_err());
 }
 
 #[test]

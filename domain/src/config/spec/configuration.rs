@@ -2,11 +2,12 @@
 
 use serde_json::Value;
 
-use super::fields::{At, Faults, Fields, words};
+use super::fields::{At, Faults, Fields};
 use super::{MAX_POINTER_BYTES, PROGRAMS, sections};
 use crate::config::json;
 use crate::config::secret::{self, Secret};
 use crate::names::ServiceName;
+use crate::node_file::words;
 
 /// `config` and `overrides`, as far as the kind has them.
 pub(super) fn check_configurations(spec: &Fields<'_>) {

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use crate::config::json::{push, shown};
 use crate::config::{Code, FieldFault};
-use crate::node_file::{describe, nearest};
+use crate::node_file::{describe, nearest, words};
 
 /// More faults than these help nobody.
 const MAX_FAULTS: usize = 100;
@@ -203,15 +203,5 @@ impl<'v> Fields<'v> {
             self.at.faults.add(&push(&self.at.pointer, name), "is required");
         }
         found
-    }
-}
-
-/// Words of an error for a text. Errors of names do not repeat the text, those of words do.
-pub(super) fn words(text: &str, error: &impl Display) -> String {
-    let error = error.to_string();
-    if error.starts_with('"') {
-        error
-    } else {
-        format!("{text:?} {error}")
     }
 }

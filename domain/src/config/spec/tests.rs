@@ -1,10 +1,7 @@
-use std::sync::Arc;
-
 use proptest::prelude::*;
 use serde_json::json;
 
 use super::*;
-use crate::config::Timestamp;
 use crate::config::arbitrary::{any_json, any_part};
 use crate::names::ServiceName;
 
@@ -586,18 +583,7 @@ mod envelopes {
 }
 
 fn document(key: &str, spec: Value) -> Document {
-    Document {
-        key: key.parse().unwrap(),
-        uid: "u".to_owned(),
-        revision: 1,
-        create_time: Timestamp::default(),
-        update_time: Timestamp::default(),
-        updated_by: "ops".to_owned(),
-        labels: Labels::new(),
-        annotations: Labels::new(),
-        spec: Arc::new(spec),
-        status: None,
-    }
+    Document::new(key.parse().unwrap(), spec)
 }
 
 #[test]

@@ -3,7 +3,6 @@
 use std::ffi::OsStr;
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
 
 use blaze_brokers::Role;
 use blaze_domain::Scope;
@@ -73,24 +72,8 @@ pub(crate) async fn put(rest: &str, path: &str, body: &Value) -> u64 {
         .unwrap()
 }
 
-pub(crate) async fn bandwidth(flow: &str) -> Option<f64> {
-    let metrics = reqwest::get(format!("http://{flow}/metrics"))
-        .await
-        .ok()?
-        .text()
-        .await
-        .ok()?;
-    let is_it = |line: &&str| {
-        line.starts_with("blaze_flow_budget_bytes_per_second{")
-            && line.contains("\"limit\"")
-            && line.contains("\"inter\"")
-    };
-    let line = metrics.lines().find(is_it)?;
-    line.rsplit(' ').next()?.parse().ok()
-}
-
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_change_over_rest_is_heard_by_a_service_and_by_the_flow() {
+async fn a_change_over_rest_is_heard_by_a_service() {
     let stage = Stage::new();
     let file = stage.write(
         "slam.yaml",
@@ -133,22 +116,6 @@ async fn a_change_over_rest_is_heard_by_a_service_and_by_the_flow() {
         .await
         .expect("it hears of the change");
     assert_eq!(heard.as_deref(), Some(&json!({ "rate_hz": 25 })));
-
-    // The flow follows what is said of blaze-flow.
-    let before = bandwidth(&places["flow"]).await;
-    let body = json!({ "spec": { "layer": "edge", "overrides": { "blaze-flow": { "flow": { "bandwidth": { "limit_mbps": 8 } } } } } });
-    put(&places["rest"], "/nodes/dev-1", &body).await;
-    let expected = 8.0 * 1024.0 * 1024.0 / 8.0;
-    let start = std::time::Instant::now();
-    while bandwidth(&places["flow"]).await != Some(expected) {
-        assert!(
-            start.elapsed() < PATIENCE,
-            "{before:?}, then {:?}: {}",
-            bandwidth(&places["flow"]).await,
-            process.tail()
-        );
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
     service.shutdown().await;
 
     process.signal(Signal::INT).unwrap();

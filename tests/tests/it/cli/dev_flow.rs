@@ -7,11 +7,26 @@ use blaze_tests::process::Process;
 use blaze_tests::wait;
 use serde_json::{Value, json};
 
-use crate::cli::dev::{bandwidth, dev, dev_on_redis, put};
+use crate::cli::dev::{dev, dev_on_redis, put};
 use crate::cli::stage::{PATIENCE, ready};
 
 /// Bytes a second of 8 Mbit/s.
 const EIGHT: f64 = 8.0 * 1024.0 * 1024.0 / 8.0;
+
+/// What the flow may send to other layers, in bytes a second.
+async fn bandwidth(flow: &str) -> Option<f64> {
+    let metrics = reqwest::get(format!("http://{flow}/metrics"))
+        .await
+        .ok()?
+        .text()
+        .await
+        .ok()?;
+    let is_it = |line: &&str| {
+        let budget = line.strip_prefix("blaze_flow_budget_bytes_per_second{");
+        budget.is_some_and(|rest| rest.contains("\"limit\"") && rest.contains("\"inter\""))
+    };
+    metrics.lines().find(is_it)?.rsplit(' ').next()?.parse().ok()
+}
 
 /// Asks until the answer is as it should be.
 async fn until(process: &Process, what: &str, url: &str, is_so: impl Fn(&Value) -> bool) {

@@ -36,7 +36,9 @@ impl ConfigAck {
         let members = object(bytes).map_err(|detail| format!("the message: {detail}"))?;
         check_depth(&members)?;
         let word = need(text(&members, "status", MAX_HASH_BYTES)?, "status")?;
-        let status = AckStatus::from_word(word).ok_or("status: must be applied, rejected, unhealthy or healthy")?;
+        let status = word
+            .parse::<AckStatus>()
+            .map_err(|_| "status: must be applied, rejected, unhealthy or healthy")?;
         let detail = text(&members, "detail", MAX_DETAIL_BYTES)?.unwrap_or_default();
         Ok(Self {
             service: need(parsed(&members, "service")?, "service")?,
@@ -58,7 +60,7 @@ mod tests {
 
     #[test]
     fn every_status_is_read() {
-        for status in AckStatus::ALL {
+        for status in AckStatus::ALL.iter().copied() {
             let message = json!({"service": "slam", "instance": "0", "node": "robot-1", "revision": 431,
                 "hash": "sha256:ab", "status": status.as_str(), "detail": "", "later": true});
             let expected = ConfigAck {

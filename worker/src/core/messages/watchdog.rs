@@ -1,5 +1,6 @@
 //! How instances are: what they keep in Redis, or send where there is none.
 
+pub use blaze_domain::config::ServiceState as Health;
 use blaze_domain::{InstanceName, LayerName, NodeName, ServiceName};
 use serde_json::{Map, Value};
 
@@ -12,34 +13,6 @@ const MAX_TTL_MS: u64 = 3_600_000;
 const MAX_WORD_BYTES: usize = 32;
 const MAX_VERSION_BYTES: usize = 256;
 const MAX_HASH_BYTES: usize = 128;
-
-/// How an instance is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Health {
-    /// It begins.
-    Starting,
-    /// It works.
-    Ready,
-    /// It runs, and not well.
-    Unhealthy,
-    /// It ends.
-    Stopping,
-}
-
-impl Health {
-    const ALL: [Self; 4] = [Self::Starting, Self::Ready, Self::Unhealthy, Self::Stopping];
-
-    /// The word in messages.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Starting => "starting",
-            Self::Ready => "ready",
-            Self::Unhealthy => "unhealthy",
-            Self::Stopping => "stopping",
-        }
-    }
-}
 
 /// Who says that it is alive: the parts of a Redis key.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -112,8 +85,9 @@ impl ServiceState {
 
     fn of_members(members: &Map<String, Value>) -> Result<Self, String> {
         let word = need(text(members, "state", MAX_WORD_BYTES)?, "state")?;
-        let health = Health::ALL.into_iter().find(|health| health.as_str() == word);
-        let health = health.ok_or("state: must be starting, ready, unhealthy or stopping")?;
+        let health = word
+            .parse()
+            .map_err(|_| "state: must be starting, ready, unhealthy or stopping")?;
         let text = |name: &str, max_bytes: usize| -> Result<String, String> {
             Ok(text(members, name, max_bytes)?.unwrap_or_default().to_owned())
         };
