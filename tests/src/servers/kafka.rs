@@ -182,27 +182,6 @@ impl KafkaServer {
         self.process.thaw()
     }
 
-    /// All that its topics hold, as it lies on the disk; what clients have compressed is so here.
-    ///
-    /// # Errors
-    /// When the folder cannot be read.
-    pub fn stored(&self) -> anyhow::Result<Vec<u8>> {
-        let mut bytes = Vec::new();
-        for topic in std::fs::read_dir(self.process.folder().join("data"))? {
-            let topic = topic?.path();
-            if !topic.is_dir() {
-                continue;
-            }
-            for file in std::fs::read_dir(topic)? {
-                let file = file?.path();
-                if file.extension().is_some_and(|extension| extension == "log") {
-                    bytes.extend(std::fs::read(file)?);
-                }
-            }
-        }
-        Ok(bytes)
-    }
-
     /// Resident memory in KiB.
     ///
     /// # Errors

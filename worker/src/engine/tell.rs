@@ -216,6 +216,6 @@ impl Engine {
 
     /// Without the prefix of the server.
     fn key_name(&self, place: &Place) -> String {
-        messages::config_key("", &place.service, place.instance.as_ref())
+        messages::config_key(&place.service, place.instance.as_ref())
     }
 }

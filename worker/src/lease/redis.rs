@@ -8,6 +8,7 @@ use blaze_brokers::redis::{RedisKeys, RedisLock};
 use blaze_domain::LayerName;
 
 use super::{Held, Lease, Mark};
+use crate::core::messages::lease_key;
 
 /// A key of Redis, which has the worker's id while it is held.
 pub struct RedisLease {
@@ -19,7 +20,7 @@ impl RedisLease {
     /// The lease of a layer, for a worker.
     #[must_use]
     pub fn new(keys: Arc<RedisKeys>, layer: &LayerName, owner: String) -> Self {
-        let key = format!("blaze:lease:worker:{layer}");
+        let key = lease_key(layer);
         Self {
             keys,
             lock: RedisLock { key, owner },

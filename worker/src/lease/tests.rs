@@ -178,36 +178,3 @@ async fn what_is_given_up_is_had_at_once() {
     other.leads().await;
     assert!(start.elapsed() <= TIME / 20);
 }
-
-struct InMemory(Mutex<std::collections::BTreeMap<String, Arc<Server>>>);
-
-impl conformance::Fixture for InMemory {
-    fn lease(&self, layer: &str, owner: &str) -> Arc<dyn Lease> {
-        let server = Arc::clone(self.0.lock().entry(layer.to_owned()).or_default());
-        Arc::new(OnServer {
-            server,
-            owner: owner.to_owned(),
-        })
-    }
-
-    fn time(&self) -> Duration {
-        Duration::from_millis(500)
-    }
-
-    fn runs_out_within(&self) -> Duration {
-        Duration::from_millis(1500)
-    }
-
-    fn given_within(&self) -> Duration {
-        Duration::from_millis(250)
-    }
-
-    fn first_within(&self) -> Duration {
-        Duration::from_millis(500)
-    }
-}
-
-#[tokio::test]
-async fn one_in_memory_passes_the_suite() {
-    conformance::run_all(&InMemory(Mutex::default())).await.unwrap();
-}

@@ -1,39 +1,41 @@
-//! BlazeFlow takes its own settings from the worker of its node: what counts, what is refused, and who else hears.
+//! BlazeFlow takes its own settings from the worker of its node: what counts, what is refused, who else hears, and what
+//! follows while messages flow.
 
 use std::time::{Duration, Instant};
 
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::plain::{self, RedisReader};
+use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
 use blaze_tests::{wait, within};
 use serde_json::{Value, json};
 
 use super::stage::{PATIENCE, Stage, Worker, next, rest};
 
 /// What is acknowledged to a user is in effect so soon.
-pub(crate) fn soon() -> Duration {
+fn soon() -> Duration {
     within(Duration::from_secs(1))
 }
 
-pub(crate) fn spec(stage: &Stage, node: &str) -> FlowSpec {
+fn spec(stage: &Stage, node: &str) -> FlowSpec {
     FlowSpec::new("edge", node).on_redis(&stage.redis.url(), "")
 }
 
 /// The layer as `Stage::robot` makes it, with overrides for the flow.
-pub(crate) fn layer(flow: &Value) -> Value {
+fn layer(flow: &Value) -> Value {
     json!({ "kind": "edge", "config": { "verbosity": "info" }, "overrides": { "blaze-flow": flow } })
 }
 
-pub(crate) fn limit(limit_mbps: f64) -> Value {
+fn limit(limit_mbps: f64) -> Value {
     json!({ "flow": { "bandwidth": { "limit_mbps": limit_mbps } } })
 }
 
 /// Waits until `/v1/allocation` satisfies.
-pub(crate) fn allocates(flow: &FlowProcess, what: &str, within: Duration, is_so: impl Fn(&Value) -> bool) -> Duration {
+fn allocates(flow: &FlowProcess, what: &str, within: Duration, is_so: impl Fn(&Value) -> bool) -> Duration {
     let ask = || flow.admin().json("/v1/allocation").unwrap_or_default();
     wait::until(what, within, || is_so(&ask()), || format!("{} {}", ask(), flow.tail())).unwrap()
 }
 
-pub(crate) fn has_limit(flow: &FlowProcess, limit_mbps: f64, within: Duration) -> Duration {
+fn has_limit(flow: &FlowProcess, limit_mbps: f64, within: Duration) -> Duration {
     allocates(flow, &format!("limit {limit_mbps}"), within, |seen| {
         seen["limit_mbps"] == limit_mbps
             && seen["budget_bytes_per_s"].as_f64() == Some((limit_mbps * 131_072.0).floor())
@@ -41,7 +43,7 @@ pub(crate) fn has_limit(flow: &FlowProcess, limit_mbps: f64, within: Duration) -
 }
 
 /// Waits until the check `config` satisfies; a flow stays ready whatever it says.
-pub(crate) fn check(flow: &FlowProcess, what: &str, is_so: impl Fn(&str, &str) -> bool) {
+fn check(flow: &FlowProcess, what: &str, is_so: impl Fn(&str, &str) -> bool) {
     let ask = || flow.admin().json("/readyz").unwrap_or_default();
     let holds = || {
         let seen = ask();
@@ -56,14 +58,14 @@ pub(crate) fn check(flow: &FlowProcess, what: &str, is_so: impl Fn(&str, &str) -
 }
 
 /// Acknowledgements of a flow, as anybody on the broker hears them.
-pub(crate) struct Acks(RedisReader);
+struct Acks(RedisReader);
 
 impl Acks {
-    pub(crate) fn new(stage: &Stage) -> Self {
+    fn new(stage: &Stage) -> Self {
         Self(RedisReader::new(&stage.redis.url(), "blaze/config/ack").unwrap())
     }
 
-    pub(crate) fn next(&mut self, status: &str) -> Value {
+    fn next(&mut self, status: &str) -> Value {
         let start = Instant::now();
         loop {
             let ack = self.0.next_json(PATIENCE).unwrap();
@@ -76,7 +78,7 @@ impl Acks {
 }
 
 /// Waits until the worker knows that the flow has its newest configuration.
-pub(crate) async fn is_configured(worker: &Worker) {
+async fn is_configured(worker: &Worker) {
     worker
         .until("the flow has its configuration", |status| {
             let mut rows = status["services"].as_array().into_iter().flatten();
@@ -94,15 +96,17 @@ pub(crate) async fn is_configured(worker: &Worker) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_limit_of_layer_or_node_is_in_effect_within_a_second_and_nobody_else_hears() {
     let stage = Stage::new();
-    let _main = stage.main();
-    stage.robot().await;
-    let worker = stage.worker("robot-1");
-    stage.equal(&worker, PATIENCE).await;
+    // The flow first, for once: it is ready without a worker, and finds the one that comes.
     let mut flow = FlowProcess::start(FlowSpec {
         limit_mbps: 30.0,
         ..spec(&stage, "robot-1")
     })
     .unwrap();
+    has_limit(&flow, 30.0, PATIENCE);
+    let _main = stage.main();
+    stage.robot().await;
+    let worker = stage.worker("robot-1");
+    stage.equal(&worker, PATIENCE).await;
     is_configured(&worker).await;
     let record = stage
         .keys()
@@ -279,4 +283,74 @@ async fn the_node_file_and_blaze_config_change_apart_from_each_other() {
     let _worker = stage.worker("robot-1");
     stage.put("/layers/edge", layer(&json!({}))).await;
     has_limit(&flow, 31.0, PATIENCE);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn rates_rules_and_compression_follow_while_messages_flow() {
+    const BYTES: usize = 200_000;
+    let stage = Stage::new();
+    let _main = stage.main();
+    stage.robot().await;
+    let worker = stage.worker("robot-1");
+    stage.equal(&worker, PATIENCE).await;
+    let domain = free_domain().unwrap();
+    let far_redis = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
+    let far = FlowSpec::new("fog", "fog-1")
+        .on_redis(&far_redis.url(), "")
+        .joined(domain);
+    let mut flow = FlowProcess::launch(spec(&stage, "robot-1").joined(domain)).unwrap();
+    let mut far = FlowProcess::launch(far).unwrap();
+    flow.wait_ready().unwrap();
+    far.wait_ready().unwrap();
+    is_configured(&worker).await;
+    let near = stage.redis.url();
+    let advertise = json!({ "op": "advertise", "topic": "camera/x", "service": "camera", "rate_hz": 50, "max_bytes": BYTES, "ttl_s": 600 });
+    plain::tell_redis(&near, "", &advertise).unwrap();
+    let request = json!({ "op": "request", "topic": "camera/x", "service": "viewer", "ttl_s": 600 });
+    plain::tell_redis(&far_redis.url(), "", &request).unwrap();
+    flow.wait_bridge("camera/x", PATIENCE).unwrap();
+    let topic = |seen: &Value| {
+        let mut rows = seen["topics"].as_array().into_iter().flatten();
+        rows.find(|row| row["topic"] == "camera/x").cloned().unwrap_or_default()
+    };
+    let rate = move |seen: &Value| topic(seen)["lanes"][0]["allocated_hz"].as_f64().unwrap_or_default();
+    // 50 Hz of 200 kB need some 80 Mbit/s.
+    allocates(&flow, "all of it fits", PATIENCE, move |seen| rate(seen) > 49.0);
+    stage.put("/layers/edge", layer(&limit(16.0))).await;
+    // 2 MiB/s, and what the wire takes besides.
+    let took = allocates(&flow, "a fifth of it fits", soon(), move |seen| {
+        (7.0..11.0).contains(&rate(seen))
+    });
+    eprintln!("another rate is allocated after {took:?}");
+    let mut ruled = limit(16.0);
+    ruled["flow"]["topics"] = json!([{ "match": "camera/**", "max_rate_hz": 4 }]);
+    stage.put("/layers/edge", layer(&ruled)).await;
+    allocates(&flow, "the rule counts", soon(), move |seen| {
+        (3.9..4.1).contains(&rate(seen))
+    });
+    ruled["flow"]["compression"] = json!({ "level": 1, "adaptive": false });
+    stage.put("/layers/edge", layer(&ruled)).await;
+    let payload = vec![b'a'; BYTES];
+    let level = |seen: &Value| topic(seen)["compression"]["level"].clone();
+    let publishes = |what: &str, level_wanted: Value| {
+        let ask = || {
+            plain::publish(&near, "camera/x", &payload).unwrap();
+            std::thread::sleep(Duration::from_millis(20));
+            flow.admin().json("/v1/allocation").unwrap_or_default()
+        };
+        wait::until(
+            what,
+            PATIENCE,
+            || level(&ask()) == level_wanted,
+            || format!("{} {}", ask(), flow.tail()),
+        )
+        .unwrap();
+    };
+    publishes("level 1", json!(1));
+    ruled["flow"]["topics"][0]["compression"] = json!({ "level": 5 });
+    stage.put("/layers/edge", layer(&ruled)).await;
+    publishes("level 5 by the rule of the topic", json!(5));
+    stage.put("/layers/edge", layer(&json!({}))).await;
+    allocates(&flow, "as in the file", PATIENCE, move |seen| rate(seen) > 49.0);
+    worker.stop();
 }

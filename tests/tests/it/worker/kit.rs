@@ -24,15 +24,8 @@ pub(crate) struct Robot {
 impl Robot {
     pub(crate) fn new(stage: &Stage, node: &'static str) -> Self {
         let redis = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
-        let file = json!({
-            "log": { "level": "info" },
-            "layer": { "name": "edge", "kind": "edge" },
-            "node": { "name": node },
-            "brokers": { "node": { "redis": { "url": redis.url() } } },
-            "admin": { "worker": "127.0.0.1:0" },
-            "config": { "server": format!("http://{}", stage.grpc) },
-            "worker": { "state_dir": stage.path(node) },
-        });
+        let brokers = json!({ "node": { "redis": { "url": redis.url() } } });
+        let file = stage.node_file(node, &brokers, &json!({}));
         Self { node, redis, file }
     }
 
@@ -156,11 +149,6 @@ impl Worker {
             assert!(start.elapsed() < PATIENCE, "{metrics}\n{}", self.tail());
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
-    }
-
-    /// What it has said on stderr, as far as it is kept.
-    pub(crate) fn log(&self) -> Vec<String> {
-        self.process.stderr()
     }
 
     pub(crate) fn id(&self) -> u32 {

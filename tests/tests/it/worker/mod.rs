@@ -5,10 +5,8 @@
 //! ```text
 //! stage      a main service, a broker and workers of one layer
 //! kit        robots that each have a Redis of their own, and service processes
-//! serving    what services are told, and whether only those it concerns
-//! outages    the main service, the broker and the worker away, in turns and together
-//! flow       BlazeFlow's own settings: what counts, what is refused, who else hears
-//! flow_live  the same while messages flow, in a roll-out, and whatever starts first
+//! serving    what services are told, and whether only those it concerns; the mounted file
+//! flow       BlazeFlow's own settings: what counts, what is refused, who else hears, also while messages flow
 //! layer      one worker for a whole layer, on Kafka and on DDS
 //! kafka      what is special to Kafka
 //! leases     the suite of leases on real servers
@@ -25,14 +23,12 @@
 //! ```
 
 mod flow;
-mod flow_live;
 mod kafka;
 mod killed;
 mod kit;
 mod late;
 mod layer;
 mod leases;
-mod outages;
 mod partition;
 mod raw;
 mod recorded;

@@ -4,12 +4,9 @@ use std::collections::BTreeSet;
 use std::process::Command;
 use std::time::Duration;
 
-use blaze_proto::v1;
-use blaze_proto::v1::config_service_client::ConfigServiceClient;
 use blaze_tests::process::binary;
 use reqwest::Method;
 use serde_json::{Value, json};
-use tonic::transport::Channel;
 
 use super::kit::{Robot, ServiceProcess};
 use super::stage::{PATIENCE, Stage, Worker, rest};
@@ -48,12 +45,6 @@ fn blaze(stage: &Stage, arguments: &[&str]) -> Result<Value, (i32, String)> {
         Some(0) => Ok(serde_json::from_slice(&output.stdout).unwrap()),
         code => Err((code.unwrap_or(-1), String::from_utf8_lossy(&output.stderr).into_owned())),
     }
-}
-
-async fn grpc(stage: &Stage) -> ConfigServiceClient<Channel> {
-    ConfigServiceClient::connect(format!("http://{}", stage.grpc))
-        .await
-        .unwrap()
 }
 
 fn rate(config: &Value) -> Option<u64> {
@@ -204,37 +195,22 @@ async fn a_good_one_is_promoted_and_others_are_undone() {
     }
     let stage = &stage;
 
-    // Over REST, promoted over gRPC.
+    // Started over REST, promoted by the command line.
     stage.send(Method::POST, "/rollouts", Some(&rollout("good", 20))).await;
     a.until("the canary tries it", has(20));
-    let (status, problem) = refused(stage, &rollout("second", 30)).await;
-    assert_eq!((status, &problem["code"]), (409, &json!("rollout_active")), "{problem}");
     let file = stage.write("second.json", &rollout("second", 30));
     let (code, words) = blaze(stage, &["rollout", "start", "-f", &file]).unwrap_err();
     assert!(code == 5 && words.contains("rollout_active"), "{code}: {words}");
     assert_eq!(rates(&b), BTreeSet::from([FORMER]));
-    set(stage, "good", "promote").await.unwrap();
+    blaze(stage, &["rollout", "promote", "good"]).unwrap();
     b.until("promoted", has(20));
     ends(stage, "good", "promoted").await;
     assert_eq!(a.seen().last().and_then(rate), Some(20));
-    let ended = set(stage, "good", "abort").await.unwrap_err();
-    assert_eq!(ended.code(), tonic::Code::FailedPrecondition, "{ended}");
 
-    // Over gRPC, aborted by the command line.
-    let document = v1::Document {
-        r#ref: Some(v1::Ref {
-            kind: v1::Kind::Rollout.into(),
-            name: "aborted".to_owned(),
-            service: String::new(),
-        }),
-        spec_json: rollout("aborted", 25)["spec"].to_string(),
-        ..v1::Document::default()
-    };
-    let request = v1::CreateRequest {
-        document: Some(document),
-        ..v1::CreateRequest::default()
-    };
-    grpc(stage).await.create(request).await.unwrap();
+    // Aborted by the command line.
+    stage
+        .send(Method::POST, "/rollouts", Some(&rollout("aborted", 25)))
+        .await;
     a.until("the canary tries it", has(25));
     let said = blaze(stage, &["rollout", "abort", "aborted", "--reason", "no need"]).unwrap();
     assert_eq!(said["status"]["phase"], "aborted", "{said}");
@@ -275,39 +251,11 @@ async fn a_good_one_is_promoted_and_others_are_undone() {
     );
     let a = first.run("slam", "a", &judge);
     a.until("the next life has the former value", has(20));
-
-    // Promoted by the command line, aborted over REST.
-    stage.send(Method::POST, "/rollouts", Some(&rollout("last", 45))).await;
-    a.until("the canary tries it", has(45));
-    blaze(stage, &["rollout", "promote", "last"]).unwrap();
-    b.until("promoted", has(45));
-    stage.send(Method::POST, "/rollouts", Some(&rollout("none", 46))).await;
-    a.until("the canary tries it", has(46));
-    let reason = json!({ "reason": "enough" });
-    stage.send(Method::POST, "/rollouts/none/abort", Some(&reason)).await;
-    a.until("undone", has(45));
     assert_eq!(
         rates(&b),
-        BTreeSet::from([FORMER, 20, 45]),
+        BTreeSet::from([FORMER, 20]),
         "the other robot had what was promoted"
     );
     stage.equal(&canary, PATIENCE).await;
     stage.equal(&other, PATIENCE).await;
-}
-
-/// Status and body of a start that is refused.
-async fn refused(stage: &Stage, body: &Value) -> (u16, Value) {
-    let url = format!("http://{}/api/v1/rollouts", stage.rest);
-    let response = stage.http.post(url).json(body).send().await.unwrap();
-    let status = response.status().as_u16();
-    (status, response.json().await.unwrap())
-}
-
-async fn set(stage: &Stage, name: &str, action: &str) -> Result<(), tonic::Status> {
-    let request = v1::SetRolloutRequest {
-        name: name.to_owned(),
-        action: action.to_owned(),
-        reason: String::new(),
-    };
-    grpc(stage).await.set_rollout(request).await.map(drop)
 }

@@ -22,20 +22,20 @@ use super::kit::{Robot, content};
 use super::stage::{PATIENCE, Stage, Worker, next};
 
 /// The beginning of every secret text, and of nothing else.
-pub(super) const CANARY: &str = "kanarienvogel-93ab";
+const CANARY: &str = "kanarienvogel-93ab";
 /// Stands beside the secrets: where this is, a secret would have been found too.
-pub(super) const PLAIN: &str = "sperling-51cc";
+const PLAIN: &str = "sperling-51cc";
 
 fn secret(number: u32) -> Value {
     json!({ "$secret": format!("{CANARY}-{number}") })
 }
 
-pub(super) fn config(number: u32) -> Value {
+fn config(number: u32) -> Value {
     json!({ "plain": PLAIN, "number": number, "db": { "password": secret(number) }, "list": [{ "key": secret(number + 1) }] })
 }
 
 /// Fails where a secret is found, also as a plain encoding of it. Gives whether what stands beside the secrets is there.
-pub(super) fn clean(what: &str, text: &str) -> bool {
+fn clean(what: &str, text: &str) -> bool {
     let encoded = (0..3).map(|skip| {
         let bytes = &CANARY.as_bytes()[skip..];
         STANDARD.encode(&bytes[..bytes.len() / 3 * 3])
@@ -111,7 +111,7 @@ fn dump(mongo: &MongoServer, database: &str) -> String {
 }
 
 /// Secrets in documents of each kind that can have them.
-pub(super) async fn documents(stage: &Stage) {
+async fn documents(stage: &Stage) {
     let documents = json!([
         { "kind": "Layer", "name": "edge", "spec": { "kind": "edge", "config": { "of_layer": config(10) }, "overrides": { "slam": { "more": config(12) } } } },
         { "kind": "Node", "name": "robot-1", "spec": { "layer": "edge", "config": { "of_node": config(14) } } },
@@ -164,7 +164,7 @@ async fn everything(stage: &Stage, robot: &Robot, worker: &Worker, is_shown: boo
 }
 
 /// What an operator sees: answers of the admin port and the log of a process.
-pub(super) async fn operator_sees_none(worker: &Worker, logs: &[&Path]) {
+async fn operator_sees_none(worker: &Worker, logs: &[&Path]) {
     for path in ["/v1/status", "/metrics", "/readyz", "/healthz", "/livez"] {
         clean(path, &worker.text(path).await);
     }

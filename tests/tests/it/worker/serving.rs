@@ -1,25 +1,51 @@
-//! What services are told, and who is not.
+//! What services are told, and who is not; what the mounted file serves.
+
+use std::time::Duration;
 
 use serde_json::json;
 
 use super::stage::{PATIENCE, Stage, next, rest};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_service_that_is_deleted_hears_it_and_has_no_key_any_more() {
+async fn without_anything_the_mounted_file_serves_until_the_main_service_is_there() {
     let stage = Stage::new();
+    let defaults = stage.path("defaults.yaml");
+    let file = |rate_hz: u64| {
+        format!(
+            "kind: Layer\nname: edge\nspec: {{ kind: edge }}\n---\nkind: Service\nname: slam\nspec: {{ config: {{ camera: {{ rate_hz: {rate_hz} }} }} }}\n"
+        )
+    };
+    std::fs::write(&defaults, file(1)).unwrap();
+    let worker = stage.worker_with("robot-1", json!({ "defaults_file": defaults }));
+    let mut service = stage.service().await;
+    let asks = json!({ "service": "slam", "instance": "0" });
+    let answer = service.ask(asks.clone(), PATIENCE).await;
+    assert_eq!(
+        (&answer["source"], &answer["config"]["camera"]["rate_hz"]),
+        (&json!("file"), &json!(1))
+    );
+    let mut slam = service.listen("slam").await;
+    std::fs::write(&defaults, file(2)).unwrap();
+    assert_eq!(next(&mut slam).await["config"]["camera"]["rate_hz"], 2);
+    std::fs::write(&defaults, "kind: [").unwrap();
+    let start = tokio::time::Instant::now();
+    while !worker.text("/readyz").await.contains("defaults.yaml") {
+        assert!(start.elapsed() < PATIENCE, "{}", worker.text("/readyz").await);
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert_eq!(
+        service.ask(asks.clone(), PATIENCE).await["config"]["camera"]["rate_hz"],
+        2
+    );
+
     let _main = stage.main();
     stage.robot().await;
-    let worker = stage.worker("robot-1");
     stage.equal(&worker, PATIENCE).await;
-    let service = stage.service().await;
-    let mut nav = service.listen("nav").await;
-    stage.send(reqwest::Method::DELETE, "/services/nav", None).await;
-    let notice = next(&mut nav).await;
+    let answer = service.ask(asks, PATIENCE).await;
     assert_eq!(
-        (&notice["deleted"], &notice["config"], &notice["hash"]),
-        (&json!(true), &json!(null), &json!(null))
+        (&answer["source"], &answer["config"]["camera"]["rate_hz"]),
+        (&json!("main"), &json!(30))
     );
-    assert_eq!(stage.keys().get("blaze:config:nav").await.unwrap(), None);
 }
 
 mod quick {

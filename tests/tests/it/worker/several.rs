@@ -123,20 +123,8 @@ async fn with_kafka_another_worker_takes_over_within_its_session_timeout() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn whoever_was_stopped_writes_nothing_older_over_what_the_next_one_wrote() {
     let (stage, _main) = stage().await;
-    let sections = json!({
-        "cache": { "redis": { "url": stage.redis.url() } },
-        "worker": { "state_dir": stage.path("shared-by-none"), "lease_ms": 1000 },
-    });
-    let sections_of = |node: &str| {
-        let mut sections = sections.clone();
-        sections["worker"]["state_dir"] = json!(stage.path(node));
-        sections
-    };
-    let leader = stage.layer_worker("fog-1", &sections_of("fog-1"));
-    stage.equal(&leader, PATIENCE).await;
-    until_it_leads(&leader, Instant::now()).await;
-    let other = stage.layer_worker("fog-2", &sections_of("fog-2"));
-    stage.equal(&other, PATIENCE).await;
+    let sections = json!({ "cache": { "redis": { "url": stage.redis.url() } }, "worker": { "lease_ms": 1000 } });
+    let (leader, other) = two(&stage, &sections).await;
     for round in 1..=3_u64 {
         // It is stopped with a change on its way.
         stage
@@ -179,27 +167,4 @@ async fn whoever_was_stopped_writes_nothing_older_over_what_the_next_one_wrote()
         stage.equal(&other, PATIENCE).await;
         assert!(!other.is_leader().await);
     }
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_was_told_is_marked_beside_the_lease_which_a_worker_that_ends_gives_up() {
-    let (stage, _main) = stage().await;
-    let sections = json!({ "cache": { "redis": { "url": stage.redis.url() } } });
-    let worker = stage.layer_worker("fog-1", &sections);
-    stage.equal(&worker, PATIENCE).await;
-    until_it_leads(&worker, Instant::now()).await;
-    let mark = async || {
-        let mark = stage.keys().get("blaze:lease:worker:edge:told").await.unwrap();
-        mark.map(|mark| serde_json::from_slice::<Value>(&mark).unwrap())
-    };
-    let status = worker.status().await;
-    let start = Instant::now();
-    while mark().await.is_none_or(|mark| mark["revision"] != status["revision"]) {
-        assert!(start.elapsed() < PATIENCE, "{:?}; {}", mark().await, worker.tail());
-        tokio::time::sleep(Duration::from_millis(20)).await;
-    }
-    let owner = stage.keys().get("blaze:lease:worker:edge").await.unwrap().unwrap();
-    assert_eq!(owner, status["worker_id"].as_str().unwrap());
-    worker.stop();
-    assert_eq!(stage.keys().get("blaze:lease:worker:edge").await.unwrap(), None);
 }

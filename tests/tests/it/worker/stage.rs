@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::Context as _;
 use blaze_brokers::redis::RedisKeys;
 use blaze_brokers::{
     Broker, BrokerKind, Content, Health, PublisherOptions, Role, SubscribeOptions, Subscription, open_layer, open_node,
 };
+use blaze_domain::config::merge::merge_patch;
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::{NodeBroker, NodeFile};
 use blaze_tests::process::{Process, Signal};
@@ -19,6 +19,8 @@ use blaze_tests::wait;
 use bytes::Bytes;
 use serde_json::{Value, json};
 use tempfile::TempDir;
+
+use super::kit::Starting;
 
 /// A start on a machine that does much else.
 const START: Duration = Duration::from_secs(60);
@@ -56,12 +58,6 @@ fn free() -> SocketAddr {
     SocketAddr::from((Ipv4Addr::LOCALHOST, free_port().unwrap()))
 }
 
-fn launch(program: &str, node_file: &str) -> anyhow::Result<(Process, BTreeMap<String, SocketAddr>)> {
-    let process = Process::start(program, &["--config", node_file], None)?;
-    let addresses = addresses(&process)?;
-    Ok((process, addresses))
-}
-
 /// Waits for the ready line, and gives what is in it.
 pub(super) fn addresses(process: &Process) -> anyhow::Result<BTreeMap<String, SocketAddr>> {
     let line = wait::until_some(
@@ -86,15 +82,6 @@ impl Stage {
     /// A layer on this broker, as in the node file.
     pub(crate) fn of_layer(broker: &Value) -> Self {
         Self::with(None, json!({ "layer": broker }))
-    }
-
-    /// The same with a Redis beside it.
-    pub(crate) fn with_cache(self) -> Self {
-        let redis = RedisServer::start(RedisKind::Redis, RedisOptions::default()).unwrap();
-        Self {
-            redis: OwnRedis(Some(redis)),
-            ..self
-        }
     }
 
     fn with(redis: Option<RedisServer>, brokers: Value) -> Self {
@@ -146,13 +133,7 @@ impl Stage {
             None => Process::start("blaze-config", &arguments, None),
         }
         .unwrap();
-        wait::until_some(
-            "the ready line of blaze-config",
-            START,
-            || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
-            || process.tail(),
-        )
-        .unwrap();
+        addresses(&process).unwrap();
         process
     }
 
@@ -163,45 +144,38 @@ impl Stage {
 
     /// The same with further members of the section `worker`.
     pub(crate) fn worker_with(&self, node: &str, section: Value) -> Worker {
-        let mut section = section;
-        section["state_dir"] = json!(self.path(node));
-        let mut file = json!({
-            "log": { "level": "info" },
-            "layer": { "name": "edge", "kind": "edge" },
-            "node": { "name": node },
-            "brokers": self.brokers,
-            "admin": { "worker": "127.0.0.1:0" },
-            "config": { "server": format!("http://{}", self.grpc) },
-            "worker": section,
-        });
-        if let (OwnRedis(Some(redis)), Some(_)) = (&self.redis, self.brokers.get("layer")) {
-            file["cache"] = json!({ "redis": { "url": redis.url() } });
-        }
-        let file = self.write(&format!("{node}.yaml"), &file);
-        let (process, addresses) = launch("blaze-worker", &file).unwrap();
-        let admin = *addresses.get("admin").context("no admin").unwrap();
-        Worker { process, admin }
+        self.started(
+            node,
+            &self.node_file(node, &self.brokers, &json!({ "worker": section })),
+        )
     }
 
     /// A worker of the whole layer, ready, beside others; `more` are further sections. Its broker is in its own memory, unless
     /// they name another: keys are enough to see who serves.
     pub(crate) fn layer_worker(&self, node: &str, more: &Value) -> Worker {
+        let memory = json!({ "layer": { "memory": {} } });
+        let brokers = more.get("brokers").unwrap_or(&memory);
+        self.started(node, &self.node_file(node, brokers, more))
+    }
+
+    /// The node file of a worker, with further members.
+    pub(super) fn node_file(&self, node: &str, brokers: &Value, more: &Value) -> Value {
         let mut file = json!({
-            "log": { "level": "debug" },
+            "log": { "level": "info" },
             "layer": { "name": "edge", "kind": "edge" },
             "node": { "name": node },
-            "brokers": { "layer": { "memory": {} } },
+            "brokers": brokers,
             "admin": { "worker": "127.0.0.1:0" },
             "config": { "server": format!("http://{}", self.grpc) },
             "worker": { "state_dir": self.path(node) },
         });
-        for (name, section) in more.as_object().unwrap() {
-            file[name] = section.clone();
-        }
-        let file = self.write(&format!("{node}.yaml"), &file);
-        let (process, addresses) = launch("blaze-worker", &file).unwrap();
-        let admin = *addresses.get("admin").context("no admin").unwrap();
-        Worker { process, admin }
+        merge_patch(&mut file, more);
+        file
+    }
+
+    fn started(&self, node: &str, file: &Value) -> Worker {
+        let file = self.write(&format!("{node}.yaml"), file);
+        Starting::of(Process::start("blaze-worker", &["--config", &file], None).unwrap()).ready()
     }
 
     /// A request to the main service that must succeed.
@@ -496,11 +470,4 @@ pub(crate) async fn rest(notices: &mut Subscription) -> Vec<Value> {
     // What is there is taken at once.
     let _ = tokio::time::timeout(Duration::from_millis(1), notices.receive(&mut batch, 10_000)).await;
     batch.iter().map(|received| text(&received.content)).collect()
-}
-
-impl Stage {
-    /// Where workers reach the main service.
-    pub(crate) fn grpc(&self) -> SocketAddr {
-        self.grpc
-    }
 }

@@ -11,7 +11,6 @@ use std::time::Duration;
 use blaze_proto::v1;
 use blaze_proto::v1::sync_request::Msg as Said;
 use blaze_proto::v1::sync_response::Msg as Told;
-use blaze_tests::wait;
 use bytes::Bytes;
 use futures::StreamExt as _;
 use prost::Message as _;
@@ -301,16 +300,8 @@ async fn the_worker_understands_main_services_that_were_recorded() {
     }
 }
 
-/// Waits until the worker says this of itself, and has logged it.
-async fn says(worker: &Worker, words: &str) {
-    let is_there = |status: &Value| status["reason"].as_str().is_some_and(|reason| reason.contains(words));
-    worker.until(words, is_there).await;
-    let is_logged = || worker.log().iter().any(|line| line.contains(words));
-    wait::until(words, PATIENCE, is_logged, || worker.tail()).unwrap();
-}
-
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn versions_that_are_too_far_apart_are_told_so() {
+async fn the_main_service_tells_workers_that_are_too_far_apart() {
     let stage = Stage::new();
     let _main = stage.main();
     documents(&stage).await;
@@ -340,38 +331,4 @@ async fn versions_that_are_too_far_apart_are_told_so() {
     let none = Bytes::from(greeting(PROTOCOL - 2).encode_to_vec());
     let refused = RawStream::open(stage.grpc, none).await.err().unwrap();
     assert_eq!(refused.code(), tonic::Code::InvalidArgument, "{refused}");
-
-    // The same from the other side: what a worker makes of it.
-    let mut main = RawMain::start().await;
-    let robot = Robot::new(&stage, "robot-1").with(&json!({
-        "config": { "server": format!("http://{}", main.address) }, "worker": { "defaults_file": stage.path("defaults.yaml") },
-    }));
-    std::fs::write(
-        stage.path("defaults.yaml"),
-        "kind: Layer\nname: edge\nspec: { kind: edge }\n",
-    )
-    .unwrap();
-    let worker = robot.worker(&stage);
-    let mut session = main.session().await;
-    hello(&mut session).await;
-    let welcome = v1::SyncResponse {
-        msg: Some(Told::Welcome(v1::Welcome {
-            protocol: PROTOCOL + 1,
-            ..v1::Welcome::default()
-        })),
-    };
-    session.tell.send(Ok(welcome.encode_to_vec().into())).await.unwrap();
-    says(&worker, "speaks version 3 of the protocol, this worker 1 to 2").await;
-    drop(session);
-    let session = main.session().await;
-    let reason = "version 2 of the protocol of Sync is not spoken here";
-    let away = v1::SyncResponse {
-        msg: Some(Told::GoAway(v1::GoAway {
-            retry_after_ms: 100,
-            reason: reason.to_owned(),
-        })),
-    };
-    session.tell.send(Ok(away.encode_to_vec().into())).await.unwrap();
-    drop(session);
-    says(&worker, reason).await;
 }

@@ -1,8 +1,7 @@
-//! Many workers at once: who hears of what, what becomes of all of them while parts are killed, and how they come back.
+//! Many workers at once: what becomes of all of them while parts are killed, and how they come back.
 //!
 //! Needs `cargo build --workspace` and `scripts/services install`.
 
-mod hears;
 mod kills;
 mod restarts;
 mod writer;
