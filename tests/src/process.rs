@@ -92,6 +92,16 @@ pub struct Usage {
     pub descriptors: u64,
 }
 
+impl Usage {
+    /// Whether it is at most so much more than before.
+    #[must_use]
+    pub fn exceeds_by_at_most(&self, before: &Self, most: &Self) -> bool {
+        self.resident_kib <= before.resident_kib + most.resident_kib
+            && self.threads <= before.threads + most.threads
+            && self.descriptors <= before.descriptors + most.descriptors
+    }
+}
+
 impl std::fmt::Display for Usage {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(

@@ -120,9 +120,7 @@ impl FlowReport {
                 Some(format!("{}: {}", self.node, self.unbalanced.join("; ")))
             }
             Expect::Growth(most) => {
-                let held = self.last.resident_kib <= self.warm.resident_kib + most.resident_kib
-                    && self.last.threads <= self.warm.threads + most.threads
-                    && self.last.descriptors <= self.warm.descriptors + most.descriptors;
+                let held = self.last.exceeds_by_at_most(&self.warm, most);
                 (!held).then(|| format!("{} grew from {} to {}", self.node, self.warm, self.last))
             }
             _ => None,

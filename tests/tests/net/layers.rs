@@ -73,6 +73,33 @@ pub(super) fn broker(name: &'static str, host: &'static str, kind: BrokerKind) -
     Broker { name, host, kind }
 }
 
+/// A robot with a Redis, a cloud with some broker, one link between them, and streams from the one to the other; without faults
+/// or an end.
+pub(super) fn one_link(shape: Shape, cloud: BrokerKind, limit_mbps: f64, streams: Vec<Stream>) -> Scenario {
+    let flow = |layer, node, broker, peers: &[&'static str]| Flow {
+        limit_mbps,
+        ..flow(layer, node, broker, None, peers)
+    };
+    Scenario {
+        name: "a robot and a cloud",
+        network: Plan::two_hosts("robot-1", "cloud-1", shape),
+        brokers: vec![
+            broker("redis", "robot-1", BrokerKind::Redis),
+            broker("cloud-broker", "cloud-1", cloud),
+        ],
+        flows: vec![
+            flow("edge", "robot-1", "redis", &["cloud-1"]),
+            flow("cloud", "cloud-1", "cloud-broker", &[]),
+        ],
+        publishers: vec![service("driver", "robot-1", "redis", streams.clone())],
+        consumers: vec![service("recorder", "cloud-1", "cloud-broker", streams)],
+        faults: vec![],
+        duration: Duration::ZERO,
+        settle: Duration::ZERO,
+        expect: vec![],
+    }
+}
+
 /// Robots with a Redis each meet over DDS in the edge; fog and cloud have a Kafka each, the fog two flows over it.
 pub(super) fn three_layers(image_hz: f64) -> Scenario {
     let shape = Shape::to_cloud();
@@ -125,7 +152,7 @@ pub(super) fn three_layers(image_hz: f64) -> Scenario {
             service("pilot", "robot-1", "redis-1", vec![commands, map]),
         ],
         faults: vec![],
-        duration: Duration::from_secs(if long() { 120 } else { 10 }),
+        duration: Duration::from_secs(if long() { 120 } else { 6 }),
         settle: Duration::from_secs(10),
         expect: whole(),
     }

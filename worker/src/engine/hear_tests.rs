@@ -150,7 +150,11 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away_after_a_r
     documents.push(rollout(3, "u-1", 500));
     w.opens(documents.clone(), 3).await;
     assert_eq!(w.reported("failed").await.node, "robot-1");
-    assert_eq!(w.rates().await, [json!(30)], "every place once, none with the bad value");
+    assert_eq!(
+        w.rates().await,
+        [json!(30)],
+        "every place once, none with the bad value"
+    );
     // Another one of the same name may be tried.
     assert_eq!(w.tries(4, "u-2", 40).await, [json!(40)]);
     assert_eq!(w.reported("applied").await.uid, "u-2");
