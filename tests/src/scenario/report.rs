@@ -29,10 +29,6 @@ pub struct Route {
     pub reordered: u64,
     /// From publishing to the consumer's callback, ms, sorted; of the time in which faults are played.
     pub latencies_ms: Vec<f64>,
-    /// Seconds after the consumer's start when something came last.
-    pub heard_s: usize,
-    /// The same of when something came after a later one, and how many.
-    pub reordered_s: Vec<(usize, u64)>,
 }
 
 impl Route {

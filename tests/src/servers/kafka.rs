@@ -202,14 +202,6 @@ impl KafkaServer {
         }
         Ok(bytes)
     }
-
-    /// Resident memory in KiB.
-    ///
-    /// # Errors
-    /// When it does not run.
-    pub fn rss_kib(&self) -> anyhow::Result<u64> {
-        self.process.rss_kib()
-    }
 }
 
 /// Copies the empty data folder that `scripts/services install` formatted, which saves a start of Java, and gives it a

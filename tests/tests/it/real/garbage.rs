@@ -8,9 +8,9 @@ use blaze_tests::servers::{shared_kafka, shared_redis};
 use blaze_tests::wait;
 use rand::rngs::StdRng;
 use rand::{Rng as _, RngExt as _, SeedableRng as _};
-use serde_json::json;
+use serde_json::{Value, json};
 
-use crate::real::support::{RobotAndCloud, SOON, connect};
+use crate::real::support::{RedisReader, RobotAndCloud, SOON, connect};
 
 const TOPIC: &str = "imu/data";
 /// What a flow may hold beside what it had before.
@@ -99,12 +99,10 @@ fn flowing(system: &RobotAndCloud, reader: &KafkaReader) -> anyhow::Result<()> {
 fn garbage_is_counted_and_does_no_harm() -> anyhow::Result<()> {
     const BACK: &str = "fleet/commands";
     let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
-    system.tell_robot(&json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","ttl_s":0}))?;
+    system.route(TOPIC, &json!({}))?;
     system.tell_robot(&json!({"op":"request","topic":BACK,"service":"driver","ttl_s":0}))?;
-    system.tell_cloud(&json!([{"op":"request","topic":TOPIC,"service":"logger","ttl_s":0},
-        {"op":"advertise","topic":BACK,"service":"planner","ttl_s":0}]))?;
+    system.tell_cloud(&json!({"op":"advertise","topic":BACK,"service":"planner","ttl_s":0}))?;
     for flow in [&system.robot, &system.cloud] {
-        flow.wait_bridge(TOPIC, SOON)?;
         flow.wait_bridge(BACK, SOON)?;
     }
     let reader = KafkaReader::from_end(&system.kafka, &system.topic(TOPIC))?;
@@ -128,26 +126,55 @@ fn garbage_is_counted_and_does_no_harm() -> anyhow::Result<()> {
 
     // One byte too many.
     let before = metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"too_large\"");
-    system.publish(TOPIC, &vec![b'x'; 16 * 1024 * 1024 + 1])?;
+    let large = vec![b'x'; 16 * 1024 * 1024 + 1];
+    system.publish(TOPIC, &large)?;
     wait::until(
         "a payload of 16 MiB + 1 is counted",
         SOON,
         || metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"too_large\"") > before,
         || system.robot.tail(),
     )?;
+    let why = || system.robot.why(TOPIC, None).unwrap_or_default();
+    wait::until(
+        "why names what is too large for any bridge",
+        SOON,
+        || {
+            let _ = system.publish(TOPIC, &large);
+            why()["code"] == "too_large" && why()["verdict"] == "not_flowing"
+        },
+        || why().to_string(),
+    )?;
     flowing(&system, &reader)?;
 
     // Control topic of both brokers.
     let mut connection = connect(&system.redis)?;
     let writer = KafkaWriter::new(&system.kafka)?;
-    for payload in hostile_control() {
+    let mut events = RedisReader::new(&system.redis, &system.channel("blaze/flow/events"))?;
+    let refused = || {
+        let label = "event=\"control_message_refused\"";
+        metric_sum(&system.robot, "blaze_flow_link_events_total", label)
+    };
+    let (before, hostile) = (refused(), hostile_control());
+    for payload in &hostile {
         redis::cmd("PUBLISH")
             .arg(system.channel("blaze/flow/control"))
-            .arg(&payload)
+            .arg(payload)
             .exec(&mut connection)?;
-        writer.produce_later(&system.topic("blaze/flow/control"), &payload)?;
+        writer.produce_later(&system.topic("blaze/flow/control"), payload)?;
     }
     writer.produce(&system.topic("blaze/flow/control"), b"{}")?;
+    // An empty array alone has no fault.
+    let expected = before + (hostile.len() - 1) as f64;
+    let counted = || format!("{} of {expected}", refused());
+    wait::until(
+        "every refused control message is counted",
+        SOON,
+        || refused() >= expected,
+        counted,
+    )?;
+    let is_told = |event: Value| event["event"] == "lease_refused" && event["code"] == "invalid_json";
+    let told = || events.next_json(SOON).is_ok_and(is_told);
+    wait::until("an event says so", SOON, told, || system.robot.tail())?;
     flowing(&system, &reader)?;
 
     // Kafka records with headers that lie.

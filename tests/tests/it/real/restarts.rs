@@ -66,6 +66,7 @@ fn whatever_is_killed_comes_back() -> anyhow::Result<()> {
     let held = [leases(&system.robot), leases(&system.cloud)];
     assert_eq!(held.iter().map(Vec::len).sum::<usize>(), 2, "{held:?}");
 
+    let hash = system.channel("blaze:flow:leases");
     let rounds = if blaze_tests::long() { 10 } else { 1 };
     let mut first_memory = None;
     for round in 1..=rounds {
@@ -73,6 +74,8 @@ fn whatever_is_killed_comes_back() -> anyhow::Result<()> {
         for victim in [Victim::Redis, Victim::RobotFlow, Victim::CloudFlow, Victim::Kafka] {
             let took = kill_and_restart(victim, &mut system, &redis, &kafka, &stream)?;
             println!("round {round}: {victim:?} killed, flowing {took:?} after it answers");
+            let written = || redis.cli(&["HLEN", &hash]).is_ok_and(|count| count.trim() == "1");
+            wait::until("the lease is written, also anew", SOON, written, || system.robot.tail())?;
             wait::until(
                 "bridges are as before",
                 SOON,
@@ -136,9 +139,7 @@ fn kill_and_restart(
         Victim::Redis => {
             redis.kill()?;
             redis.restart()?;
-            let hash = system.channel("blaze:flow:leases");
-            let written = || redis.cli(&["HLEN", &hash]).is_ok_and(|count| count.trim() == "1");
-            wait::until("the leases are written again", SOON, written, || system.robot.tail())?;
+            wait::until("Redis answers PING", SOON, || redis.ping(), String::new)?;
         }
         Victim::Kafka => {
             kafka.kill()?;
