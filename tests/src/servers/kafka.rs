@@ -6,6 +6,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use rdkafka::ClientConfig;
 use rdkafka::consumer::{BaseConsumer, Consumer as _};
+use rdkafka::metadata::{MetadataPartition, MetadataTopic};
 
 use super::endpoint::Endpoint;
 use super::process::ServerProcess;
@@ -244,8 +245,8 @@ pub(super) fn leaders(broker: &Endpoint, within: Duration) -> anyhow::Result<(St
         let client: BaseConsumer = settings.set("log_level", "2").create()?;
         let metadata = client.fetch_metadata(None, within)?;
         anyhow::ensure!(!metadata.brokers().is_empty(), "no broker takes part");
-        let partitions = metadata.topics().iter().flat_map(|topic| topic.partitions());
+        let partitions = metadata.topics().iter().flat_map(MetadataTopic::partitions);
         let cluster = client.client().fetch_cluster_id(within).context("no cluster")?;
-        Ok((cluster, partitions.map(|partition| partition.leader()).collect()))
+        Ok((cluster, partitions.map(MetadataPartition::leader).collect()))
     })
 }

@@ -131,18 +131,8 @@ fn an_instance_that_can_be_none_is_a_fault_of_the_configuration() {
 /// A `blaze-flow` that has printed its ready line.
 fn started(path: &str) -> (Process, Admin) {
     let process = Process::start("blaze-flow", &["--config", path], None).unwrap();
-    let address = |line: String| {
-        let mut pairs = line.strip_prefix("ready ")?.split_whitespace();
-        pairs.find_map(|pair| pair.strip_prefix("admin="))?.parse().ok()
-    };
-    let address = wait::until_some(
-        "the ready line",
-        DEADLINE,
-        || process.stdout().into_iter().find_map(address),
-        || process.tail(),
-    );
     let admin = Admin {
-        address: address.unwrap(),
+        address: process.ready_at("admin", DEADLINE).unwrap(),
         namespace: None,
     };
     (process, admin)
