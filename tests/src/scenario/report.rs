@@ -1,7 +1,6 @@
 //! What a scenario measured.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
 
 use super::Expect;
 use crate::process::Usage;
@@ -61,9 +60,6 @@ impl Route {
             }
             Expect::Received(_, _, least) => self.received >= *least,
             Expect::Alive(..) => self.sent > 0 && self.last == self.sent,
-            Expect::P99(_, _, most) => self
-                .latency_ms(0.99)
-                .is_some_and(|p99| Duration::from_secs_f64(p99 / 1e3) <= *most),
             // Of flows, not of routes.
             Expect::Balanced | Expect::Growth(_) => true,
         };
@@ -164,8 +160,7 @@ impl Report {
             Expect::Whole(consumer, topic)
             | Expect::LostAtMost(consumer, topic, _)
             | Expect::Received(consumer, topic, _)
-            | Expect::Alive(consumer, topic)
-            | Expect::P99(consumer, topic, _) => match self.route(consumer, topic) {
+            | Expect::Alive(consumer, topic) => match self.route(consumer, topic) {
                 Some(route) => route.faults(expect),
                 None => Some(format!("there is no {topic} at {consumer}")),
             },
@@ -238,14 +233,12 @@ mod tests {
                 Expect::LostAtMost("recorder", "imu", 0.01),
                 Expect::Received("recorder", "imu", 990),
                 Expect::Alive("recorder", "imu"),
-                Expect::P99("recorder", "imu", Duration::from_millis(99)),
             ])
             .unwrap();
         for wrong in [
             Expect::Whole("recorder", "imu"),
             Expect::LostAtMost("recorder", "imu", 0.009),
             Expect::Received("recorder", "imu", 991),
-            Expect::P99("recorder", "imu", Duration::from_millis(98)),
             Expect::Received("recorder", "odom", 1),
             Expect::Received("player", "imu", 1),
         ] {

@@ -102,9 +102,7 @@ impl Running {
         let mut spec = FlowSpec::new(flow.layer, flow.node)
             .joined(DOMAIN)
             .inside(self.topology.host(flow.host)?, &peers);
-        spec.kind = flow.kind.to_owned();
         spec.limit_mbps = flow.limit_mbps;
-        spec.extra = flow.extra.to_owned();
         spec.bandwidth = flow.bandwidth.to_owned();
         spec.flow = flow.keys.to_owned();
         spec.layer_domain = flow.layer_domain;
@@ -176,17 +174,6 @@ impl Running {
     /// When there is none.
     pub fn link(&self, a: &str, b: &str) -> anyhow::Result<Link<'_>> {
         self.topology.link(a, b)
-    }
-
-    /// A server with Redis' or Valkey's protocol.
-    ///
-    /// # Errors
-    /// When there is none of that name.
-    pub fn redis(&self, name: &str) -> anyhow::Result<&RedisServer> {
-        match self.broker(name)? {
-            Server::Redis(redis) => Ok(redis),
-            Server::Kafka(_) => anyhow::bail!("{name} is a Kafka"),
-        }
     }
 
     /// What a consumer measured of a topic from a moment on.
@@ -437,16 +424,15 @@ fn dropped(flow: &FlowProcess) -> BTreeMap<String, u64> {
 
 fn start_broker(broker: &Broker, host: &Host) -> anyhow::Result<Server> {
     let host = Some(host.clone());
-    let redis = |kind| {
-        let options = RedisOptions {
-            host: host.clone(),
-            ..RedisOptions::default()
-        };
-        RedisServer::start(kind, options).map(Server::Redis)
-    };
     let server = match broker.kind {
-        BrokerKind::Redis => redis(RedisKind::Redis),
-        BrokerKind::Valkey => redis(RedisKind::Valkey),
+        BrokerKind::Redis => RedisServer::start(
+            RedisKind::Redis,
+            RedisOptions {
+                host,
+                ..RedisOptions::default()
+            },
+        )
+        .map(Server::Redis),
         BrokerKind::Kafka => KafkaServer::start(KafkaOptions {
             host,
             ..KafkaOptions::default()

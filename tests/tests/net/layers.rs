@@ -47,7 +47,6 @@ pub(super) fn flow(
 ) -> Flow {
     Flow {
         layer,
-        kind: "",
         node,
         host: node,
         brokers: vec![broker],
@@ -56,7 +55,6 @@ pub(super) fn flow(
         limit_mbps: 100.0,
         bandwidth: "",
         keys: "",
-        extra: "",
     }
 }
 

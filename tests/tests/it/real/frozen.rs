@@ -178,9 +178,9 @@ impl Rig {
         }
         let times = others.iter().map(|other| {
             let calm = other.p99(calm_from, calm_to).unwrap_or_default();
-            let frozen = other.p99(frozen_from, frozen_to).unwrap_or_default();
+            // A route that did not go on at all is slower than any.
+            let frozen = other.p99(frozen_from, frozen_to).unwrap_or(Duration::MAX);
             println!("{what}: another route's p99 {calm:?} before, {frozen:?} while it was frozen");
-            assert!(!frozen.is_zero(), "{what}: another route went on");
             (calm, frozen)
         });
         let times = times.collect();
