@@ -44,7 +44,7 @@ const RIGHTS: &[(Role, &[Right])] = &[
 pub fn allowed(claims: &Claims, right: Right) -> Result<(), String> {
     let mut granted = false;
     for text in &claims.roles {
-        let role: Role = text.parse()?;
+        let role: Role = text.parse().map_err(|error| format!("role {error}"))?;
         granted |= RIGHTS.iter().any(|(of, rights)| *of == role && rights.contains(&right));
     }
     if granted {

@@ -35,7 +35,7 @@ impl NewToken<'_> {
             return Err("roles is empty; name at least one of viewer, operator, admin, worker".to_owned());
         }
         for (index, role) in self.roles.iter().enumerate() {
-            let role: Role = role.parse()?;
+            let role: Role = role.parse().map_err(|error| format!("role {error}"))?;
             if self.roles[..index].iter().any(|before| before == role.as_str()) {
                 return Err(format!("role {} is named twice", role.as_str()));
             }

@@ -1,14 +1,12 @@
 //! Closed sets that describe how a topic is carried.
 
-use std::fmt;
-use std::str::FromStr;
-
-use serde::{Deserialize, Serialize};
-
+/// An enum of words: its variants, each with the word that stands for it on the wire and in files. The crate that makes one
+/// needs `serde`.
+#[macro_export]
 macro_rules! word_enum {
     ($(#[$doc:meta])* $type:ident { $($(#[$variant_doc:meta])* $variant:ident = $text:literal),+ $(,)? }) => {
         $(#[$doc])*
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, ::serde::Serialize, ::serde::Deserialize)]
         pub enum $type {
             $($(#[$variant_doc])* #[serde(rename = $text)] $variant,)+
         }
@@ -24,16 +22,16 @@ macro_rules! word_enum {
             }
         }
 
-        impl fmt::Display for $type {
-            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        impl ::std::fmt::Display for $type {
+            fn fmt(&self, f: &mut ::std::fmt::Formatter<'_>) -> ::std::fmt::Result {
                 f.write_str(self.as_str())
             }
         }
 
-        impl FromStr for $type {
-            type Err = UnknownWord;
-            fn from_str(text: &str) -> Result<Self, UnknownWord> {
-                Self::ALL.iter().copied().find(|value| value.as_str() == text).ok_or_else(|| UnknownWord {
+        impl ::std::str::FromStr for $type {
+            type Err = $crate::qos::UnknownWord;
+            fn from_str(text: &str) -> Result<Self, $crate::qos::UnknownWord> {
+                Self::ALL.iter().copied().find(|value| value.as_str() == text).ok_or_else(|| $crate::qos::UnknownWord {
                     found: text.to_owned(),
                     allowed: Self::ALL.iter().map(|value| value.as_str()).collect::<Vec<_>>().join(", "),
                 })
@@ -41,7 +39,7 @@ macro_rules! word_enum {
         }
     };
 }
-pub(crate) use word_enum;
+pub(crate) use crate::word_enum;
 
 /// A word is not of its closed set.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -1,11 +1,6 @@
 //! Why a message was dropped, and why a topic does or does not arrive. Both sets are part of the contract.
 
-use std::fmt;
-use std::str::FromStr;
-
-use serde::{Deserialize, Serialize};
-
-use crate::qos::{UnknownWord, word_enum};
+use crate::qos::word_enum;
 
 word_enum!(
     /// Why a message was dropped; the label `reason` of `blaze_flow_dropped_total`.

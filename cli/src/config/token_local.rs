@@ -155,7 +155,7 @@ pub(super) fn parse_algorithm(text: &str) -> Result<Algorithm, String> {
         .iter()
         .copied()
         .find(|known| known.as_str().eq_ignore_ascii_case(text));
-    found.map_or_else(|| text.parse(), Ok)
+    found.map_or_else(|| text.parse().map_err(|error| format!("algorithm {error}")), Ok)
 }
 
 /// Makes a key file, readable for its owner alone, and beside it `<file>.pub` where there is a public part. What exists is

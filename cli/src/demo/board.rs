@@ -5,23 +5,41 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::DropReason;
 use blaze_proto::Frame;
+use blaze_sdk::SubscriptionStats;
 use parking_lot::Mutex;
 use serde::Serialize;
 
 use super::flows::{FlowView, Spot};
 use super::options::DemoNode;
 use super::roles::{Consumer, MOVES_FROM, MOVES_TO, MOVING_SERVICE, PUBLISHING_NODE, PlayedTopic};
-use super::stats::{Arrival, Period, SubscriptionStats};
+use super::stats::{Arrival, ConsumerStats, Period};
 
-/// Messages that reached a consumer and were not handed to it, since it began to listen.
+/// Messages that a consumer did not get as they were published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct ConsumerCounts {
-    /// They gave way in its queue.
-    pub queue_full: u64,
-    /// They were older than their lifespan.
-    pub lifespan: u64,
-    /// They had come before.
-    pub duplicated: u64,
+struct Faults {
+    lost: u64,
+    duplicated: u64,
+    reordered: u64,
+}
+
+impl Faults {
+    /// What its subscription left out is missing, too.
+    fn of(counts: &SubscriptionStats) -> Self {
+        Self {
+            lost: counts.lost + counts.queue_dropped + counts.expired,
+            duplicated: counts.duplicated,
+            reordered: counts.reordered,
+        }
+    }
+
+    /// A late message that fills a gap of before lowers no earlier count.
+    fn since(self, before: Self) -> Self {
+        Self {
+            lost: self.lost.saturating_sub(before.lost),
+            duplicated: self.duplicated.saturating_sub(before.duplicated),
+            reordered: self.reordered.saturating_sub(before.reordered),
+        }
+    }
 }
 
 /// Index of a consumer on the board.
@@ -123,13 +141,14 @@ struct PublisherEntry {
 struct ConsumerEntry {
     consumer: Consumer,
     publisher: usize,
-    stats: SubscriptionStats,
+    stats: ConsumerStats,
     active: bool,
     route: Vec<String>,
     on_the_way: DropCounter,
-    at_consumer: ConsumerCounts,
+    /// What its subscription counted.
+    at_consumer: SubscriptionStats,
     dropped_before: BTreeMap<String, u64>,
-    duplicated_before: u64,
+    faults_before: Faults,
 }
 
 /// Adds up counters of bridges that may be made anew, and then count from 0.
@@ -166,10 +185,11 @@ impl DropCounter {
 impl ConsumerEntry {
     fn dropped(&self) -> BTreeMap<String, u64> {
         let mut total = self.on_the_way.total();
-        let ConsumerCounts {
-            queue_full, lifespan, ..
-        } = self.at_consumer;
-        for (reason, count) in [(DropReason::QueueFull, queue_full), (DropReason::Lifespan, lifespan)] {
+        let counts = &self.at_consumer;
+        for (reason, count) in [
+            (DropReason::QueueFull, counts.queue_dropped),
+            (DropReason::Lifespan, counts.expired),
+        ] {
             if count > 0 {
                 *total.entry(reason.as_str().to_owned()).or_default() += count;
             }
@@ -219,13 +239,13 @@ impl Board {
         state.consumers.push(ConsumerEntry {
             consumer,
             publisher,
-            stats: SubscriptionStats::new(now),
+            stats: ConsumerStats::new(now),
             active: true,
             route: Vec::new(),
             on_the_way: DropCounter::default(),
-            at_consumer: ConsumerCounts::default(),
+            at_consumer: SubscriptionStats::default(),
             dropped_before: BTreeMap::new(),
-            duplicated_before: 0,
+            faults_before: Faults::default(),
         });
         Some(ConsumerId(state.consumers.len() - 1))
     }
@@ -239,8 +259,6 @@ impl Board {
             Duration::from_micros(frame.age_us())
         };
         let arrival = Arrival {
-            writer: frame.writer(),
-            sequence: frame.sequence(),
             publish_time_ns: frame.publish_time_ns(),
             latency,
             bytes: frame.payload().len(),
@@ -255,8 +273,8 @@ impl Board {
         }
     }
 
-    /// Takes over what a consumer's own queue left out.
-    pub fn set_consumer_counts(&self, id: ConsumerId, counts: ConsumerCounts) {
+    /// Takes over what a consumer's subscription counted.
+    pub fn set_consumer_counts(&self, id: ConsumerId, counts: SubscriptionStats) {
         if let Some(entry) = self.state.lock().consumers.get_mut(id.0) {
             entry.at_consumer = counts;
         }
@@ -273,21 +291,14 @@ impl Board {
     #[must_use]
     pub fn received(&self, id: ConsumerId) -> u64 {
         let state = self.state.lock();
-        state
-            .consumers
-            .get(id.0)
-            .map_or(0, |entry| entry.stats.counters().received)
+        state.consumers.get(id.0).map_or(0, |entry| entry.stats.received())
     }
 
     /// Messages that all consumers have received.
     #[must_use]
     pub fn received_by_all(&self) -> u64 {
         let state = self.state.lock();
-        state
-            .consumers
-            .iter()
-            .map(|entry| entry.stats.counters().received)
-            .sum()
+        state.consumers.iter().map(|entry| entry.stats.received()).sum()
     }
 
     /// Pictures that came to each consumer outside the publisher's layer, on average.
@@ -300,7 +311,7 @@ impl Board {
                 && entry.consumer.node.layer() != PUBLISHING_NODE.layer()
         };
         let received = state.consumers.iter().filter(is_elsewhere);
-        let received: Vec<u64> = received.map(|entry| entry.stats.counters().received).collect();
+        let received: Vec<u64> = received.map(|entry| entry.stats.received()).collect();
         received.iter().sum::<u64>() as f64 / received.len().max(1) as f64
     }
 
@@ -326,15 +337,14 @@ impl Board {
         } = &mut *state;
         let mut rows = Vec::new();
         for entry in consumers.iter_mut() {
-            let mut period = entry.stats.take_recent(now);
-            let duplicated = entry.at_consumer.duplicated;
-            period.counters.duplicated += duplicated - entry.duplicated_before.min(duplicated);
-            entry.duplicated_before = duplicated;
+            let period = entry.stats.take_recent(now);
+            let faults = Faults::of(&entry.at_consumer);
+            let faults = faults.since(std::mem::replace(&mut entry.faults_before, faults));
             let total = entry.dropped();
             let before = std::mem::replace(&mut entry.dropped_before, total.clone());
             if let Some(publisher) = publishers.get(entry.publisher).filter(|_| entry.active) {
                 let sent = publisher.sent - publisher.sent_before;
-                let mut row = row(publisher, sent, seconds, Some(entry), &period, now);
+                let mut row = row(publisher, sent, seconds, Some(entry), &period, faults, now);
                 row.dropped = difference(&total, &before);
                 rows.push(row);
             }
@@ -365,9 +375,8 @@ impl Board {
             let last = entry.stats.last.map_or(end, |(at, _)| at);
             let until = if entry.active { last.max(end) } else { last };
             let (count, seconds) = sent(publisher);
-            let mut period = entry.stats.total(until);
-            period.counters.duplicated += entry.at_consumer.duplicated;
-            Some(row(publisher, count, seconds, Some(entry), &period, end))
+            let (period, faults) = (entry.stats.total(until), Faults::of(&entry.at_consumer));
+            Some(row(publisher, count, seconds, Some(entry), &period, faults, end))
         });
         heard.chain(unheard(publishers, consumers, end, sent)).collect()
     }
@@ -422,7 +431,15 @@ fn unheard<'a>(
     };
     publishers.iter().filter(nobody).map(move |publisher| {
         let (count, seconds) = sent(publisher);
-        row(publisher, count, seconds, None, &Period::default(), now)
+        row(
+            publisher,
+            count,
+            seconds,
+            None,
+            &Period::default(),
+            Faults::default(),
+            now,
+        )
     })
 }
 
@@ -432,10 +449,10 @@ fn row(
     seconds: f64,
     entry: Option<&ConsumerEntry>,
     period: &Period,
+    faults: Faults,
     end: Instant,
 ) -> TopicRow {
     let rate = |count: u64, seconds: f64| if seconds > 0.0 { count as f64 / seconds } else { 0.0 };
-    let counters = &period.counters;
     TopicRow {
         topic: publisher.topic.name.to_string(),
         from: PUBLISHING_NODE.flow(),
@@ -443,13 +460,13 @@ fn row(
         service: entry.map(|entry| entry.consumer.service),
         route: entry.map(|entry| entry.route.clone()).unwrap_or_default(),
         rate_in_hz: publisher.here.then(|| round(rate(sent, seconds), 2)),
-        rate_out_hz: round(rate(counters.received, period.seconds), 2),
-        bytes_per_s: round(rate(counters.bytes, period.seconds), 0),
+        rate_out_hz: round(rate(period.received, period.seconds), 2),
+        bytes_per_s: round(rate(period.bytes, period.seconds), 0),
         sent: publisher.here.then_some(sent),
-        received: counters.received,
-        lost: counters.lost,
-        duplicated: counters.duplicated,
-        reordered: counters.reordered,
+        received: period.received,
+        lost: faults.lost,
+        duplicated: faults.duplicated,
+        reordered: faults.reordered,
         dropped: entry.map(ConsumerEntry::dropped).unwrap_or_default(),
         latency_ms: LatencyMs {
             p50: period.p50_ms.map(|value| round(value, 3)),

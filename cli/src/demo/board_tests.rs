@@ -34,10 +34,8 @@ fn consumer(service: &'static str, node: DemoNode) -> Consumer {
     }
 }
 
-fn arrival(sequence: u64, published_ms: u64) -> Arrival {
+fn arrival(published_ms: u64) -> Arrival {
     Arrival {
-        writer: WriterId([1; 16]),
-        sequence,
         publish_time_ns: published_ms * 1_000_000,
         latency: Duration::from_millis(2),
         bytes: 300,
@@ -54,7 +52,7 @@ fn rows_show_the_last_second_and_the_whole() {
         .unwrap();
     for index in 0..100 {
         board.published(0, at(index * 20));
-        board.arrived(recorder, &arrival(index + 1, index * 20), at(index * 20 + 1));
+        board.arrived(recorder, &arrival(index * 20), at(index * 20 + 1));
         if index == 49 {
             board.published(1, at(990));
             let rows = board.recent(at(1_000));
@@ -69,19 +67,21 @@ fn rows_show_the_last_second_and_the_whole() {
     }
     let rows = board.recent(at(2_000));
     assert_eq!((rows[0].received, rows[0].sent), (50, Some(50)));
-    let counts = ConsumerCounts {
-        queue_full: 0,
-        lifespan: 3,
-        duplicated: 2,
-    };
+    let mut counts = SubscriptionStats::default();
+    (counts.lost, counts.expired, counts.duplicated, counts.reordered) = (4, 3, 2, 1);
     board.set_consumer_counts(recorder, counts);
     let recent = &board.recent(at(3_000))[0];
-    assert_eq!((recent.duplicated, recent.dropped["lifespan"]), (2, 3));
-    assert_eq!(board.recent(at(4_000))[0].duplicated, 0);
+    // What its own queue left out is missing, too.
+    assert_eq!((recent.lost, recent.duplicated, recent.reordered), (7, 2, 1));
+    assert_eq!(recent.dropped["lifespan"], 3);
+    counts.lost -= 1;
+    board.set_consumer_counts(recorder, counts);
+    let later = &board.recent(at(4_000))[0];
+    assert_eq!((later.lost, later.duplicated, later.reordered), (0, 0, 0));
     let total = board.total(at(2_000));
-    assert_eq!(total[0].duplicated, 2);
+    assert_eq!((total[0].lost, total[0].duplicated, total[0].reordered), (6, 2, 1));
     assert_eq!(total[0].dropped, BTreeMap::from([("lifespan".to_owned(), 3)]));
-    assert_eq!((total[0].received, total[0].sent, total[0].lost), (100, Some(100), 0));
+    assert_eq!((total[0].received, total[0].sent), (100, Some(100)));
     assert!((total[0].latency_ms.p99.unwrap() - 2.0).abs() < 0.25);
     assert_eq!(board.first_message_s(), BTreeMap::from([("cloud", 0.001)]));
 }
@@ -96,9 +96,9 @@ fn the_gap_of_a_move_is_between_messages() {
     let cloud = board
         .add_consumer(consumer(roles::MOVING_SERVICE, DemoNode::Cloud1), start)
         .unwrap();
-    board.arrived(fog, &arrival(1, 100), start);
+    board.arrived(fog, &arrival(100), start);
     assert_eq!(board.moved(), None);
-    board.arrived(cloud, &arrival(4, 160), start);
+    board.arrived(cloud, &arrival(160), start);
     assert_eq!(board.moved(), None, "it has not left the fog");
     board.end_consumer(fog);
     let moved = board.moved().unwrap();
@@ -107,7 +107,7 @@ fn the_gap_of_a_move_is_between_messages() {
         (60.0, "fog/fog-1", "cloud/cloud-1")
     );
     // Side by side for a while: no gap.
-    board.arrived(fog, &arrival(5, 180), start);
+    board.arrived(fog, &arrival(180), start);
     assert_eq!(board.moved().unwrap().gap_ms, 0.0);
     // One that has left has no live row any more, but stays in the summary.
     assert_eq!(

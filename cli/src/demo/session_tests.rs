@@ -1,7 +1,7 @@
 use std::collections::HashMap;
 use std::net::SocketAddr;
 
-use blaze_domain::WriterId;
+use blaze_sdk::SubscriptionStats;
 use parking_lot::Mutex;
 
 use super::*;
@@ -19,6 +19,7 @@ struct Wire {
     topics: Vec<TopicName>,
     /// Every so many messages of the first topic one is left out.
     lose_every: u64,
+    lost: Arc<Mutex<HashMap<ConsumerId, u64>>>,
     changed: Mutex<Vec<Wanted>>,
 }
 
@@ -46,18 +47,18 @@ impl Stage for Wire {
 
     fn publisher(&self) -> Option<Box<dyn FnMut(usize, bytes::Bytes) + Send>> {
         let (board, listening, lose_every) = (Arc::clone(&self.board), Arc::clone(&self.listening), self.lose_every);
-        let mut sequences: HashMap<usize, u64> = HashMap::new();
-        let mut published = 0;
+        let lost = Arc::clone(&self.lost);
+        let (mut published, mut of_first): (u64, u64) = (0, 0);
         Some(Box::new(move |topic, payload| {
-            let sequence = sequences.entry(topic).or_default();
-            *sequence += 1;
             published += 1;
-            if topic == 0 && sequence.is_multiple_of(lose_every) {
+            of_first += u64::from(topic == 0);
+            if topic == 0 && of_first.is_multiple_of(lose_every) {
+                for id in listening.lock().get(&topic).into_iter().flatten() {
+                    *lost.lock().entry(*id).or_default() += 1;
+                }
                 return;
             }
             let arrival = Arrival {
-                writer: WriterId([topic as u8; 16]),
-                sequence: *sequence,
                 publish_time_ns: published * 1_000_000,
                 latency: Duration::from_micros(100),
                 bytes: payload.len(),
@@ -90,7 +91,13 @@ impl Stage for Wire {
         }
     }
 
-    async fn look(&self) {}
+    async fn look(&self) {
+        for (id, lost) in &*self.lost.lock() {
+            let mut counts = SubscriptionStats::default();
+            counts.lost = *lost;
+            self.board.set_consumer_counts(*id, counts);
+        }
+    }
 
     async fn interrupted(&self) -> Option<String> {
         std::future::pending().await
@@ -115,6 +122,7 @@ async fn run_with(
         listening: Arc::default(),
         topics: topics.iter().map(|topic| topic.name.clone()).collect(),
         lose_every,
+        lost: Arc::default(),
         changed: Mutex::default(),
     };
     let script = Script {

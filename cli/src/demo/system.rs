@@ -15,7 +15,7 @@ use futures::future::join_all;
 use tokio::sync::Mutex;
 
 use super::analytics::Analytics;
-use super::board::{Board, ConsumerCounts, ConsumerId};
+use super::board::{Board, ConsumerId};
 use super::changes::{Taken, Wanted};
 use super::configuration::Configuration;
 use super::nodes::Nodes;
@@ -226,9 +226,7 @@ impl Stage for EndableSystem {
             return Ok(());
         };
         let withdrawn = listener.lease.withdraw().await;
-        self.system
-            .board
-            .set_consumer_counts(id, counts_of(&listener.subscription));
+        self.system.board.set_consumer_counts(id, listener.subscription.stats());
         listener.subscription.close().await;
         withdrawn.map_err(|error| error.to_string())
     }
@@ -249,21 +247,12 @@ impl Stage for EndableSystem {
         for (id, listener) in self.system.listeners.lock().await.iter() {
             self.system
                 .board
-                .set_consumer_counts(*id, counts_of(&listener.subscription));
+                .set_consumer_counts(*id, listener.subscription.stats());
         }
     }
 
     async fn interrupted(&self) -> Option<String> {
         self.ends.wait().await
-    }
-}
-
-fn counts_of(subscription: &Subscription) -> ConsumerCounts {
-    let stats = subscription.stats();
-    ConsumerCounts {
-        queue_full: stats.queue_dropped,
-        lifespan: stats.expired,
-        duplicated: stats.duplicated,
     }
 }
 

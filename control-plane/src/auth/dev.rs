@@ -135,7 +135,7 @@ mod tests {
         ] {
             assert!(origin_is_foreign(origin, host), "{origin} {host}");
         }
-        assert!(claims().has_role(Role::Admin));
+        assert_eq!(claims().roles, ["admin", "worker"]);
     }
 
     proptest! {

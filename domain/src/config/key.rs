@@ -3,8 +3,6 @@
 use std::fmt;
 use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
-
 use crate::names::{DocumentName, LayerName, NameError, NodeName, ServiceName};
 use crate::qos::{UnknownWord, word_enum};
 

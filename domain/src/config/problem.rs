@@ -6,26 +6,17 @@ use serde::Serialize;
 use serde_json::{Map, Value, json};
 
 use super::Code;
+use crate::qos::word_enum;
 
-/// Whether a refused change took effect.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Applied {
-    /// It did not.
-    No,
-    /// Nobody knows: look before trying again.
-    Unknown,
-}
-
-impl Applied {
-    /// The word on the wire.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::No => "no",
-            Self::Unknown => "unknown",
-        }
+word_enum!(
+    /// Whether a refused change took effect.
+    Applied {
+        /// It did not.
+        No = "no",
+        /// Nobody knows: look before trying again.
+        Unknown = "unknown",
     }
-}
+);
 
 /// One fault of several.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]

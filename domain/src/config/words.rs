@@ -1,11 +1,6 @@
 //! The words that services and workers exchange.
 
-use std::fmt;
-use std::str::FromStr;
-
-use serde::{Deserialize, Serialize};
-
-use crate::qos::{UnknownWord, word_enum};
+use crate::qos::word_enum;
 
 word_enum!(
     /// How a service gets on with its configuration.

@@ -1,11 +1,6 @@
 //! Closed sets of the control protocol.
 
-use std::fmt;
-use std::str::FromStr;
-
-use serde::{Deserialize, Serialize};
-
-use crate::qos::{UnknownWord, word_enum};
+use crate::qos::word_enum;
 
 word_enum!(
     /// What a lease says: its holder publishes the topic, or wants it.

@@ -1,18 +1,15 @@
 //! `brokers`: what the node's services, its layer and the other layers are reached over.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::net::Ipv4Addr;
 use std::path::PathBuf;
-use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::readers::{formed, free_text, parsed, path, text, whole};
 use super::walk::{Node, Section};
 use super::{SecretText, TopicPattern, url};
-use crate::qos::{UnknownWord, word_enum};
+use crate::qos::word_enum;
 
 /// Highest DDS domain whose ports stay below the range that systems give out by themselves.
 pub const MAX_DDS_DOMAIN: u16 = 100;

@@ -1,17 +1,13 @@
 //! `control_plane`: the main service of the configuration.
 
-use std::fmt;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::str::FromStr;
-
-use serde::{Deserialize, Serialize};
 
 use super::readers::{boolean, parsed, path, text, whole};
 use super::services::{loopback, mongodb, socket};
 use super::walk::{Node, Section, from_empty};
 use super::{SecretText, url};
-use crate::qos::{UnknownWord, word_enum};
+use crate::qos::word_enum;
 
 /// `control_plane`.
 #[derive(Debug, Clone, PartialEq)]

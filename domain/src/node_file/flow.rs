@@ -1,16 +1,12 @@
 //! `flow`: bandwidth, compression and rules of topics.
 
 use std::collections::BTreeMap;
-use std::fmt;
-use std::str::FromStr;
-
-use serde::{Deserialize, Serialize};
 
 use super::readers::{boolean, number, parsed, whole};
 use super::walk::{Node, Section, from_empty};
 use super::{AccessRules, AutoBool, MAX_BYTES, TopicPattern, auto_bool};
 use crate::names::{LayerName, TopicName};
-use crate::qos::{Priority, UnknownWord, word_enum};
+use crate::qos::{Priority, word_enum};
 
 /// What one Mbit/s of the file is, in bytes per second: 1024² bit.
 const BYTES_PER_MBIT: f64 = 1024.0 * 1024.0 / 8.0;

@@ -3,11 +3,8 @@
 //! It is read with the same strictness as a node file, and its `bandwidth` is the section of one.
 
 use std::collections::BTreeSet;
-use std::fmt;
 use std::path::PathBuf;
-use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::flow::BandwidthSection;
@@ -17,7 +14,7 @@ use super::{Fault, MAX_BYTES};
 use crate::MAX_RATE_HZ;
 use crate::identity::FlowId;
 use crate::names::{LayerName, NodeName, TopicName};
-use crate::qos::{UnknownWord, word_enum};
+use crate::qos::word_enum;
 
 /// Most publishers of a topic on one flow.
 const MAX_WRITERS: u32 = 10_000;

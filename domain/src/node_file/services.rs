@@ -1,17 +1,13 @@
 //! Sections of the worker, the monitor and of every program: `admin`, `log`, `config`, `cache`, `database`.
 
-use std::fmt;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
-use std::str::FromStr;
-
-use serde::{Deserialize, Serialize};
 
 use super::readers::{formed, parsed, path, text, whole};
 use super::walk::{Node, Section, from_empty};
 use super::{AutoBool, RedisBroker, SecretText, auto_bool, url};
 use crate::names::TopicName;
-use crate::qos::{UnknownWord, word_enum};
+use crate::qos::word_enum;
 
 /// Where each program answers `/livez`, `/readyz` and `/metrics`.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -137,12 +137,6 @@ fn documents_are_counted() {
 }
 
 #[test]
-fn a_second_document_does_not_know_the_first() {
-    assert_eq!(read("a: 1\n---\na: 2\n"), [json!({ "a": 1 }), json!({ "a": 2 })]);
-    assert_eq!(faults("a: [\n---\nb: 1\n").len(), 1);
-}
-
-#[test]
 fn large_texts_take_time_in_proportion() {
     // Each of many values below a long key: the path must not be put together for each.
     let rows = "  - {v: 1}\n".repeat(50_000);

@@ -17,18 +17,16 @@ mod sections;
 #[cfg(test)]
 mod tests;
 
-use std::fmt;
 use std::io;
 use std::net::IpAddr;
-use std::str::FromStr;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use serde_json::Value;
 
 use super::selector::{check_label_key, check_label_value, is_dns_name};
 use super::{Document, FieldFault, Key, Kind, Labels, MAX_DEPTH, MAX_LABELS, MAX_SCHEMA_BYTES, json, secret};
 use crate::names::{LayerName, NodeName};
-use crate::qos::{LayerKind, UnknownWord, word_enum};
+use crate::qos::{LayerKind, word_enum};
 use configuration::{check_configurations, check_program};
 use fields::{At, Faults, Fields};
 use rollout::check_rollout;
