@@ -30,12 +30,6 @@ const REMEMBERED: NonZeroUsize = NonZeroUsize::MIN.saturating_add(65_535);
 /// Bytes of bodies that are being received, of all clients together (512 MiB).
 const RECEIVING_BYTES: usize = 512 * 1024 * 1024;
 
-/// A place among the requests at work; free again when dropped.
-#[derive(Debug)]
-pub struct InFlight {
-    _permit: OwnedSemaphorePermit,
-}
-
 /// One of a subject's watches; free again when dropped.
 #[derive(Debug)]
 pub struct WatchSlot {
@@ -98,15 +92,13 @@ impl ApiLimits {
         }))
     }
 
-    /// A place among the requests at work, for one whose body is there.
+    /// A place among the requests at work, for one whose body is there; free again when dropped.
     ///
     /// # Errors
     /// `overloaded` if all are taken.
-    pub fn enter(&self) -> Result<InFlight, Problem> {
-        match Arc::clone(&self.in_flight).try_acquire_owned() {
-            Ok(permit) => Ok(InFlight { _permit: permit }),
-            Err(_) => Err(overloaded("the service works on as many requests as it may: try again")),
-        }
+    pub fn enter(&self) -> Result<OwnedSemaphorePermit, Problem> {
+        let place = Arc::clone(&self.in_flight).try_acquire_owned();
+        place.map_err(|_| overloaded("the service works on as many requests as it may: try again"))
     }
 
     /// Counts a request of a subject.

@@ -237,12 +237,6 @@ impl Authenticator {
         Some(blaze_auth::sign(&self.shared.realm, Some(id), key, token))
     }
 
-    /// Whether there is a key that signs.
-    #[must_use]
-    pub fn can_sign(&self) -> bool {
-        self.shared.active.load().signer.is_some()
-    }
-
     /// Whether there is any key to check tokens with; keys from a URL may not have come yet.
     #[must_use]
     pub fn has_keys(&self) -> bool {

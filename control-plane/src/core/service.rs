@@ -11,7 +11,6 @@ mod write;
 
 use std::net::IpAddr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use blaze_domain::config::selector::LabelSelector;
@@ -140,7 +139,6 @@ impl ConfigService {
             log: Arc::clone(&log),
             revocations: options.revocations.clone(),
             ending: CancellationToken::new(),
-            open: Arc::new(AtomicUsize::new(0)),
         });
         let service = Self {
             inner: Arc::new(Inner {
@@ -234,12 +232,6 @@ impl ConfigService {
     #[must_use]
     pub fn store_id(&self) -> &str {
         &self.inner.store_id
-    }
-
-    /// Watches that are open.
-    #[must_use]
-    pub fn watchers(&self) -> usize {
-        self.inner.watches.open.load(Ordering::Relaxed)
     }
 
     /// Ends all watches; those that are opened later end at once.

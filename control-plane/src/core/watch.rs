@@ -5,16 +5,13 @@
 //! ```
 
 use std::collections::VecDeque;
-use std::pin::Pin;
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
-use std::task::{Context, Poll};
 use std::time::Duration;
 
 use blaze_domain::config::selector::LabelSelector;
 use blaze_domain::config::{Code, Document, Key, Kind, Problem};
 use blaze_domain::{LayerName, ServiceName};
-use futures::Stream;
+use futures::StreamExt as _;
 use futures::stream::BoxStream;
 use rand::RngExt as _;
 use tokio::sync::watch;
@@ -173,29 +170,10 @@ pub(crate) struct Watches {
     pub(crate) revocations: Revocations,
     /// Cancelled when streams shall end.
     pub(crate) ending: CancellationToken,
-    pub(crate) open: Arc<AtomicUsize>,
-}
-
-/// A watch that counts as open.
-struct Open(Arc<AtomicUsize>);
-
-impl Drop for Open {
-    fn drop(&mut self) {
-        self.0.fetch_sub(1, Ordering::Relaxed);
-    }
 }
 
 /// What a watcher gets, until [`WatchItem::End`].
-pub struct WatchStream {
-    items: BoxStream<'static, WatchItem>,
-}
-
-impl Stream for WatchStream {
-    type Item = WatchItem;
-    fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<WatchItem>> {
-        self.items.as_mut().poll_next(context)
-    }
-}
+pub type WatchStream = BoxStream<'static, WatchItem>;
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Stage {
@@ -232,7 +210,6 @@ struct Watcher {
     head: watch::Receiver<u64>,
     revoked: watch::Receiver<u64>,
     stage: Stage,
-    _open: Open,
 }
 
 impl Watches {
@@ -256,7 +233,6 @@ impl Watches {
     }
 
     fn stream(self: &Arc<Self>, caller: &Caller, filter: Filter, since: u64, life: u64, patient: bool) -> WatchStream {
-        self.open.fetch_add(1, Ordering::Relaxed);
         let watcher = Watcher {
             shared: Arc::clone(self),
             everything: filter.is_everything(),
@@ -276,16 +252,13 @@ impl Watches {
             head: self.log.subscribe(),
             revoked: self.revocations.changed(),
             stage: Stage::Running,
-            _open: Open(Arc::clone(&self.open)),
         };
         let start = futures::stream::iter([WatchItem::Bookmark(since)]);
         let rest = futures::stream::unfold(watcher, |mut watcher| async move {
             let item = watcher.next().await?;
             Some((item, watcher))
         });
-        WatchStream {
-            items: Box::pin(futures::StreamExt::chain(start, rest)),
-        }
+        start.chain(rest).boxed()
     }
 }
 

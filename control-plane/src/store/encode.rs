@@ -9,6 +9,7 @@
 //!
 //! What users write is inside of JSON texts: no key of theirs becomes a column, nor a member that the database looks at.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::sync::Arc;
@@ -280,63 +281,49 @@ impl TokenRow {
 }
 
 /// A document but for its key.
-#[derive(Serialize)]
-struct Written<'a> {
-    uid: &'a str,
+#[derive(Serialize, Deserialize)]
+struct Stored<'a> {
+    uid: Cow<'a, str>,
     revision: u64,
     create_time: i64,
     update_time: i64,
-    updated_by: &'a str,
-    labels: &'a Labels,
-    annotations: &'a Labels,
-    spec: &'a Value,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    status: Option<&'a Value>,
-}
-
-#[derive(Deserialize)]
-struct Read {
-    uid: String,
-    revision: u64,
-    create_time: i64,
-    update_time: i64,
-    updated_by: String,
-    labels: Labels,
-    annotations: Labels,
-    spec: Value,
-    #[serde(default)]
-    status: Option<Value>,
+    updated_by: Cow<'a, str>,
+    labels: Cow<'a, Labels>,
+    annotations: Cow<'a, Labels>,
+    spec: Cow<'a, Value>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    status: Option<Cow<'a, Value>>,
 }
 
 /// A document as JSON, without its key.
 pub(crate) fn document_text(document: &Document) -> Result<String, StoreError> {
-    json(&Written {
-        uid: &document.uid,
+    json(&Stored {
+        uid: Cow::Borrowed(&document.uid),
         revision: document.revision,
         create_time: document.create_time.as_millis(),
         update_time: document.update_time.as_millis(),
-        updated_by: &document.updated_by,
-        labels: &document.labels,
-        annotations: &document.annotations,
-        spec: &document.spec,
-        status: document.status.as_ref(),
+        updated_by: Cow::Borrowed(&document.updated_by),
+        labels: Cow::Borrowed(&document.labels),
+        annotations: Cow::Borrowed(&document.annotations),
+        spec: Cow::Borrowed(&document.spec),
+        status: document.status.as_ref().map(Cow::Borrowed),
     })
 }
 
 /// The document that [`document_text`] wrote.
 pub(crate) fn document(key: Key, text: &str) -> Result<Document, StoreError> {
-    let read: Read = serde_json::from_str(text).map_err(|error| corrupt(format_args!("{key}: {error}")))?;
+    let read: Stored<'_> = serde_json::from_str(text).map_err(|error| corrupt(format_args!("{key}: {error}")))?;
     Ok(Document {
         key,
-        uid: read.uid,
+        uid: read.uid.into_owned(),
         revision: read.revision,
         create_time: Timestamp::from_millis(read.create_time),
         update_time: Timestamp::from_millis(read.update_time),
-        updated_by: read.updated_by,
-        labels: read.labels,
-        annotations: read.annotations,
-        spec: Arc::new(read.spec),
-        status: read.status,
+        updated_by: read.updated_by.into_owned(),
+        labels: read.labels.into_owned(),
+        annotations: read.annotations.into_owned(),
+        spec: Arc::new(read.spec.into_owned()),
+        status: read.status.map(Cow::into_owned),
     })
 }
 

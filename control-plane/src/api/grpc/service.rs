@@ -6,13 +6,14 @@ use std::sync::atomic::Ordering;
 use blaze_domain::config::{Applied, Code, Key, Problem};
 use blaze_proto::v1::config_service_server;
 use blaze_proto::{Message, v1};
+use tokio::sync::OwnedSemaphorePermit;
 use tonic::metadata::MetadataValue;
 use tonic::{Request, Response, Status};
 
 use super::gate::{self, Call};
 use super::operations::{Done, Operations};
 use super::{MAX_MESSAGE_BYTES, incoming, status, watch};
-use crate::api::limits::{ApiLimits, InFlight};
+use crate::api::limits::ApiLimits;
 use crate::core::{Answer, ConfigService, ReadOptions};
 use crate::metrics::ApiMetrics;
 
@@ -53,7 +54,7 @@ impl Call {
 
 impl Service {
     /// The caller that the gate let through, the message, and a place to work on it.
-    fn open<T>(&self, request: Request<T>) -> Result<(Call, T, InFlight), Status> {
+    fn open<T>(&self, request: Request<T>) -> Result<(Call, T, OwnedSemaphorePermit), Status> {
         let (call, message) = Call::open(request)?;
         match self.limits.enter() {
             Ok(place) => Ok((call, message, place)),

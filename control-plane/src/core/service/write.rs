@@ -20,6 +20,7 @@ use super::super::view::{authorize_whole, view};
 use super::super::watch::trimmed;
 use super::{ConfigService, selector};
 use crate::auth::Right;
+use crate::store::migrate::hex;
 use crate::store::{Change, Op};
 
 /// Documents of one `apply`, at most.
@@ -543,8 +544,4 @@ fn once(caller: &Caller, idempotency: &Idempotency) -> Once {
         id: hex(&Sha256::digest(text.as_bytes())),
         body: hex(&idempotency.body),
     }
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
