@@ -65,17 +65,8 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
     let now = Instant::now();
     let id = core.intern(&topic, now).unwrap();
     let lane = LaneSpec {
-        max_rate_hz: None,
-        lifespan_ms: 0,
-        reliable: false,
-        durable: false,
         depth: 1,
-        priority: None,
-        from: Vec::new(),
-        degraded: None,
-        relays: Vec::new(),
-        shared: None,
-        held: false,
+        ..LaneSpec::default()
     };
     let plan = TopicPlan {
         bridges: vec![Bridge {
@@ -83,8 +74,7 @@ fn measure(batch_size: usize, bare: bool) -> f64 {
             to: Target::Layer,
             lane,
         }],
-        blocked: Vec::new(),
-        carrier: None,
+        ..TopicPlan::default()
     };
     let counter = Arc::new(Counter::default());
     core.apply(now, id, TopicInfo::default(), &plan, |_| {
