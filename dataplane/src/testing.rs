@@ -3,7 +3,9 @@
 use std::time::{Duration, Instant};
 
 use blaze_domain::FlowId;
+use blaze_domain::node_file::{AccessRules, NodeFile};
 use blaze_proto::link::link_control::{Delta, Entry, Hello, Kind, State};
+use serde_json::{Value, json};
 
 use crate::codec::pool::Spawner;
 
@@ -71,6 +73,15 @@ pub(crate) fn eventually(mut holds: impl FnMut() -> bool) {
 /// Starts plain threads.
 pub(crate) fn on_threads() -> Spawner {
     Box::new(|name, run| std::thread::Builder::new().name(name).spawn(run).map(|_| ()))
+}
+
+/// What a node file with these rules in `flow.access` says.
+pub(crate) fn access(rules: &Value) -> AccessRules {
+    let file = json!({
+        "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "robot-1"}, "brokers": {"node": {"memory": {}}},
+        "flow": {"access": rules},
+    });
+    NodeFile::read(&file).unwrap().0.flow.access
 }
 
 /// The changes of one version, in one part.

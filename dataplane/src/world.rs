@@ -8,6 +8,8 @@ use std::time::Duration;
 
 use blaze_domain::node_file::{AccessRules, AutoBool};
 use blaze_domain::{Durability, FlowId, LayerKind, LayerName, Priority, Reliability, TopicName};
+use blaze_proto::link::link_control::State;
+use serde::Serialize;
 use sha2::{Digest, Sha256};
 
 /// All flows that one flow knows, itself included.
@@ -48,6 +50,26 @@ pub struct FlowView {
     pub role: Role,
     /// The broker of its layer has not answered it for some seconds: another flow of its group serves that better.
     pub layer_away: bool,
+}
+
+impl FlowView {
+    /// A flow that has said nothing but which kind and life it is.
+    pub(crate) fn new(kind: LayerKind, epoch: u64) -> Self {
+        Self {
+            kind,
+            epoch,
+            state: FlowState::Starting,
+            reach: Reach::Up,
+            node_scope: false,
+            layer_scope: None,
+            topics: BTreeMap::new(),
+            settled: false,
+            parts: BTreeMap::new(),
+            gateway: AutoBool::Auto,
+            role: Role::Gateway,
+            layer_away: false,
+        }
+    }
 }
 
 /// Whether a flow is on the inter scope for the flows that share its layer broker.
@@ -173,15 +195,27 @@ impl LayerScopeId {
     }
 }
 
-/// What a flow says of itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+/// What a flow says of itself: it begins, is ready, and goes, never the other way round in one life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum FlowState {
     /// It has not yet read its leases and listened for peers.
+    #[default]
     Starting,
     /// It carries topics.
     Ready,
     /// It is going away: it takes in nothing more.
     Draining,
+}
+
+impl From<FlowState> for State {
+    fn from(state: FlowState) -> Self {
+        match state {
+            FlowState::Starting => Self::Starting,
+            FlowState::Ready => Self::Ready,
+            FlowState::Draining => Self::Draining,
+        }
+    }
 }
 
 /// Whether a flow can be reached.
@@ -322,6 +356,12 @@ impl World {
     #[must_use]
     pub fn own(&self) -> Option<&FlowView> {
         self.flows.get(&self.me)
+    }
+
+    /// Whether a flow carries topics, as far as the own flow knows. Of itself it knows that it lives.
+    pub(crate) fn carries(&self, id: &FlowId) -> bool {
+        let flow = self.flows.get(id);
+        flow.is_some_and(|flow| flow.state == FlowState::Ready && (flow.reach != Reach::Down || *id == self.me))
     }
 
     /// The flows of one layer, by node.

@@ -166,17 +166,19 @@ fn document_from(value: &Value) -> Option<Document> {
     })
 }
 
+type KeptPlace = (
+    Option<ServiceName>,
+    Option<InstanceName>,
+    Option<LayerName>,
+    Option<NodeName>,
+);
+
 /// An answer of `apply` as it is kept.
 #[derive(Serialize, Deserialize)]
 struct Kept {
     revision: u64,
     results: Vec<KeptResult>,
-    affected: Vec<(
-        Option<ServiceName>,
-        Option<InstanceName>,
-        Option<LayerName>,
-        Option<NodeName>,
-    )>,
+    affected: Vec<KeptPlace>,
     affected_total: u64,
 }
 

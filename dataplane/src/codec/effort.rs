@@ -150,12 +150,6 @@ impl Effort {
         self.step == 0 || self.incompressible
     }
 
-    /// Whether they do because they do not become smaller.
-    #[must_use]
-    pub fn is_incompressible(&self) -> bool {
-        self.incompressible
-    }
-
     /// How often the level has changed.
     #[must_use]
     pub fn changes(&self) -> u64 {

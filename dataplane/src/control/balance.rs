@@ -83,7 +83,8 @@ struct Gift {
 /// What the core remembers of loads and moves.
 #[derive(Debug, Default)]
 pub(super) struct Balance {
-    own: Load,
+    /// How much this flow carries.
+    pub(super) own: Load,
     /// Topics that this flow got by load, and since when.
     got: BTreeMap<TopicName, Instant>,
     /// Topics that were taken back: they stay until then.
@@ -99,16 +100,6 @@ pub(super) struct Balance {
 }
 
 impl Balance {
-    /// Topics that went to other flows.
-    pub(super) fn moves(&self) -> &Moves {
-        &self.moves
-    }
-
-    /// How much this flow carries.
-    pub(super) fn own(&self) -> Load {
-        self.own
-    }
-
     /// This flow was given a topic by load.
     pub(super) fn note_got(&mut self, now: Instant, topic: &TopicName) {
         self.got.insert(topic.clone(), now);
@@ -218,13 +209,13 @@ impl ControlCore {
     /// Topics that went to other flows of the layer since the start.
     #[must_use]
     pub fn moves(&self) -> &Moves {
-        self.balance.moves()
+        &self.balance.moves
     }
 
     /// How much this flow carries, as the others are told.
     #[must_use]
     pub fn load(&self) -> Load {
-        self.balance.own()
+        self.balance.own
     }
 
     /// What weighs something, or was placed by load, stays until it is given away by load.

@@ -41,9 +41,10 @@ const ENTER: Duration = Duration::from_secs(1);
 const LEAVE: Duration = Duration::from_secs(2);
 
 /// Where a flow is on its way to the inter scope and from there.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Stage {
     /// It listens on the channel of the layer broker who is there.
+    #[default]
     Listening,
     /// It joins the inter scope, and listens there once it has.
     Joining {
@@ -81,7 +82,7 @@ impl Stage {
 }
 
 /// What the core remembers of it.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Gateways {
     stage: Stage,
     /// Since when the channel of the layer broker is heard.
@@ -118,13 +119,7 @@ impl Gateways {
         };
         Self {
             stage,
-            heard_since: None,
-            left: None,
-            choice: None,
-            cannot: false,
-            cut_off: None,
-            entered: None,
-            shown: FlowState::Starting,
+            ..Self::default()
         }
     }
 

@@ -29,6 +29,7 @@ use blaze_domain::{FlowId, Scope, TopicName};
 use bytes::Bytes;
 
 use crate::link::LinkEvent;
+use crate::link::transport::Endpoint;
 use crate::plan::{PlanRules, TopicPlan};
 use crate::registry::{EventDraft, Registry, RegistryConfig};
 use crate::world::{FlowState, OriginFilter, Reach, World};
@@ -239,12 +240,12 @@ impl ControlCore {
                 self.registry.on_hello(now, &from, &hello)
             }
             LinkEvent::Control { from, body } => self.registry.on_control(now, &from, body),
-            LinkEvent::PeerUp { flow, .. } | LinkEvent::PeerRecovered { flow } => {
+            LinkEvent::PeerUp(Endpoint { flow, .. }) | LinkEvent::PeerRecovered { flow } => {
                 self.registry.set_reach(now, &flow, Reach::Up)
             }
             LinkEvent::PeerSuspect { flow } => self.registry.set_reach(now, &flow, Reach::Suspect),
-            LinkEvent::PeerDown { flow, .. } => self.registry.set_reach(now, &flow, Reach::Down),
-            LinkEvent::PeerForgotten { flow, .. } => {
+            LinkEvent::PeerDown { endpoint, .. } => self.registry.set_reach(now, &endpoint.flow, Reach::Down),
+            LinkEvent::PeerForgotten(Endpoint { flow, .. }) => {
                 self.addresses.remove(&flow);
                 self.registry.forget_link(now, &flow)
             }

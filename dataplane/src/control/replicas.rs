@@ -9,15 +9,15 @@
 
 use std::time::{Duration, Instant};
 
+use blaze_domain::FlowId;
 use blaze_domain::node_file::AutoBool;
-use blaze_domain::{FlowId, LayerKind};
 use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Body, Channel, Egress, Gateway, Goodbye, Hello, Kind, LayerScope, State};
+use blaze_proto::link::link_control::{Body, Channel, Egress, Gateway, Goodbye, Hello, LayerScope, State};
 use bytes::Bytes;
 use prost::Message as _;
 
 use super::{ControlCore, LISTEN, Output};
-use crate::world::FlowState;
+use crate::link::kind_to_wire;
 
 /// Between two Hellos.
 const HELLO_EVERY: Duration = Duration::from_millis(500);
@@ -165,16 +165,6 @@ impl ControlCore {
     }
 
     fn hello(&self) -> Hello {
-        let kind = match self.config.kind {
-            LayerKind::Edge => Kind::Edge,
-            LayerKind::Fog => Kind::Fog,
-            LayerKind::Cloud => Kind::Cloud,
-        };
-        let state = match self.state {
-            FlowState::Starting => State::Starting,
-            FlowState::Ready => State::Ready,
-            FlowState::Draining => State::Draining,
-        };
         let scope = self.registry.world().own().and_then(|own| own.layer_scope);
         let shown = self.config.replicas.filter(|_| scope.is_some());
         let (registry_version, registry_digest) = self.registry.announced_on_layer();
@@ -183,15 +173,15 @@ impl ControlCore {
             AutoBool::Yes => Gateway::Always,
             AutoBool::No => Gateway::Never,
         };
-        let load = self.balance.own();
+        let load = self.balance.own;
         Hello {
             layer: self.config.me.layer.to_string(),
             node: self.config.me.node.to_string(),
-            kind: kind.into(),
+            kind: kind_to_wire(self.config.kind).into(),
             epoch: self.epoch(),
             registry_version,
             registry_digest,
-            state: state.into(),
+            state: State::from(self.state).into(),
             layer_scope: shown.unwrap_or(LayerScope::None).into(),
             gateway: gateway.into(),
             is_gateway: self.gateways.role().is_gateway(),

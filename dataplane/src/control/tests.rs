@@ -6,13 +6,16 @@ mod replicas;
 
 use blaze_domain::LayerKind;
 use blaze_domain::node_file::{AccessRules, AutoBool};
-use blaze_proto::link::link_control::{Body, LayerScope};
+use blaze_proto::link::LinkControl;
+use blaze_proto::link::link_control::{Body, Channel, Entry, Hello, Kind, LayerScope, Request};
+use prost::Message as _;
 use serde_json::{Value, json};
 
 use super::routes::route_states;
 use super::*;
 use crate::plan::Bridge;
 use crate::registry::{LapseReason, LayerNames};
+use crate::testing::{access, delta, hello_of};
 use crate::world::{LayerScopeId, SETTLED_AFTER};
 
 struct Bench {
@@ -51,11 +54,16 @@ impl Bench {
         }
     }
 
+    /// Nothing is kept by its brokers.
+    fn read_leases(&mut self) {
+        for scope in LOCAL {
+            self.core.restore_leases(self.now, scope, &[]);
+        }
+    }
+
     fn ready() -> Self {
         let mut bench = Self::new();
-        for scope in LOCAL {
-            bench.core.restore_leases(bench.now, scope, &[]);
-        }
+        bench.read_leases();
         bench.step(0);
         assert_eq!(bench.core.state(), FlowState::Ready);
         bench
@@ -68,9 +76,7 @@ impl Bench {
             gateway: AutoBool::Yes,
             ..config
         });
-        for scope in LOCAL {
-            bench.core.restore_leases(bench.now, scope, &[]);
-        }
+        bench.read_leases();
         // It listens for others, and nobody is there.
         for _ in 0..50 {
             bench.step(100);
@@ -94,15 +100,48 @@ impl Bench {
         self.outputs.extend(std::iter::from_fn(|| self.core.poll()));
     }
 
+    /// What was wanted of a kind since the last call.
+    fn wanted<T>(&mut self, of: impl FnMut(Output) -> Option<T>) -> Vec<T> {
+        self.outputs.drain(..).filter_map(of).collect()
+    }
+
     /// What was asked of brokers' channels since the last call.
     fn channels(&mut self) -> Vec<String> {
-        let outputs = std::mem::take(&mut self.outputs);
-        let text = |output| match output {
+        self.wanted(|output| match output {
             Output::Prepare { scope, channel, depth } => Some(format!("+{scope} {channel} {depth}")),
             Output::Release { scope, channel } => Some(format!("-{scope} {channel}")),
             _ => None,
+        })
+    }
+
+    fn wants(&self, wanted: impl Fn(&Output) -> bool) -> bool {
+        self.outputs.iter().any(wanted)
+    }
+
+    /// A flow elsewhere says Hello over the link, and announces a version of what it has.
+    fn link_says(&mut self, hello: Hello, version: u64, entries: Vec<Entry>) {
+        let from: FlowId = format!("{}/{}", hello.layer, hello.node).parse().unwrap();
+        let body = Body::Delta(delta(version, entries));
+        let hello = Box::new(hello);
+        let told = from.clone();
+        self.core.link_event(self.now, LinkEvent::Hello { from, hello });
+        self.core.link_event(self.now, LinkEvent::Control { from: told, body });
+    }
+
+    /// `fog/fog-2` says something on the channel of the layer broker. Whether that is a reason to work.
+    fn fog_2_says(&mut self, body: Body, appended_ms: Option<i64>) -> bool {
+        let channel = Channel {
+            from: FOG_2.to_owned(),
+            epoch: 1,
+            began: 1,
+            to: String::new(),
         };
-        outputs.into_iter().filter_map(text).collect()
+        let message = LinkControl {
+            body: Some(body),
+            channel: Some(channel),
+        };
+        let read = read_replica_message(&message.encode_to_vec());
+        self.core.replica_message(self.now, read, appended_ms)
     }
 
     fn bridges(&self, topic: &str) -> Vec<String> {
@@ -115,6 +154,18 @@ impl Bench {
         let plan = &self.core.plans()[&topic.parse::<TopicName>().unwrap()];
         let states = route_states(&self.core.config.me, plan, |scope| self.core.scopes.health(scope));
         states.into_iter().map(|state| (state.step, state.code)).collect()
+    }
+}
+
+/// The other flow of the layer.
+const FOG_2: &str = "fog/fog-2";
+
+/// An announcement that services of a node ask for a topic.
+fn asks_for(topic: &str) -> Entry {
+    Entry {
+        topic: topic.to_owned(),
+        node_request: Some(Request::default()),
+        ..Entry::default()
     }
 }
 
@@ -140,15 +191,9 @@ fn a_flow_is_starting_until_all_kept_leases_are_read() {
     assert_eq!(bench.core.state(), FlowState::Ready);
     bench.step(300);
     assert_eq!(bench.bridges("imu/data"), ["node>Layer"]);
-    let told = bench
-        .outputs
-        .iter()
-        .filter(|output| matches!(output, Output::Publish { .. }));
-    let events: Vec<String> = told.map(|output| format!("{output:?}")).collect();
-    assert!(
-        events.iter().all(|event| event.contains("route_up")),
-        "no refusal, no answer: {events:?}"
-    );
+    let other =
+        |output: &Output| matches!(output, Output::Publish { .. }) && !format!("{output:?}").contains("route_up");
+    assert!(!bench.wants(other), "no refusal, no answer: {:?}", bench.outputs);
     assert_eq!(bench.channels(), ["+node imu/data 0", "+layer imu/data 0"]);
 }
 
@@ -160,11 +205,10 @@ fn others_are_told_of_a_layer_broker_that_does_not_answer_for_seconds() {
         bench.core.set_scope_health(bench.now, Scope::Layer, health);
         bench.step(ms);
         bench.step(0);
-        let away = bench.outputs.iter().filter_map(|output| match output {
-            Output::LayerAway(away) => Some(*away),
+        bench.wanted(|output| match output {
+            Output::LayerAway(away) => Some(away),
             _ => None,
-        });
-        away.collect::<Vec<_>>()
+        })
     };
     assert!(told(&mut bench, ScopeHealth::Away, 2000).is_empty());
     assert!(told(&mut bench, ScopeHealth::Up, 2000).is_empty());
@@ -179,12 +223,7 @@ fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
     bench.core.set_scope_health(bench.now, Scope::Layer, ScopeHealth::InUse);
     bench.step(0);
     assert_eq!(bench.core.state(), FlowState::Ready);
-    assert!(
-        bench
-            .outputs
-            .iter()
-            .any(|output| matches!(output, Output::LayerScope { shared: false }))
-    );
+    assert!(bench.wants(|output| matches!(output, Output::LayerScope { shared: false })));
     bench.send(Scope::Node, &lease("advertise", "t"));
     bench.step(300);
     assert_eq!(bench.bridges("t"), [""; 0]);
@@ -192,12 +231,7 @@ fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
     bench.outputs.clear();
     bench.core.set_scope_health(bench.now, Scope::Layer, ScopeHealth::Up);
     bench.step(300);
-    assert!(
-        bench
-            .outputs
-            .iter()
-            .any(|output| matches!(output, Output::LayerScope { shared: true }))
-    );
+    assert!(bench.wants(|output| matches!(output, Output::LayerScope { shared: true })));
     assert!(bench.core.is_reading_leases(Scope::Layer), "now it is ours");
     assert_eq!(bench.core.state(), FlowState::Ready, "which holds nothing up any more");
     let value = Bytes::from(lease("request", "t").to_string());
@@ -209,11 +243,10 @@ fn a_scope_that_is_in_use_holds_nothing_up_and_has_no_bridges() {
     bench.core.set_scope_health(bench.now, Scope::Node, ScopeHealth::InUse);
     bench.step(300);
     assert_eq!(bench.bridges("t"), [""; 0]);
-    let saved = bench
-        .outputs
-        .iter()
-        .any(|output| matches!(output, Output::SaveLease(_)));
-    assert!(!saved, "what is kept there is the other's");
+    assert!(
+        !bench.wants(|output| matches!(output, Output::SaveLease(_))),
+        "what is kept there is the other's"
+    );
     assert_eq!(bench.channels(), ["-node t"]);
 }
 
@@ -264,43 +297,12 @@ fn a_channel_is_made_before_the_answer_and_kept_while_it_is_used() {
 fn a_topic_that_is_only_delivered_and_collides_is_blocked() {
     let mut bench = Bench::ready();
     // Another node of the layer asks for `imu_data` of this node: only the way over Kafka is between them.
-    let hello = blaze_proto::link::link_control::Hello {
-        layer: "fog".into(),
-        node: "fog-2".into(),
-        kind: blaze_proto::link::link_control::Kind::Fog.into(),
-        epoch: 1,
-        state: blaze_proto::link::link_control::State::Ready.into(),
+    let hello = Hello {
         layer_scope_id: LayerScopeId::kafka("").0,
         registry_version: 1,
-        ..Default::default()
+        ..hello_of(&FOG_2.parse().unwrap(), Kind::Fog)
     };
-    let other: FlowId = "fog/fog-2".parse().unwrap();
-    let entry = blaze_proto::link::link_control::Entry {
-        topic: "imu_data".into(),
-        node_request: Some(Default::default()),
-        ..Default::default()
-    };
-    let delta = blaze_proto::link::link_control::Delta {
-        from_version: 0,
-        to_version: 1,
-        part: 0,
-        parts: 1,
-        entries: vec![entry],
-    };
-    bench.core.link_event(
-        bench.now,
-        LinkEvent::Hello {
-            from: other.clone(),
-            hello: Box::new(hello),
-        },
-    );
-    bench.core.link_event(
-        bench.now,
-        LinkEvent::Control {
-            from: other,
-            body: Body::Delta(delta),
-        },
-    );
+    bench.link_says(hello, 1, vec![asks_for("imu_data")]);
     bench.send(Scope::Node, &lease("advertise", "imu_data"));
     bench.step(300);
     assert_eq!(bench.bridges("imu_data"), ["node>Layer"]);
@@ -336,16 +338,6 @@ fn other_flows_are_told_of_brokers_that_are_away() {
     assert_eq!(bench.routes("t"), state("bridge", "broker_down"));
 }
 
-/// The rules of a node file.
-fn access(rules: &Value) -> AccessRules {
-    let file = json!({
-        "layer": {"name": "fog", "kind": "fog"}, "node": {"name": "fog-1"}, "brokers": {"node": {"memory": {}}},
-        "flow": {"access": rules},
-    });
-    let (file, _) = blaze_domain::node_file::NodeFile::read(&file).unwrap();
-    file.flow.access
-}
-
 #[test]
 fn who_may_not_advertise_is_told_and_leaves_no_lease() {
     let mut bench = Bench::ready();
@@ -355,16 +347,12 @@ fn who_may_not_advertise_is_told_and_leaves_no_lease() {
     denied["service"] = "planner".into();
     denied["reply_to"] = "blaze/reply/planner".into();
     bench.send(Scope::Node, &denied);
-    let answers: Vec<Value> = bench
-        .outputs
-        .drain(..)
-        .filter_map(|output| match output {
-            Output::Publish { channel, body, .. } if channel.as_str().starts_with("blaze/reply") => {
-                Some(serde_json::from_slice(&body).unwrap())
-            }
-            _ => None,
-        })
-        .collect();
+    let answers: Vec<Value> = bench.wanted(|output| match output {
+        Output::Publish { channel, body, .. } if channel.as_str().starts_with("blaze/reply") => {
+            Some(serde_json::from_slice(&body).unwrap())
+        }
+        _ => None,
+    });
     let [answer] = answers.as_slice() else {
         panic!("{answers:?}")
     };
@@ -389,11 +377,8 @@ fn leases_that_new_rules_do_not_allow_end() {
     bench.send(Scope::Layer, &lease("request", "cmd/vel"));
     bench.step(300);
     assert_eq!(bench.bridges("cmd/vel"), ["node>Layer"]);
-    bench.core.set_access(
-        bench.now,
-        0,
-        access(&json!([{"match": "cmd/*", "request": {"allow": []}}])),
-    );
+    let nobody = access(&json!([{"match": "cmd/*", "request": {"allow": []}}]));
+    bench.core.set_access(bench.now, 0, nobody);
     bench.step(300);
     assert_eq!(bench.bridges("cmd/vel"), [""; 0]);
     assert_eq!(bench.core.registry().lease_count(), 1);

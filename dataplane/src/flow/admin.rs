@@ -18,7 +18,7 @@ use blaze_domain::{Scope, TopicName};
 use serde_json::{Map, Value, json};
 
 use super::Shared;
-use super::plane::wall_ns;
+use super::plane::wall_ms;
 use super::routes::SourceState;
 use crate::control::ControlCore;
 use crate::lane::path::{BridgeState, Phase, Sink, TopicPath};
@@ -44,7 +44,7 @@ pub(super) fn answer(shared: &Shared, body: Value) -> Json<Value> {
     let mut whole = Map::new();
     whole.insert("flow".into(), json!(shared.me));
     whole.insert("epoch".into(), json!(shared.epoch.load(Ordering::Relaxed)));
-    whole.insert("time".into(), json!(rfc3339_millis(wall_ns() / 1_000_000)));
+    whole.insert("time".into(), json!(rfc3339_millis(wall_ms())));
     if let Value::Object(members) = body {
         whole.extend(members);
     }

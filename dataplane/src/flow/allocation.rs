@@ -9,7 +9,7 @@ use blaze_domain::node_file::BandwidthSection;
 use super::Shared;
 use crate::lane::allocation::Reckoned;
 use crate::limit::capacity::State;
-use crate::limit::limiter::{LinkRate, Measured};
+use crate::limit::limiter::LinkRate;
 use crate::limit::wire_factor::Totals;
 use crate::link::{Engine, LinkBudgets, LinkCapacity, PacketSize};
 
@@ -36,8 +36,7 @@ impl Shared {
             }
             let (all, links) = self.totals(&reckoned);
             let rates = capacities.into_iter().map(|(flow, capacity)| (flow, rate_of(capacity)));
-            let measured = Measured { links: rates.collect() };
-            limiter.look(now, all, &links, measured);
+            limiter.look(now, all, &links, rates.collect());
         }
         let (grown, changed) = self
             .plane
@@ -69,7 +68,7 @@ impl Shared {
         let budgets = self
             .inter
             .as_ref()
-            .map(|inter| link_budgets(bandwidth, inter.packets()));
+            .map(|inter| link_budgets(bandwidth, inter.wire().packets()));
         self.plane.with(|state| {
             state.core.set_large_bytes(bandwidth.large_bytes.into());
             if let Some((engine, budgets)) = state.engine.as_mut().zip(budgets) {

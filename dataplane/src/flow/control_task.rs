@@ -12,13 +12,13 @@ use blaze_brokers::{
 };
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Scope, TopicName, WriterId};
-use blaze_proto::link::link_control::{LayerScope, State as HelloState};
+use blaze_proto::link::link_control::LayerScope;
 use bytes::Bytes;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::Shared;
-use super::plane::{News, wall_ns};
+use super::plane::{News, wall_ms};
 use crate::control::{Duty, Output};
 use crate::registry::peers_channel;
 use crate::world::FlowState;
@@ -34,11 +34,6 @@ const BATCH: usize = 64;
 const MAX_WAITING: usize = 4096;
 /// Reply channels whose writers are kept.
 const MAX_WRITERS: usize = 1024;
-
-/// Milliseconds since 1970.
-fn wall_ms() -> u64 {
-    wall_ns() / 1_000_000
-}
 
 /// Drives the control core until the flow drains.
 pub(super) struct ControlTask {
@@ -209,23 +204,13 @@ impl ControlTask {
         match output {
             Output::Publish { scope, channel, body } => self.publish(scope, channel, &body, None),
             Output::Link { to, body } => {
-                plane.with(|state| state.engine.as_mut().map(|engine| engine.send_control(now, &to, *body)));
+                plane.link(|engine| engine.send_control(&to, *body));
             }
             Output::Announce { version, digest } => {
-                plane.with(|state| {
-                    state
-                        .engine
-                        .as_mut()
-                        .map(|engine| engine.set_registry(now, version, digest))
-                });
+                plane.link(|engine| engine.set_registry(version, digest));
             }
-            Output::State(flow_state) => {
-                let said = match flow_state {
-                    FlowState::Starting => HelloState::Starting,
-                    FlowState::Ready => HelloState::Ready,
-                    FlowState::Draining => HelloState::Draining,
-                };
-                plane.with(|state| state.engine.as_mut().map(|engine| engine.set_state(now, said)));
+            Output::State(state) => {
+                plane.link(|engine| engine.set_state(now, state.into()));
             }
             Output::Inter { join } => {
                 if let Some(inter) = &self.shared.inter {
@@ -249,7 +234,7 @@ impl ControlTask {
                 }
             }
             Output::LayerAway(away) => {
-                plane.with(|state| state.engine.as_mut().map(|engine| engine.set_layer_away(now, away)));
+                plane.link(|engine| engine.set_layer_away(now, away));
             }
             Output::LayerScope { shared } => {
                 let said = if shared {
@@ -257,12 +242,7 @@ impl ControlTask {
                 } else {
                     (LayerScope::None, 0)
                 };
-                plane.with(|state| {
-                    state
-                        .engine
-                        .as_mut()
-                        .map(|engine| engine.set_layer_scope(now, said.0, said.1))
-                });
+                plane.link(|engine| engine.set_layer_scope(now, said.0, said.1));
             }
             Output::SaveLease(lease) => {
                 if let Some(side) = self.side(lease.scope) {

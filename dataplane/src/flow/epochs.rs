@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use blaze_domain::FlowId;
 
-use super::plane::wall_ns;
+use super::plane::wall_ms;
 
 /// Gives a flow its epochs. Clones share them.
 #[derive(Debug, Clone)]
@@ -43,7 +43,7 @@ impl Epochs {
     fn next(&self) -> io::Result<u64> {
         let given = match &self.state_dir {
             Some(dir) => blaze_runtime::state::next_epoch(dir, self.me.layer.as_str(), self.me.node.as_str())?,
-            None => clock_ms(),
+            None => wall_ms(),
         };
         Ok(self.after_last(given))
     }
@@ -52,7 +52,7 @@ impl Epochs {
     pub(super) fn renew(&self) -> u64 {
         self.next().unwrap_or_else(|error| {
             tracing::warn!(%error, "the epoch is not kept");
-            self.after_last(clock_ms())
+            self.after_last(wall_ms())
         })
     }
 
@@ -64,10 +64,6 @@ impl Epochs {
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |last| Some(newer(last)));
         newer(before.unwrap_or_else(|last| last))
     }
-}
-
-fn clock_ms() -> u64 {
-    wall_ns() / 1_000_000
 }
 
 #[cfg(test)]

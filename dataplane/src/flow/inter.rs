@@ -4,7 +4,6 @@
 //! control core ─► want ─► thread `inter`: start, or let out, say good-bye and stop ─► News ─► control core
 //! ```
 
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -17,9 +16,9 @@ use parking_lot::{Condvar, Mutex};
 use super::epochs::Epochs;
 use super::plane::{News, Plane};
 use super::settings::InterSettings;
-use crate::link::dds::{self, DdsConfig, DdsStatus, DdsTransport};
-use crate::link::transport::{Endpoint, SendOutcome, Transport};
-use crate::link::{DownReason, LinkEvent, PacketSize};
+use crate::link::dds::{DdsConfig, DdsStatus, DdsTransport, Wire};
+use crate::link::transport::{Endpoint, SendOutcome};
+use crate::link::{DownReason, LinkEvent};
 
 /// Between attempts to start a transport.
 const RETRY: Duration = Duration::from_secs(1);
@@ -113,7 +112,7 @@ impl InterScope {
         let (settings, sink, epochs) = (&self.settings, Arc::clone(&self.plane), self.epochs.clone());
         let transport = DdsTransport::start(DdsConfig {
             domain: settings.domain,
-            listen: settings.listen_address(),
+            listen: settings.listen.into(),
             peers: settings.peers.iter().map(ToString::to_string).collect(),
             peer_slots: settings.peer_slots,
             mtu: settings.mtu.into(),
@@ -127,8 +126,7 @@ impl InterScope {
         })
         .context("brokers.inter.dds")?;
         let addresses = transport.addresses();
-        self.plane
-            .with(|state| state.engine.as_mut().map(|engine| engine.set_addresses(addresses)));
+        self.plane.link(|engine| engine.set_addresses(addresses));
         self.trouble.lock().clear();
         *self.transport.lock() = Some(Arc::new(transport));
         self.wish.lock().joined = true;
@@ -192,27 +190,14 @@ impl InterScope {
 
     fn leave(&self) {
         let until = Instant::now() + DRAIN;
-        let still_draining = || {
-            self.plane.with(|state| {
-                state.run_timers(Instant::now());
-                state.core.is_draining()
-            })
-        };
-        while Instant::now() < until && still_draining() {
+        while Instant::now() < until && self.plane.is_draining() {
             std::thread::sleep(LOOK);
         }
         // As for a flow that is stopped: others go on with the good-bye.
-        let waits_for_brokers = || {
-            self.plane.with(|state| {
-                state.run_timers(Instant::now());
-                state.core.has_unwritten()
-            })
-        };
-        while Instant::now() < until + WRITTEN && waits_for_brokers() {
+        while Instant::now() < until + WRITTEN && self.plane.has_unwritten() {
             std::thread::sleep(LOOK);
         }
-        self.plane
-            .with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
+        self.plane.say_goodbye();
         std::thread::sleep(GOODBYE);
         // The pacer may still hold it for the datagram that it sends. Its end takes a while, in which nobody is to wait for it.
         let gone = self.transport.lock().take();
@@ -242,92 +227,38 @@ impl InterScope {
     /// Makes and drops writers as peers come and go. Of a peer that is down the control writer stays: it carries Hello
     /// until the peer is forgotten, says Goodbye or begins a new life.
     pub(super) fn follow(&self, news: &News) {
-        let endpoint = |flow: &FlowId, epoch: u64| Endpoint {
-            flow: flow.clone(),
-            epoch,
-        };
+        let Some(transport) = self.current() else { return };
         let event = match news {
-            News::Discovered(found) => return self.connect(found),
+            News::Discovered(found) => return transport.connect(found),
             News::Link(event) => event.as_ref(),
             News::Rebuilt(_) | News::Joined | News::Lost | News::Left => return,
         };
         match event {
-            LinkEvent::PeerUp { flow, epoch } | LinkEvent::PeerAdmitted { flow, epoch } => {
-                self.connect(&endpoint(flow, *epoch));
-            }
+            LinkEvent::PeerUp(endpoint) | LinkEvent::PeerAdmitted(endpoint) => transport.connect(endpoint),
             LinkEvent::PeerRefused { flow, peers } => {
                 tracing::warn!(%flow, peers, "no place for another flow among the peers on the inter scope");
             }
             LinkEvent::PeerDown {
-                flow,
-                epoch,
+                endpoint,
                 reason: DownReason::Silent,
-            } => {
-                self.disconnect(&endpoint(flow, *epoch), &[Priority::State, Priority::Bulk]);
-            }
-            LinkEvent::PeerDown { flow, epoch, .. }
-            | LinkEvent::PeerForgotten { flow, epoch }
-            | LinkEvent::PeerRemoved { flow, epoch } => {
-                self.disconnect(&endpoint(flow, *epoch), Priority::ALL);
-            }
-            LinkEvent::Addresses(addresses) => self.learn_addresses(addresses),
+            } => transport.disconnect(endpoint, &[Priority::State, Priority::Bulk]),
+            LinkEvent::PeerDown { endpoint, .. }
+            | LinkEvent::PeerForgotten(endpoint)
+            | LinkEvent::PeerRemoved(endpoint) => transport.disconnect(endpoint, Priority::ALL),
+            LinkEvent::Addresses(addresses) => transport.learn_addresses(addresses),
             _ => {}
         }
     }
 
-    fn sizes(&self) -> (usize, blaze_domain::node_file::Chunking, IpAddr) {
-        let settings = &self.settings;
-        (settings.mtu.into(), settings.chunking, settings.listen_address())
-    }
-}
-
-impl InterScope {
     /// What datagrams become on the wire.
-    pub(super) fn packets(&self) -> PacketSize {
-        let (mtu, chunking, listen) = self.sizes();
-        dds::packets(mtu, chunking, listen)
+    pub(super) fn wire(&self) -> Wire {
+        self.settings.wire()
     }
-}
 
-/// That of the transport, while there is one; before and after it nothing is sent.
-impl Transport for InterScope {
-    fn send(&self, to: &Endpoint, class: Priority, datagram: Bytes) -> SendOutcome {
+    /// Sends one datagram while there is a transport; before and after it nothing is sent.
+    pub(super) fn send(&self, to: &Endpoint, class: Priority, datagram: Bytes) -> SendOutcome {
         self.current()
             .map_or(SendOutcome::NotSent, |transport| transport.send(to, class, datagram))
-    }
-
-    fn connect(&self, to: &Endpoint) {
-        if let Some(transport) = self.current() {
-            transport.connect(to);
-        }
-    }
-
-    fn disconnect(&self, to: &Endpoint, classes: &[Priority]) {
-        if let Some(transport) = self.current() {
-            transport.disconnect(to, classes);
-        }
-    }
-
-    fn learn_addresses(&self, addresses: &[String]) {
-        if let Some(transport) = self.current() {
-            transport.learn_addresses(addresses);
-        }
-    }
-
-    fn addresses(&self) -> Vec<String> {
-        self.current()
-            .map(|transport| transport.addresses())
-            .unwrap_or_default()
-    }
-
-    fn wire_bytes(&self, datagram_bytes: usize) -> usize {
-        let (mtu, chunking, listen) = self.sizes();
-        dds::wire_bytes(mtu, chunking, listen, datagram_bytes)
-    }
-
-    fn max_datagram_bytes(&self) -> usize {
-        let (mtu, chunking, listen) = self.sizes();
-        dds::max_datagram_bytes(mtu, chunking, listen)
     }
 }
 

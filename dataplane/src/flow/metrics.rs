@@ -6,8 +6,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use blaze_domain::{Priority, Scope};
-use prometheus::core::Collector;
-use prometheus::{CounterVec, Encoder, GaugeVec, Opts, Registry, TextEncoder};
+use prometheus::{CounterVec, GaugeVec, Opts, Registry, TextEncoder};
 
 use super::inter::InterScope;
 use super::routes::SourceState;
@@ -15,6 +14,7 @@ use super::{Shared, class_label};
 use crate::codec::pool::CodecPool;
 use crate::control::MoveReason;
 use crate::lane::path::{Phase, TopicId, TopicPath};
+use crate::link::{Engine, PeerState};
 use crate::registry::Terms;
 use latency::Histogram;
 
@@ -24,214 +24,117 @@ const OTHER: &str = "_other";
 
 /// The text of one scrape.
 pub(super) fn render(shared: &Shared) -> String {
-    let page = Page::new();
-    match page.and_then(|page| {
-        page.fill(shared);
-        page.text()
-    }) {
-        Ok(text) => text,
-        Err(error) => {
-            tracing::error!(%error, "metrics");
-            String::new()
-        }
-    }
+    let text = Page::new().and_then(|page| page.text(shared));
+    text.unwrap_or_else(|error| {
+        tracing::error!(%error, "metrics");
+        String::new()
+    })
 }
 
+/// Each metric: kind, name, labels (`-`: none) and help.
+const METRICS: &str = "\
+counter blaze_flow_messages_total topic,from,to,direction Messages through a bridge.
+counter blaze_flow_bytes_total topic,from,to,direction Payload bytes through a bridge.
+counter blaze_flow_dropped_total topic,to,reason Messages dropped.
+gauge blaze_flow_bridges state Bridges by state.
+gauge blaze_flow_queue_bytes to,class Bytes that wait for the link or may have to be repaired.
+gauge blaze_flow_rate_hertz topic,to,kind Rates of a topic.
+gauge blaze_flow_budget_bytes_per_second to,kind Wire bytes per second.
+gauge blaze_flow_feasible to 1 while what is published fits the budget at its lowest rates.
+gauge blaze_flow_wire_factor - Wire bytes for each byte that the allocation reckons with.
+counter blaze_flow_compression_bytes_total topic,stage Payload bytes before and after compression.
+counter blaze_flow_compression_seconds topic Processor time of compression.
+gauge blaze_flow_compression_level topic Level of now; 0: payloads go as they are.
+gauge blaze_flow_compression_pool state Threads that compress, and what waits for them.
+counter blaze_flow_compression_pool_seconds - Time that the threads were taken, all together.
+counter blaze_flow_wire_bytes_total to,class IP bytes sent on the inter scope.
+gauge blaze_flow_peer_up peer 1 while the peer says Hello and acknowledges.
+gauge blaze_flow_peer_rtt_seconds peer Round trip to the peer.
+gauge blaze_flow_leases kind Leases of local services.
+counter blaze_flow_link_events_total event Things that happened on the link.
+gauge blaze_flow_load_bytes_per_second direction Payload that the flow carries over the inter scope, \
+    as the other flows of its layer are told.
+counter blaze_flow_moves_total reason Topics that went to another flow of the layer.
+gauge process_start_time_seconds - When the flow started, since 1970.
+gauge blaze_build_info version,program 1, with the version as label.
+";
+
+/// All metrics, without values at first.
 struct Page {
     registry: Registry,
-    messages: CounterVec,
-    bytes: CounterVec,
-    dropped: CounterVec,
-    bridges: GaugeVec,
-    queue_bytes: GaugeVec,
-    rate: GaugeVec,
-    budget: GaugeVec,
-    feasible: GaugeVec,
-    wire_factor: GaugeVec,
-    wire_bytes: CounterVec,
-    compression_bytes: CounterVec,
-    compression_seconds: CounterVec,
-    compression_level: GaugeVec,
-    compression_pool: GaugeVec,
-    compression_pool_seconds: CounterVec,
-    peer_up: GaugeVec,
-    peer_rtt: GaugeVec,
-    leases: GaugeVec,
-    link: CounterVec,
-    load: GaugeVec,
-    moves: CounterVec,
-    build: GaugeVec,
-    started: GaugeVec,
-    latency: parking_lot::Mutex<String>,
+    metrics: BTreeMap<&'static str, Metric>,
 }
 
-fn counter(registry: &Registry, name: &str, help: &str, labels: &[&str]) -> prometheus::Result<CounterVec> {
-    let metric = CounterVec::new(Opts::new(name, help), labels)?;
-    register(registry, metric)
-}
-
-fn gauge(registry: &Registry, name: &str, help: &str, labels: &[&str]) -> prometheus::Result<GaugeVec> {
-    let metric = GaugeVec::new(Opts::new(name, help), labels)?;
-    register(registry, metric)
-}
-
-fn register<M: Collector + Clone + 'static>(registry: &Registry, metric: M) -> prometheus::Result<M> {
-    registry.register(Box::new(metric.clone()))?;
-    Ok(metric)
+enum Metric {
+    Counter(CounterVec),
+    Gauge(GaugeVec),
 }
 
 impl Page {
     fn new() -> prometheus::Result<Self> {
-        let r = Registry::new();
-        Ok(Self {
-            messages: counter(
-                &r,
-                "blaze_flow_messages_total",
-                "Messages through a bridge.",
-                &["topic", "from", "to", "direction"],
-            )?,
-            bytes: counter(
-                &r,
-                "blaze_flow_bytes_total",
-                "Payload bytes through a bridge.",
-                &["topic", "from", "to", "direction"],
-            )?,
-            dropped: counter(
-                &r,
-                "blaze_flow_dropped_total",
-                "Messages dropped.",
-                &["topic", "to", "reason"],
-            )?,
-            bridges: gauge(&r, "blaze_flow_bridges", "Bridges by state.", &["state"])?,
-            queue_bytes: gauge(
-                &r,
-                "blaze_flow_queue_bytes",
-                "Bytes that wait for the link or may have to be repaired.",
-                &["to", "class"],
-            )?,
-            rate: gauge(
-                &r,
-                "blaze_flow_rate_hertz",
-                "Rates of a topic.",
-                &["topic", "to", "kind"],
-            )?,
-            budget: gauge(
-                &r,
-                "blaze_flow_budget_bytes_per_second",
-                "Wire bytes per second.",
-                &["to", "kind"],
-            )?,
-            feasible: gauge(
-                &r,
-                "blaze_flow_feasible",
-                "1 while what is published fits the budget at its lowest rates.",
-                &["to"],
-            )?,
-            wire_factor: gauge(
-                &r,
-                "blaze_flow_wire_factor",
-                "Wire bytes for each byte that the allocation reckons with.",
-                &[],
-            )?,
-            compression_bytes: counter(
-                &r,
-                "blaze_flow_compression_bytes_total",
-                "Payload bytes before and after compression.",
-                &["topic", "stage"],
-            )?,
-            compression_seconds: counter(
-                &r,
-                "blaze_flow_compression_seconds",
-                "Processor time of compression.",
-                &["topic"],
-            )?,
-            compression_level: gauge(
-                &r,
-                "blaze_flow_compression_level",
-                "Level of now; 0: payloads go as they are.",
-                &["topic"],
-            )?,
-            compression_pool: gauge(
-                &r,
-                "blaze_flow_compression_pool",
-                "Threads that compress, and what waits for them.",
-                &["state"],
-            )?,
-            compression_pool_seconds: counter(
-                &r,
-                "blaze_flow_compression_pool_seconds",
-                "Time that the threads were taken, all together.",
-                &[],
-            )?,
-            wire_bytes: counter(
-                &r,
-                "blaze_flow_wire_bytes_total",
-                "IP bytes sent on the inter scope.",
-                &["to", "class"],
-            )?,
-            peer_up: gauge(
-                &r,
-                "blaze_flow_peer_up",
-                "1 while the peer says Hello and acknowledges.",
-                &["peer"],
-            )?,
-            peer_rtt: gauge(&r, "blaze_flow_peer_rtt_seconds", "Round trip to the peer.", &["peer"])?,
-            leases: gauge(&r, "blaze_flow_leases", "Leases of local services.", &["kind"])?,
-            link: counter(
-                &r,
-                "blaze_flow_link_events_total",
-                "Things that happened on the link.",
-                &["event"],
-            )?,
-            load: gauge(
-                &r,
-                "blaze_flow_load_bytes_per_second",
-                "Payload that the flow carries over the inter scope, as the other flows of its layer are told.",
-                &["direction"],
-            )?,
-            moves: counter(
-                &r,
-                "blaze_flow_moves_total",
-                "Topics that went to another flow of the layer.",
-                &["reason"],
-            )?,
-            started: gauge(
-                &r,
-                "process_start_time_seconds",
-                "When the flow started, since 1970.",
-                &[],
-            )?,
-            build: gauge(
-                &r,
-                "blaze_build_info",
-                "1, with the version as label.",
-                &["version", "program"],
-            )?,
-            latency: parking_lot::Mutex::default(),
-            registry: r,
-        })
+        let mut page = Self {
+            registry: Registry::new(),
+            metrics: BTreeMap::new(),
+        };
+        for line in METRICS.lines() {
+            let mut words = line.splitn(4, ' ');
+            let mut word = || words.next().unwrap_or_default();
+            let (kind, name, labels, help) = (word(), word(), word(), word());
+            let labels: Vec<&str> = labels.split(',').filter(|label| *label != "-").collect();
+            let metric = if kind == "counter" {
+                let counter = CounterVec::new(Opts::new(name, help), &labels)?;
+                page.registry.register(Box::new(counter.clone()))?;
+                Metric::Counter(counter)
+            } else {
+                let gauge = GaugeVec::new(Opts::new(name, help), &labels)?;
+                page.registry.register(Box::new(gauge.clone()))?;
+                Metric::Gauge(gauge)
+            };
+            page.metrics.insert(name, metric);
+        }
+        Ok(page)
     }
 
-    fn fill(&self, shared: &Shared) {
-        self.started.with_label_values::<&str>(&[]).set(shared.started_s);
-        self.build
-            .with_label_values(&[env!("CARGO_PKG_VERSION"), "blaze-flow"])
-            .set(1.0);
-        self.fill_topics(shared);
+    /// Adds to the value of one set of labels.
+    fn add(&self, name: &str, labels: &[&str], value: f64) {
+        let added = match self.metrics.get(name) {
+            Some(Metric::Counter(counter)) => counter
+                .get_metric_with_label_values(labels)
+                .map(|counter| counter.inc_by(value)),
+            Some(Metric::Gauge(gauge)) => gauge.get_metric_with_label_values(labels).map(|gauge| gauge.add(value)),
+            None => Err(prometheus::Error::Msg("it is not in the table".to_owned())),
+        };
+        if let Err(error) = added {
+            tracing::error!(name, ?labels, %error, "metrics");
+        }
+    }
+
+    /// Counts things that happened.
+    fn count(&self, events: &[(&str, u64)]) {
+        for (event, count) in events {
+            self.add("blaze_flow_link_events_total", &[event], *count as f64);
+        }
+    }
+
+    fn text(&self, shared: &Shared) -> prometheus::Result<String> {
+        self.add("process_start_time_seconds", &[], shared.started_s);
+        self.add("blaze_build_info", &[env!("CARGO_PKG_VERSION"), "blaze-flow"], 1.0);
+        let latencies = self.fill_topics(shared);
         self.fill_link(shared);
         self.fill_compression(shared);
         self.fill_control(shared);
+        let text = TextEncoder::new().encode_to_string(&self.registry.gather())?;
+        Ok(text + &latencies)
     }
 
-    fn fill_topics(&self, shared: &Shared) {
+    /// Returns the text of the latencies.
+    fn fill_topics(&self, shared: &Shared) -> String {
         let now = Instant::now();
         let sources = shared.routes.source_states();
         let mut histograms: BTreeMap<(String, String), Histogram> = BTreeMap::new();
         shared.plane.read(|state| {
             for (reason, count) in state.core.unattributed.iter() {
-                self.dropped
-                    .with_label_values(&["", "", reason.as_str()])
-                    .inc_by(count as f64);
+                self.add("blaze_flow_dropped_total", &["", "", reason.as_str()], count as f64);
             }
             for (id, path) in state.core.topics_mut() {
                 let topic = if id.0 < MAX_TOPICS {
@@ -250,7 +153,7 @@ impl Page {
         for ((topic, to), histogram) in histograms {
             histogram.write(&topic, &to, &mut text);
         }
-        *self.latency.lock() = text;
+        text
     }
 
     fn fill_topic(
@@ -262,25 +165,17 @@ impl Page {
         histograms: &mut BTreeMap<(String, String), Histogram>,
     ) {
         for (reason, count) in path.ingress_drops.iter() {
-            self.dropped
-                .with_label_values(&[topic, "", reason.as_str()])
-                .inc_by(count as f64);
+            self.add("blaze_flow_dropped_total", &[topic, "", reason.as_str()], count as f64);
         }
         let press = &path.press;
         if press.messages > 0 {
             for (stage, bytes) in [("before", press.before), ("after", press.after)] {
-                self.compression_bytes
-                    .with_label_values(&[topic, stage])
-                    .inc_by(bytes as f64);
+                self.add("blaze_flow_compression_bytes_total", &[topic, stage], bytes as f64);
             }
-            self.compression_seconds
-                .with_label_values(&[topic])
-                .inc_by(press.seconds);
+            self.add("blaze_flow_compression_seconds", &[topic], press.seconds);
             // Topics that share a label have no level in common.
             if topic != OTHER {
-                self.compression_level
-                    .with_label_values(&[topic])
-                    .set(f64::from(path.level()));
+                self.add("blaze_flow_compression_level", &[topic], f64::from(path.level()));
             }
         }
         let measured = path.in_rate.rate(now).0;
@@ -294,17 +189,19 @@ impl Page {
             bridge.settle();
             let stats = &bridge.stats;
             for (direction, count) in [("in", stats.taken), ("out", stats.out)] {
-                self.messages
-                    .with_label_values(&[topic, from, &to, direction])
-                    .inc_by(count.messages as f64);
-                self.bytes
-                    .with_label_values(&[topic, from, &to, direction])
-                    .inc_by(count.bytes as f64);
+                self.add(
+                    "blaze_flow_messages_total",
+                    &[topic, from, &to, direction],
+                    count.messages as f64,
+                );
+                self.add(
+                    "blaze_flow_bytes_total",
+                    &[topic, from, &to, direction],
+                    count.bytes as f64,
+                );
             }
             for (reason, count) in stats.dropped.iter() {
-                self.dropped
-                    .with_label_values(&[topic, &to, reason.as_str()])
-                    .inc_by(count as f64);
+                self.add("blaze_flow_dropped_total", &[topic, &to, reason.as_str()], count as f64);
             }
             histograms
                 .entry((topic.to_owned(), to.clone()))
@@ -319,9 +216,9 @@ impl Page {
                 (Phase::Draining { .. }, _) => "draining",
                 (Phase::Ended, _) => continue,
             };
-            self.bridges.with_label_values(&[state]).inc();
-            let rate = |kind: &str| self.rate.with_label_values(&[topic, &to, kind]);
-            rate("actual").add(bridge.out_rate.rate(now).0);
+            self.add("blaze_flow_bridges", &[state], 1.0);
+            let rate = |kind: &str, hz: f64| self.add("blaze_flow_rate_hertz", &[topic, &to, kind], hz);
+            rate("actual", bridge.out_rate.rate(now).0);
             // What goes to one flow is one lane, on whatever scope it was published.
             let counts = match bridge.receiver() {
                 Some((_, receiver)) => matches!(bridge.phase, Phase::Up { .. }) && !receivers.contains(receiver),
@@ -333,9 +230,9 @@ impl Page {
                     local.push(to.clone());
                 }
                 receivers.extend(bridge.receiver().map(|(_, receiver)| receiver.clone()));
-                rate("advertised").add(advertised);
+                rate("advertised", advertised);
                 if let Some(allocated) = bridge.allocated_hz {
-                    rate("allocated").add(allocated);
+                    rate("allocated", allocated);
                 }
             }
         }
@@ -343,28 +240,23 @@ impl Page {
 
     fn fill_link(&self, shared: &Shared) {
         let now = Instant::now();
-        let (peers, counters) = shared.plane.read(|state| {
-            state
-                .engine
-                .as_ref()
-                .map(|engine| (engine.peers(), engine.counters()))
-                .unwrap_or_default()
-        });
+        let said = |engine: &Engine| (engine.peers(), engine.counters());
+        let (peers, counters) = shared
+            .plane
+            .read(|state| state.engine.as_ref().map(said).unwrap_or_default());
         for peer in &peers {
             let name = peer.flow.to_string();
-            let up = f64::from(u8::from(peer.state == crate::link::PeerState::Up));
-            self.peer_up.with_label_values(&[&name]).set(up);
+            let up = f64::from(u8::from(peer.state == PeerState::Up));
+            self.add("blaze_flow_peer_up", &[&name], up);
             if let Some(rtt) = peer.rtt {
-                self.peer_rtt.with_label_values(&[&name]).set(rtt.as_secs_f64());
+                self.add("blaze_flow_peer_rtt_seconds", &[&name], rtt.as_secs_f64());
             }
             let to = format!("inter/{}", peer.flow.layer);
             for (index, bytes) in peer.queue_bytes.iter().enumerate() {
-                self.queue_bytes
-                    .with_label_values(&[&to, class_label(index)])
-                    .add(*bytes as f64);
+                self.add("blaze_flow_queue_bytes", &[&to, class_label(index)], *bytes as f64);
             }
         }
-        for (event, count) in [
+        self.count(&[
             ("decode_error", counters.decode_errors),
             ("unknown_sender", counters.unknown_senders),
             ("stale", counters.stale),
@@ -377,66 +269,55 @@ impl Page {
             ("repair", counters.repairs),
             ("probe", counters.probes),
             ("news_dropped", shared.plane.news_dropped()),
-        ] {
-            self.link.with_label_values(&[event]).inc_by(count as f64);
-        }
+        ]);
         if let Some(status) = shared.inter.as_ref().and_then(InterScope::status) {
-            self.link
-                .with_label_values(&["participant_rebuilt"])
-                .inc_by(status.rebuilds as f64);
-            self.link
-                .with_label_values(&["not_sent"])
-                .inc_by(status.not_sent as f64);
-            self.link
-                .with_label_values(&["dropped_by_kernel"])
-                .inc_by(status.dropped_by_kernel as f64);
-            self.link
-                .with_label_values(&["malformed_sample"])
-                .inc_by(status.malformed as f64);
+            self.count(&[
+                ("participant_rebuilt", status.rebuilds),
+                ("not_sent", status.not_sent),
+                ("dropped_by_kernel", status.dropped_by_kernel),
+                ("malformed_sample", status.malformed),
+            ]);
         }
         self.fill_budgets(now, shared);
     }
 
     fn fill_budgets(&self, now: Instant, shared: &Shared) {
+        let budget =
+            |to: &str, kind: &str, bytes: f64| self.add("blaze_flow_budget_bytes_per_second", &[to, kind], bytes);
         let mut used = 0.0;
         for (layer, mut traffic) in shared.egress.traffic().by_layer {
             let to = format!("inter/{layer}");
             for (index, bytes) in traffic.wire_bytes.iter().enumerate() {
-                self.wire_bytes
-                    .with_label_values(&[&to, class_label(index)])
-                    .inc_by(*bytes as f64);
+                self.add("blaze_flow_wire_bytes_total", &[&to, class_label(index)], *bytes as f64);
             }
             let rate = traffic.rate.rate(now).1;
             used += rate;
-            self.budget.with_label_values(&[&to, "used"]).set(rate);
+            budget(&to, "used", rate);
         }
-        self.budget
-            .with_label_values(&["inter", "limit"])
-            .set(shared.egress.budget());
-        self.budget.with_label_values(&["inter", "used"]).set(used);
+        budget("inter", "limit", shared.egress.budget());
+        budget("inter", "used", used);
         let limiter = shared.limiter.lock();
         let feasible = |to: &str, feasible: bool| {
             let value = f64::from(u8::from(feasible));
-            self.feasible.with_label_values(&[to]).set(value);
+            self.add("blaze_flow_feasible", &[to], value);
         };
         let last = limiter.last();
         feasible("inter", last.is_none_or(|last| last.process_feasible));
         if let Some(measured) = limiter.measured_bytes_per_s(None) {
-            self.budget.with_label_values(&["inter", "measured"]).set(measured);
+            budget("inter", "measured", measured);
         }
         for layer in limiter.layers() {
             let to = format!("inter/{layer}");
-            let budget = |kind: &str| self.budget.with_label_values(&[to.as_str(), kind]);
             if let Some(limit) = limiter.bandwidth().link_limit_bytes_per_s(&layer) {
-                budget("limit").set(limit);
+                budget(&to, "limit", limit);
             }
             if let Some(measured) = limiter.measured_bytes_per_s(Some(&layer)) {
-                budget("measured").set(measured);
+                budget(&to, "measured", measured);
             }
             feasible(&to, last.is_none_or(|last| !last.infeasible_links.contains(&layer)));
         }
         if let Some(factor) = limiter.wire_factor(None) {
-            self.wire_factor.with_label_values::<&str>(&[]).set(factor);
+            self.add("blaze_flow_wire_factor", &[], factor);
         }
     }
 
@@ -451,69 +332,51 @@ impl Page {
             ("waiting", press.waiting),
             ("waiting_bytes", press.waiting_bytes),
         ] {
-            self.compression_pool.with_label_values(&[state]).set(value as f64);
+            self.add("blaze_flow_compression_pool", &[state], value as f64);
         }
-        self.compression_pool_seconds
-            .with_label_values::<&str>(&[])
-            .inc_by(pool.busy.as_secs_f64());
-        for (event, count) in [
+        self.add("blaze_flow_compression_pool_seconds", &[], pool.busy.as_secs_f64());
+        self.count(&[
             ("compression_refused", press.refused),
             ("compression_failed", press.failed),
-        ] {
-            self.link.with_label_values(&[event]).inc_by(count as f64);
-        }
+        ]);
     }
 
     fn fill_control(&self, shared: &Shared) {
         let control = shared.control.lock();
         for kind in ["advertise", "request"] {
-            self.leases.with_label_values(&[kind]).set(0.0);
+            self.add("blaze_flow_leases", &[kind], 0.0);
         }
         for lease in control.registry().leases() {
             let kind = match lease.terms {
                 Terms::Advertise { .. } => "advertise",
                 Terms::Request { .. } => "request",
             };
-            self.leases.with_label_values(&[kind]).inc();
+            self.add("blaze_flow_leases", &[kind], 1.0);
         }
-        self.link
-            .with_label_values(&["control_message_overrun"])
-            .inc_by(control.overrun as f64);
-        self.link
-            .with_label_values(&["control_message_refused"])
-            .inc_by(control.refused as f64);
-        self.link
-            .with_label_values(&["kept_lease_skipped"])
-            .inc_by(control.skipped_leases as f64);
+        self.count(&[
+            ("control_message_overrun", control.overrun),
+            ("control_message_refused", control.refused),
+            ("kept_lease_skipped", control.skipped_leases),
+        ]);
         let (load, moves) = (control.load(), control.moves());
         for (direction, bytes_per_s) in [("out", load.out_bytes_per_s), ("in", load.in_bytes_per_s)] {
-            self.load.with_label_values(&[direction]).set(bytes_per_s as f64);
+            self.add("blaze_flow_load_bytes_per_second", &[direction], bytes_per_s as f64);
         }
         for (reason, count) in [
             (MoveReason::Load.as_str(), moves.by_load),
             (MoveReason::Settled.as_str(), moves.settled),
             ("taken_back", moves.taken_back),
         ] {
-            self.moves.with_label_values(&[reason]).inc_by(count as f64);
+            self.add("blaze_flow_moves_total", &[reason], count as f64);
         }
         let (handed_over, taken_over) = control.handovers();
-        for (event, count) in [
+        self.count(&[
             ("topic_handed_over", handed_over),
             ("topic_taken_over", taken_over),
             ("replica_message_refused", control.refused_replica_messages()),
             ("replica_message_overrun", control.replica_overrun()),
             ("topic_not_announced", control.registry().faults().left_out_topics),
-        ] {
-            self.link.with_label_values(&[event]).inc_by(count as f64);
-        }
-    }
-
-    fn text(&self) -> prometheus::Result<String> {
-        let mut text = Vec::new();
-        TextEncoder::new().encode(&self.registry.gather(), &mut text)?;
-        let mut text = String::from_utf8_lossy(&text).into_owned();
-        text.push_str(&self.latency.lock());
-        Ok(text)
+        ]);
     }
 }
 

@@ -60,7 +60,7 @@ use health::{readiness, watch_health};
 use inter::InterScope;
 use pacing::Egress;
 use peers_task::PeersTask;
-use plane::{Plane, wall_ns};
+use plane::{Plane, wall_ms, wall_ns};
 pub use routes::LocalBrokers;
 use routes::Routes;
 use scope_task::ScopeTask;
@@ -199,14 +199,12 @@ pub async fn start_with(
         salt: rand::random(),
     });
     let engine = settings.inter.as_ref().map(|inter| {
-        let max_datagram =
-            crate::link::dds::max_datagram_bytes(inter.mtu.into(), inter.chunking, inter.listen_address());
         let config = EngineConfig {
             me: settings.me.clone(),
             kind: settings.kind,
             epoch,
             layer_scope: said_layer_scope,
-            max_datagram,
+            max_datagram: inter.wire().max_datagram_bytes(),
             limits: Limits::default(),
         };
         Engine::new(config, now, wall_ns())
@@ -353,7 +351,7 @@ impl RunningFlow {
         {
             let mut control = self.shared.control.lock();
             control.set_rules(now, live.rules.clone());
-            control.set_access(now, wall_ns() / 1_000_000, live.access.clone());
+            control.set_access(now, wall_ms(), live.access.clone());
         }
         *self.shared.live.lock() = live;
     }
@@ -367,28 +365,14 @@ impl RunningFlow {
         let until = Instant::now() + DRAIN;
         // Nothing is planned any more, and whoever comes next knows where to begin: only then are the bridges draining.
         let _ = tokio::time::timeout(DRAIN, self.leave.handed_over.cancelled()).await;
-        let still_draining = || {
-            shared.plane.with(|state| {
-                state.run_timers(Instant::now());
-                state.core.is_draining()
-            })
-        };
-        while Instant::now() < until && still_draining() {
+        while Instant::now() < until && shared.plane.is_draining() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
         // With the good-bye others take the topics over: what they write must not be overtaken by what still waits for a broker here.
-        let waits_for_brokers = || {
-            shared.plane.with(|state| {
-                state.run_timers(Instant::now());
-                state.core.has_unwritten()
-            })
-        };
-        while Instant::now() < until + CLOSE && waits_for_brokers() {
+        while Instant::now() < until + CLOSE && shared.plane.has_unwritten() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
-        shared
-            .plane
-            .with(|state| state.engine.as_mut().map(|engine| engine.goodbye(Instant::now())));
+        shared.plane.say_goodbye();
         self.leave.gone.cancel();
         let _ = tokio::time::timeout(DRAIN, self.control.finished()).await;
         if let Some(inter) = &shared.inter {

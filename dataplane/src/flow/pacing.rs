@@ -8,11 +8,12 @@ use std::time::{Duration, Instant};
 use blaze_domain::{LayerName, Priority};
 use parking_lot::Mutex;
 
+use super::inter::InterScope;
 use super::plane::{Next, Plane};
 use crate::lane::measure::RateMeter;
 use crate::limit::pacer::{BURST_DATAGRAMS, Pacer};
 use crate::limit::wire_factor::MAX_LAYERS;
-use crate::link::transport::Transport;
+use crate::link::transport::SendOutcome;
 
 /// The pacer wakes at least that often, to notice a new limit or the end.
 const IDLE: Duration = Duration::from_millis(100);
@@ -85,9 +86,10 @@ impl Egress {
     }
 
     /// The thread: sends until it is stopped.
-    pub fn run(&self, plane: &Plane, transport: &dyn Transport) {
+    pub(super) fn run(&self, plane: &Plane, inter: &InterScope) {
         let start = Instant::now();
-        let burst = BURST_DATAGRAMS * transport.wire_bytes(transport.max_datagram_bytes());
+        let wire = inter.wire();
+        let burst = BURST_DATAGRAMS * wire.bytes(wire.max_datagram_bytes());
         let mut pacer = Pacer::new(self.budget(), burst, start);
         while !self.stop.load(Ordering::Relaxed) {
             let now = Instant::now();
@@ -114,8 +116,8 @@ impl Egress {
                 control
             };
             let Some(transmit) = transmit else { continue };
-            let wire_bytes = transport.wire_bytes(transmit.datagram.len());
-            let outcome = transport.send(&transmit.to, transmit.class, transmit.datagram);
+            let wire_bytes = wire.bytes(transmit.datagram.len());
+            let outcome = inter.send(&transmit.to, transmit.class, transmit.datagram);
             let now = Instant::now();
             pacer.spend(wire_bytes, now);
             let mut traffic = self.traffic.lock();
@@ -126,7 +128,7 @@ impl Egress {
                 wire_bytes as u64,
                 transmit.control,
             );
-            if outcome == crate::link::transport::SendOutcome::NotSent {
+            if outcome == SendOutcome::NotSent {
                 traffic.not_sent += 1;
             }
         }

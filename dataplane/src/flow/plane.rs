@@ -11,19 +11,18 @@ use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use blaze_brokers::Received;
-use blaze_domain::{DropReason, FlowId, Priority, Scope};
-use blaze_proto::link::link_control::Body;
+use blaze_domain::Scope;
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::Notify;
 
 use crate::codec::pool::{CodecPool, Spawner, Urgency};
 use crate::codec::{Done, Work, guarded};
-use crate::lane::core::{DataCore, LaneLink};
+use crate::lane::core::DataCore;
 use crate::lane::load::Loads;
 use crate::lane::path::TopicId;
 use crate::lane::press::{PressJob, PressTicket, Turns};
 use crate::link::transport::{Endpoint, TransportEvent};
-use crate::link::{Engine, LaneId, LinkEvent, Submit, Transmit};
+use crate::link::{Engine, LinkEvent, Transmit};
 
 #[cfg(test)]
 mod tests;
@@ -56,6 +55,12 @@ pub fn wall_ns() -> u64 {
     u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
 }
 
+/// Milliseconds since 1970.
+#[must_use]
+pub fn wall_ms() -> u64 {
+    wall_ns() / 1_000_000
+}
+
 /// What [`Plane::next_transmit`] has found.
 #[derive(Debug)]
 pub enum Next {
@@ -75,99 +80,46 @@ pub struct PlaneState {
     pub engine: Option<Engine>,
 }
 
-/// A flow without an inter scope: nothing can be sent.
-struct NoLink;
-
-impl LaneLink for NoLink {
-    fn submit(&mut self, _now: Instant, _message: Submit<'_>) -> Result<(), DropReason> {
-        Err(DropReason::LinkDown)
-    }
-    fn queued(&self, _lane: LaneId) -> u64 {
-        0
-    }
-    fn drop_lane(&mut self, _lane: LaneId) -> u64 {
-        0
-    }
-    fn is_suspect(&self, _to: &FlowId) -> bool {
-        true
-    }
-    fn answers(&self, _to: &FlowId) -> bool {
-        false
-    }
-    fn has_room(&self, _to: &FlowId, _class: Priority, _bytes: usize) -> bool {
-        true
-    }
-    fn takes_lz4(&self, _to: &FlowId) -> bool {
-        false
-    }
-    fn tell(&mut self, _now: Instant, _to: &FlowId, _body: Body) -> bool {
-        false
-    }
-}
-
 impl PlaneState {
     /// Takes a batch from a local scope.
     pub fn ingest(&mut self, now: Instant, wall_ns: u64, topic: TopicId, from: Scope, batch: &mut Vec<Received>) {
-        match &mut self.engine {
-            Some(engine) => self.core.ingest(now, wall_ns, topic, from, batch, engine),
-            None => self.core.ingest(now, wall_ns, topic, from, batch, &mut NoLink),
-        }
+        self.core.ingest(now, wall_ns, topic, from, batch, &mut self.engine);
     }
 
     /// A thread of the pool has a turn.
     pub fn begin(&mut self, now: Instant, urgency: Urgency) -> Option<PressJob> {
-        match &mut self.engine {
-            Some(engine) => self.core.begin(now, urgency, engine),
-            None => self.core.begin(now, urgency, &mut NoLink),
-        }
+        self.core.begin(now, urgency, &mut self.engine)
     }
 
     /// Takes what came of a turn.
     pub fn pressed(&mut self, now: Instant, ticket: PressTicket, done: Done) {
-        match &mut self.engine {
-            Some(engine) => self.core.pressed(now, ticket, done, engine),
-            None => self.core.pressed(now, ticket, done, &mut NoLink),
-        }
+        self.core.pressed(now, ticket, done, &mut self.engine);
     }
 
     /// There is no pool any more.
     pub fn stop_compression(&mut self, now: Instant) {
-        match &mut self.engine {
-            Some(engine) => self.core.stop_compression(now, engine),
-            None => self.core.stop_compression(now, &mut NoLink),
-        }
+        self.core.stop_compression(now, &mut self.engine);
     }
 
     /// Takes a sample of what every bridge carries; to be called once a second.
     pub fn measure(&mut self, now: Instant) -> Loads {
-        match &self.engine {
-            Some(engine) => self.core.measure(now, engine),
-            None => self.core.measure(now, &NoLink),
-        }
+        self.core.measure(now, &self.engine)
     }
 
     /// Delivers what waited for the bridges of a topic.
     pub fn deliver_waiting(&mut self, now: Instant, topic: TopicId) {
-        match &mut self.engine {
-            Some(engine) => self.core.deliver_waiting(now, topic, engine),
-            None => self.core.deliver_waiting(now, topic, &mut NoLink),
-        }
+        self.core.deliver_waiting(now, topic, &mut self.engine);
     }
 
     /// Carries out what the link has decided; what concerns the control core goes to `news`.
     pub fn pump(&mut self, now: Instant, mut news: impl FnMut(LinkEvent)) {
-        let Some(engine) = &mut self.engine else { return };
-        while let Some(event) = engine.poll_event() {
+        while let Some(event) = self.engine.as_mut().and_then(Engine::poll_event) {
             match event {
-                LinkEvent::Deliver { frame, .. } => self.core.deliver(now, frame, engine),
+                LinkEvent::Deliver { frame, .. } => self.core.deliver(now, frame, &mut self.engine),
                 LinkEvent::LaneSent { lane, bytes, wait } => self.core.lane_sent(now, lane, bytes as u64, wait),
-                LinkEvent::LaneOut {
-                    lane, messages, bytes, ..
-                } => self.core.lane_out(lane, messages, bytes as u64),
+                LinkEvent::LaneOut { lane, bytes } => self.core.lane_out(lane, 1, bytes as u64),
                 LinkEvent::LaneCut { lane, begun } => self.core.lane_cut(lane, begun),
-                LinkEvent::LaneDropped {
-                    lane, reason, messages, ..
-                } => self.core.lane_dropped(lane, reason, messages),
+                LinkEvent::LaneDropped { lane, reason } => self.core.lane_dropped(lane, reason, 1),
                 LinkEvent::ReceiverDropped {
                     topic,
                     reason,
@@ -176,7 +128,7 @@ impl PlaneState {
                     self.core.receiver_dropped(&topic, reason, messages);
                 }
                 LinkEvent::WrittenAsked { from, topic, token } => {
-                    self.core.written_asked(now, from, topic, token, engine);
+                    self.core.written_asked(now, from, topic, token, &mut self.engine);
                 }
                 LinkEvent::Written { from, token } => self.core.written(&from, token),
                 other => {
@@ -191,17 +143,14 @@ impl PlaneState {
 
     /// Does what is due, and returns when it wants to be called again.
     pub fn run_timers(&mut self, now: Instant) -> Option<Instant> {
-        let Some(engine) = &mut self.engine else {
-            return self.core.drain(now, &mut NoLink);
-        };
-        if engine.next_timeout().is_some_and(|due| due <= now) {
+        if let Some(engine) = &mut self.engine
+            && engine.next_timeout().is_some_and(|due| due <= now)
+        {
             engine.handle_timeout(now);
         }
-        let drained = self.core.drain(now, engine);
-        match (drained, engine.next_timeout()) {
-            (Some(a), Some(b)) => Some(a.min(b)),
-            (a, b) => a.or(b),
-        }
+        let drained = self.core.drain(now, &mut self.engine);
+        let timeout = self.engine.as_ref().and_then(Engine::next_timeout);
+        drained.into_iter().chain(timeout).min()
     }
 }
 
@@ -249,7 +198,12 @@ impl Plane {
         result
     }
 
-    /// The same; the turns at the codec are left to the caller.
+    /// The same for the link, where the flow has one.
+    pub fn link<R>(&self, action: impl FnOnce(&mut Engine) -> R) -> Option<R> {
+        self.with(|state| state.engine.as_mut().map(action))
+    }
+
+    /// As [`Plane::with`]; the turns at the codec are left to the caller.
     fn locked<R>(&self, action: impl FnOnce(&mut PlaneState) -> R) -> (R, Turns) {
         let (result, told, turns) = {
             let mut state = self.state.lock();
@@ -443,18 +397,34 @@ impl Plane {
 
     /// The flow has a new life on the link, without any peer.
     pub fn begin_life(&self, epoch: u64) {
-        self.with(|state| {
-            state
-                .engine
-                .as_mut()
-                .map(|engine| engine.restart(Instant::now(), epoch))
-        });
+        self.link(|engine| engine.restart(Instant::now(), epoch));
         self.push(News::Rebuilt(epoch));
     }
 
     /// The link knows nobody any more.
     pub fn drop_peers(&self) {
-        self.with(|state| state.engine.as_mut().map(|engine| engine.leave(Instant::now())));
+        self.link(|engine| engine.leave(Instant::now()));
+    }
+
+    /// The link says good-bye to everybody.
+    pub fn say_goodbye(&self) {
+        self.link(Engine::goodbye);
+    }
+
+    /// Whether bridges still empty their queues.
+    pub fn is_draining(&self) -> bool {
+        self.with(|state| {
+            state.run_timers(Instant::now());
+            state.core.is_draining()
+        })
+    }
+
+    /// Whether something that came over the link still waits for a broker.
+    pub fn has_unwritten(&self) -> bool {
+        self.with(|state| {
+            state.run_timers(Instant::now());
+            state.core.has_unwritten()
+        })
     }
 
     /// Something else has news for the control task.

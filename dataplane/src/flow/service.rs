@@ -151,36 +151,34 @@ async fn show(readiness: &Readiness, signs: &CacheManager) {
 
 #[cfg(test)]
 mod tests {
-    use blaze_brokers::memory::MemoryHub;
-    use blaze_brokers::{Broker as _, Content, SubscribeOptions};
+    use blaze_brokers::memory::{MemoryBroker, MemoryHub};
+    use blaze_brokers::{Broker as _, Content, SubscribeOptions, Subscription};
     use blaze_domain::node_file::NodeFile;
     use blaze_runtime::{CheckStatus, Gate};
     use serde_json::{Value, json};
 
     use super::*;
 
+    /// The options of a flow's service on a node's broker, one who reads there, and the signs of life that it gets.
+    async fn on_node() -> (ServiceOptions, MemoryBroker, Subscription) {
+        let hub = MemoryHub::new("node");
+        let (reader, watchdog) = (hub.broker(), "blaze/watchdog".parse().unwrap());
+        let beats = reader.subscribe(&watchdog, SubscribeOptions::default()).await.unwrap();
+        let (layer, name) = ("edge".parse().unwrap(), NAME.parse().unwrap());
+        let options = ServiceOptions::new(layer, name, Arc::new(hub.broker()), Scope::Node);
+        (options.on_node("robot-1".parse().unwrap()), reader, beats)
+    }
+
     #[tokio::test]
     async fn a_cache_that_can_never_work_keeps_no_flow_from_being_a_service() {
-        let hub = MemoryHub::new("node");
-        let reader = hub.broker();
-        let mut beats = reader
-            .subscribe(&"blaze/watchdog".parse().unwrap(), SubscribeOptions::default())
-            .await
-            .unwrap();
+        let (options, _reader, mut beats) = on_node().await;
         let cache = json!({ "redis": { "url": "redis://127.0.0.1:1", "password_file": "not/there" } });
         let (file, _) = NodeFile::read(&json!({ "cache": cache })).unwrap();
-        let options = ServiceOptions {
-            cache: Some(file.cache_redis().unwrap().clone()),
-            ..ServiceOptions::new(
-                "edge".parse().unwrap(),
-                "blaze-flow".parse().unwrap(),
-                Arc::new(hub.broker()),
-                Scope::Node,
-            )
-        };
+        let cache = Some(file.cache_redis().unwrap().clone());
+        let options = ServiceOptions { cache, ..options };
         let refused = ServiceManager::start(options.clone()).await;
         assert!(matches!(refused, Err(SdkError::Cache(_))));
-        let manager = started(options.on_node("robot-1".parse().unwrap())).await.unwrap();
+        let manager = started(options).await.unwrap();
         manager.cache().set_state(ServiceState::Ready);
         assert_eq!(beats.receive(&mut Vec::new(), 1).await, 1);
         manager.shutdown().await;
@@ -188,38 +186,24 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn a_flow_is_unhealthy_when_it_is_not_ready_for_a_while_and_not_when_it_ends() {
-        let hub = MemoryHub::new("node");
-        let reader = hub.broker();
-        let mut beats = reader
-            .subscribe(&"blaze/watchdog".parse().unwrap(), SubscribeOptions::default())
-            .await
-            .unwrap();
-        let options = ServiceOptions::new(
-            "edge".parse().unwrap(),
-            "blaze-flow".parse().unwrap(),
-            Arc::new(hub.broker()),
-            Scope::Node,
-        );
-        let manager = ServiceManager::start(options.on_node("robot-1".parse().unwrap()))
-            .await
-            .unwrap();
+        let (options, _reader, mut beats) = on_node().await;
+        let manager = ServiceManager::start(options).await.unwrap();
         let readiness = Readiness::new();
         readiness.add("inter", Gate::Decides, CheckStatus::Failed, "");
         let steps = async {
-            let pause = |seconds| tokio::time::sleep(Duration::from_secs(seconds));
-            pause(1).await;
-            readiness.set("inter", CheckStatus::Ok, "");
-            pause(1).await;
-            readiness.set("inter", CheckStatus::Failed, "a moment");
-            pause(1).await;
-            readiness.set("inter", CheckStatus::Ok, "");
-            pause(1).await;
-            readiness.set("inter", CheckStatus::Failed, "for long");
-            pause(20).await;
-            readiness.set("inter", CheckStatus::Ok, "");
-            pause(1).await;
+            for (status, seconds) in [
+                (CheckStatus::Failed, 1),
+                (CheckStatus::Ok, 1),
+                (CheckStatus::Failed, 1),
+                (CheckStatus::Ok, 1),
+                (CheckStatus::Failed, 20),
+                (CheckStatus::Ok, 1),
+            ] {
+                readiness.set("inter", status, "");
+                tokio::time::sleep(Duration::from_secs(seconds)).await;
+            }
             readiness.stop();
-            pause(4).await;
+            tokio::time::sleep(Duration::from_secs(4)).await;
         };
         tokio::select! {
             () = steps => {}

@@ -1,11 +1,12 @@
 //! What one flow needs to know of its node file.
 
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{Ipv4Addr, SocketAddr};
 
 use blaze_domain::node_file::{AccessRules, AutoBool, BandwidthSection, Chunking, FlowSection, NodeFile};
 use blaze_domain::{FlowId, LayerKind};
 
 use crate::lane::press::CompressionRules;
+use crate::link::dds::Wire;
 use crate::plan::PlanRules;
 
 /// The inter scope of a flow.
@@ -105,9 +106,8 @@ impl TryFrom<&NodeFile> for FlowSettings {
 }
 
 impl InterSettings {
-    /// The address as the transport wants it.
-    #[must_use]
-    pub fn listen_address(&self) -> IpAddr {
-        IpAddr::V4(self.listen)
+    /// What datagrams become on the wire.
+    pub(crate) fn wire(&self) -> Wire {
+        Wire::new(self.mtu.into(), self.chunking, self.listen.is_loopback())
     }
 }

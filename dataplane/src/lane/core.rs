@@ -63,33 +63,36 @@ pub trait LaneLink {
     /// Whether a flow decompresses what comes over the link; one that is not known does not.
     fn takes_lz4(&self, to: &FlowId) -> bool;
     /// Tells a flow something. `false`: it could not be queued.
-    fn tell(&mut self, now: Instant, to: &FlowId, body: Body) -> bool;
+    fn tell(&mut self, to: &FlowId, body: Body) -> bool;
 }
 
-impl LaneLink for Engine {
+/// The link of a flow; one without an inter scope has none, and sends nothing.
+impl LaneLink for Option<Engine> {
     fn submit(&mut self, now: Instant, message: Submit<'_>) -> Result<(), DropReason> {
-        Engine::submit(self, now, message)
+        self.as_mut().ok_or(DropReason::LinkDown)?.submit(now, message)
     }
     fn queued(&self, lane: LaneId) -> u64 {
-        self.lane_queued(lane).messages
+        self.as_ref().map_or(0, |engine| engine.lane_queued(lane).messages)
     }
     fn drop_lane(&mut self, lane: LaneId) -> u64 {
-        Engine::drop_lane(self, lane).messages
+        self.as_mut().map_or(0, |engine| engine.drop_lane(lane).messages)
     }
     fn is_suspect(&self, to: &FlowId) -> bool {
-        self.peer(to).is_none_or(|peer| peer.state != PeerState::Up)
+        let peer = self.as_ref().and_then(|engine| engine.peer(to));
+        peer.is_none_or(|peer| peer.state != PeerState::Up)
     }
     fn answers(&self, to: &FlowId) -> bool {
-        self.answers_written(to)
+        self.as_ref().is_some_and(|engine| engine.answers_written(to))
     }
     fn has_room(&self, to: &FlowId, class: Priority, bytes: usize) -> bool {
-        Engine::has_room(self, to, class, bytes)
+        self.as_ref().is_none_or(|engine| engine.has_room(to, class, bytes))
     }
     fn takes_lz4(&self, to: &FlowId) -> bool {
-        Engine::takes_lz4(self, to)
+        self.as_ref().is_some_and(|engine| engine.takes_lz4(to))
     }
-    fn tell(&mut self, now: Instant, to: &FlowId, body: Body) -> bool {
-        self.send_control(now, to, body).is_ok()
+    fn tell(&mut self, to: &FlowId, body: Body) -> bool {
+        self.as_mut()
+            .is_some_and(|engine| engine.send_control(to, body).is_ok())
     }
 }
 

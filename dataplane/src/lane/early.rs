@@ -8,6 +8,8 @@ use std::time::{Duration, Instant};
 
 use blaze_proto::Frame;
 
+use super::measure::micros;
+
 /// How long a message waits for its bridge: twice what a change of the registry takes to reach the plan.
 pub(super) const WAIT: Duration = Duration::from_millis(500);
 /// Messages that wait at most, of all topics; the oldest give way.
@@ -72,7 +74,7 @@ impl Early {
         self.waiting = left;
         let aged = taken.into_iter().map(|(since, frame)| {
             self.bytes -= frame.wire_len();
-            let waited = u64::try_from(now.saturating_duration_since(since).as_micros()).unwrap_or(u64::MAX);
+            let waited = micros(now.saturating_duration_since(since));
             let (hops, age_us) = (frame.hops(), frame.age_us().saturating_add(waited));
             frame.with_hops_and_age(hops, age_us)
         });

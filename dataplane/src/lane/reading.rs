@@ -191,16 +191,27 @@ impl DataCore {
 mod tests {
     use super::*;
 
-    fn place(offset: i64) -> Option<Place> {
+    fn place_in(partition: usize, offset: i64) -> Option<Place> {
         Some(Place {
-            partition: 0,
+            partition,
             offset,
             appended_ms: None,
         })
     }
 
+    fn place(offset: i64) -> Option<Place> {
+        place_in(0, offset)
+    }
+
     fn at_0(offset: i64) -> Begin {
         Begin::At([offset].into())
+    }
+
+    fn since(latest: &[i64]) -> Begin {
+        Begin::Since {
+            appended_ms: 5,
+            latest: latest.into(),
+        }
     }
 
     /// One partition, read until there.
@@ -211,14 +222,20 @@ mod tests {
         places
     }
 
-    /// Takes over, and subscribes at once.
-    fn take_over(places: &mut Places, begin: &Begin, again: bool) -> Begin {
-        places.take_over(begin);
-        let begin = places.begin(again);
-        if let Begin::At(offsets) = &begin {
-            places.stands(offsets);
+    impl Places {
+        /// Takes over, and subscribes at once.
+        fn takes(&mut self, begin: &Begin) -> Begin {
+            self.take_over(begin);
+            let begin = self.begin(!self.next.is_empty());
+            if let Begin::At(offsets) = &begin {
+                self.stands(offsets);
+            }
+            begin
         }
-        begin
+
+        fn read<const COUNT: usize>(&mut self, offsets: [i64; COUNT]) -> [For; COUNT] {
+            offsets.map(|offset| self.take(place(offset)))
+        }
     }
 
     #[test]
@@ -232,45 +249,42 @@ mod tests {
             "nothing was read yet: the next one begins there too"
         );
         places.stands(&[7]);
-        assert_eq!(places.take(place(7)), For::All);
+        assert_eq!(places.read([7]), [For::All]);
         assert_eq!(places.stopped_at(), [8]);
     }
 
     #[test]
     fn what_was_read_before_is_read_again_for_the_bridges_out_of_the_layer_alone() {
         let mut places = read_until(10);
-        assert_eq!(take_over(&mut places, &at_0(7), true), at_0(7));
-        let taken: Vec<For> = (7..12).map(|offset| places.take(place(offset))).collect();
-        assert_eq!(taken, [For::Outside, For::Outside, For::Outside, For::All, For::All]);
+        assert_eq!(places.takes(&at_0(7)), at_0(7));
+        assert_eq!(
+            places.read([7, 9, 10, 11]),
+            [For::Outside, For::Outside, For::All, For::All]
+        );
     }
 
     #[test]
     fn what_another_has_carried_is_not_carried_again() {
         let mut places = read_until(5);
-        assert_eq!(take_over(&mut places, &at_0(7), true), at_0(5));
+        assert_eq!(places.takes(&at_0(7)), at_0(5));
         assert_eq!(places.stopped_at(), [7]);
-        let taken: Vec<For> = (5..9).map(|offset| places.take(place(offset))).collect();
-        assert_eq!(taken, [For::Inside, For::Inside, For::All, For::All]);
+        assert_eq!(
+            places.read([5, 6, 7, 8]),
+            [For::Inside, For::Inside, For::All, For::All]
+        );
     }
 
     #[test]
     fn after_a_crash_it_begins_by_time_and_no_later_than_it_stood() {
-        let since = |latest: &[i64]| Begin::Since {
-            appended_ms: 5,
-            latest: latest.into(),
-        };
-        assert_eq!(take_over(&mut Places::default(), &since(&[]), false), since(&[]));
+        assert_eq!(Places::default().takes(&since(&[])), since(&[]));
         let mut places = read_until(10);
-        assert_eq!(take_over(&mut places, &since(&[]), true), since(&[10]));
+        assert_eq!(places.takes(&since(&[])), since(&[10]));
         assert!(
             !places.are_exact(8) && places.stopped_at().is_empty(),
             "found out by the server"
         );
         places.stands(&[8]);
-        assert_eq!(
-            [places.take(place(8)), places.take(place(10))],
-            [For::Outside, For::All]
-        );
+        assert_eq!(places.read([8, 10]), [For::Outside, For::All]);
     }
 
     #[test]
@@ -284,20 +298,11 @@ mod tests {
         assert_eq!(places.begin(true), at_0(4));
         assert_eq!(places.begin(false), Begin::Now, "there was a pause");
         assert_eq!(places.take(None), For::All);
-        let far = Place {
-            partition: usize::MAX,
-            offset: i64::MAX,
-            appended_ms: None,
-        };
-        assert_eq!(places.take(Some(far)), For::All);
+        assert_eq!(places.take(place_in(usize::MAX, i64::MAX)), For::All);
     }
 
     #[test]
     fn a_takeover_lasts_until_its_subscription_stands() {
-        let since = |latest: &[i64]| Begin::Since {
-            appended_ms: 5,
-            latest: latest.into(),
-        };
         for (takes, begins) in [(at_0(7), at_0(7)), (since(&[]), since(&[]))] {
             let mut places = Places::default();
             places.take_over(&takes);
@@ -332,10 +337,7 @@ mod tests {
         assert_eq!(places.take(place(10)), For::Inside, "it comes again");
         assert_eq!(places.begin(true), at_0(7));
         places.stands(&[7]);
-        assert_eq!(
-            [places.take(place(10)), places.take(place(11))],
-            [For::Outside, For::All]
-        );
+        assert_eq!(places.read([10, 11]), [For::Outside, For::All]);
     }
 
     #[test]
@@ -352,17 +354,13 @@ mod tests {
 
     #[test]
     fn partitions_of_which_nothing_is_known_are_not_taken_for_known() {
-        let third = |offset: i64| Place {
-            partition: 2,
-            ..place(offset).unwrap()
-        };
         let mut places = Places::default();
-        assert_eq!(places.take(Some(third(9))), For::All);
+        assert_eq!(places.take(place_in(2, 9)), For::All);
         assert_eq!(places.stopped_at(), Vec::<i64>::new());
         assert!(!places.are_exact(8));
         assert_eq!(places.begin(true), Begin::Now);
         places.stands(&[5, 6, 9]);
-        places.take(Some(third(9)));
+        places.take(place_in(2, 9));
         assert_eq!(places.stopped_at(), [5, 6, 10]);
         assert!(places.are_exact(8));
         // Who takes over was told of two: the third goes on where it stands.
@@ -374,20 +372,15 @@ mod tests {
     #[test]
     fn nobody_had_anything_of_a_topic_that_was_made_anew() {
         let mut places = read_until(10);
-        take_over(&mut places, &at_0(20), true);
-        let taken = [10, 0, 1].map(|offset| places.take(place(offset)));
-        assert_eq!(taken, [For::Inside, For::All, For::All]);
+        places.takes(&at_0(20));
+        assert_eq!(places.read([10, 0, 1]), [For::Inside, For::All, For::All]);
         assert_eq!(places.stopped_at(), [2]);
     }
 
     #[test]
     fn a_partition_that_comes_later_was_read_from_its_beginning() {
         let mut places = read_until(5);
-        let third = Place {
-            partition: 2,
-            ..place(0).unwrap()
-        };
-        places.take(Some(third));
+        places.take(place_in(2, 0));
         assert_eq!(places.stopped_at(), [5, 0, 1]);
         assert!(places.are_exact(8));
     }

@@ -289,7 +289,7 @@ impl BridgeState {
                 return Some(until.min(later));
             }
             let (topic, token) = (topic.to_owned(), unwritten.token);
-            if link.tell(now, receiver, Body::WrittenRequest(WrittenRequest { topic, token })) {
+            if link.tell(receiver, Body::WrittenRequest(WrittenRequest { topic, token })) {
                 unwritten.ask_at = Some(now + unwritten.pause);
                 unwritten.pause = (unwritten.pause * 2).min(ASK_LATER);
             } else {
@@ -482,7 +482,7 @@ impl DataCore {
             marks: None,
         };
         if self.is_written(&mut question) {
-            link.tell(now, &question.from, Body::Written(Written { token }));
+            link.tell(&question.from, Body::Written(Written { token }));
         } else if self.succession.questions.len() < MAX_QUESTIONS && of_one < MAX_QUESTIONS_OF_ONE {
             self.succession.questions.push(question);
             self.stirred = true;
@@ -516,7 +516,7 @@ impl DataCore {
             }
             let written = self.is_written(question);
             if written {
-                link.tell(now, &question.from, Body::Written(Written { token: question.token }));
+                link.tell(&question.from, Body::Written(Written { token: question.token }));
             }
             !written
         });

@@ -22,6 +22,7 @@ mod trial;
 use std::time::{Duration, Instant};
 
 use path::{Delay, Loss};
+use serde::Serialize;
 use trial::{DRAINING, Drain, Phase, SPARING, Spare, TRIALS, Verdict};
 
 /// The rate never falls below this, in bytes per second, unless the limit is lower: what is small must get through.
@@ -75,7 +76,8 @@ pub struct Seen {
 }
 
 /// What is known of a link.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum State {
     /// Nothing limits below the limit, as far as is known.
     Unknown,
@@ -85,19 +87,6 @@ pub enum State {
     Steady,
     /// It finds out whether a delay or a loss is its own doing.
     BackingOff,
-}
-
-impl State {
-    /// As in the admin JSON.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::SlowStart => "slow_start",
-            Self::Steady => "steady",
-            Self::BackingOff => "backing_off",
-        }
-    }
 }
 
 /// The estimate of one link, and the rate that may be sent over it.
@@ -243,18 +232,6 @@ impl Capacity {
             (Phase::Rising, None) if self.rate < self.limit => State::SlowStart,
             (Phase::Rising, None) => State::Unknown,
         }
-    }
-
-    /// How much longer the newest round trip took than that of the empty path.
-    #[must_use]
-    pub fn queueing_delay(&self) -> Duration {
-        self.delay.queue
-    }
-
-    /// Share of bytes that was lost of late, 0 to 1.
-    #[must_use]
-    pub fn loss(&self) -> f64 {
-        self.loss.newest
     }
 
     fn advance(&mut self, now: Instant) {

@@ -40,53 +40,19 @@ pub enum LinkRate {
     Carries(f64),
 }
 
-/// What the budgets come from, at one moment.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Measured {
-    /// The links to all flows that there are.
-    pub links: BTreeMap<FlowId, LinkRate>,
-}
-
-/// A limit and what it leaves for messages.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Budget {
-    /// The limit, in wire bytes per second.
-    pub wire_bytes_per_s: f64,
-    /// Bytes per second of `s · α` that it leaves.
-    pub message_bytes_per_s: f64,
-}
-
-impl Budget {
-    /// The wire factor ω: what has to be allowed on the wire for a byte of `s · α`.
-    #[must_use]
-    pub fn wire_factor(&self) -> f64 {
-        self.wire_bytes_per_s / self.message_bytes_per_s.max(f64::MIN_POSITIVE)
-    }
-}
-
-/// All budgets at one moment.
-#[derive(Debug, Clone, PartialEq)]
-pub struct AllBudgets {
-    /// Of the process.
-    pub process: Budget,
-    /// Of the links to layers for which the node file gives a limit.
-    pub links: BTreeMap<LayerName, Budget>,
-    /// Of the links to flows that can carry less than their limit; `true`: for the moment, see [`LinkRate::Passing`].
-    pub flows: BTreeMap<FlowId, (Budget, bool)>,
-}
-
 /// The state of one flow's allocation.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Limiter {
     bandwidth: BandwidthSection,
-    measured: Measured,
+    /// The links to all flows that there are.
+    measured: BTreeMap<FlowId, LinkRate>,
     all: WireFactor,
     links: BTreeMap<LayerName, WireFactor>,
     /// Flows that lanes go to, by layer, and what standard topics take of the links to them; as of the last run.
     receivers: BTreeMap<LayerName, BTreeSet<FlowId>>,
     standard: BTreeMap<FlowId, f64>,
     /// Budgets that the last run was made with.
-    used: Option<AllBudgets>,
+    used: Option<Budgets>,
     due: bool,
     grown: bool,
     ran: Option<Instant>,
@@ -103,19 +69,8 @@ impl Limiter {
     pub fn new(bandwidth: BandwidthSection) -> Self {
         Self {
             bandwidth,
-            measured: Measured::default(),
-            all: WireFactor::default(),
-            links: BTreeMap::new(),
-            receivers: BTreeMap::new(),
-            standard: BTreeMap::new(),
-            used: None,
             due: true,
-            grown: false,
-            ran: None,
-            looked: None,
-            last: None,
-            runs: 0,
-            told: None,
+            ..Self::default()
         }
     }
 
@@ -151,7 +106,13 @@ impl Limiter {
     }
 
     /// Takes what was measured: totals of all links together and of those to each layer, and what the links can carry.
-    pub fn look(&mut self, now: Instant, all: Totals, links: &BTreeMap<LayerName, Totals>, measured: Measured) {
+    pub fn look(
+        &mut self,
+        now: Instant,
+        all: Totals,
+        links: &BTreeMap<LayerName, Totals>,
+        measured: BTreeMap<FlowId, LinkRate>,
+    ) {
         self.all.sample(now, all);
         self.links.retain(|layer, _| links.contains_key(layer));
         for (layer, totals) in links {
@@ -173,38 +134,36 @@ impl Limiter {
     }
 
     /// The budget of the process, and those of links that have one of their own or can carry less.
-    #[must_use]
-    pub fn budgets(&self) -> AllBudgets {
+    fn budgets(&self) -> Budgets {
         let of_layer = |layer: &LayerName| {
             let limit = self.bandwidth.link_limit_bytes_per_s(layer)?;
             Some((layer.clone(), self.budget(limit, Some(layer), 1.0)))
         };
         let of_flow = |(flow, rate): (&FlowId, &LinkRate)| {
-            let (bytes_per_s, passing) = match *rate {
+            let (carries, passing) = match *rate {
                 LinkRate::Free => return None,
                 LinkRate::Passing(bytes_per_s) => (bytes_per_s, true),
                 LinkRate::Carries(bytes_per_s) => (bytes_per_s, false),
             };
-            let budget = self.budget(bytes_per_s, Some(&flow.layer), self.control_share(&flow.layer));
-            Some((flow.clone(), (budget, passing)))
+            let bytes_per_s = self.budget(carries, Some(&flow.layer), self.control_share(&flow.layer));
+            let budget = FlowBudget { bytes_per_s, passing };
+            Some((flow.clone(), budget))
         };
-        AllBudgets {
+        Budgets {
             process: self.budget(self.bandwidth.limit_bytes_per_s(), None, 1.0),
             links: self.bandwidth.links.keys().filter_map(of_layer).collect(),
-            flows: self.measured.links.iter().filter_map(of_flow).collect(),
+            flows: self.measured.iter().filter_map(of_flow).collect(),
         }
     }
 
-    /// What a limit of all links (`None`) or of those to a layer leaves. `share` of the control messages there go that way.
-    fn budget(&self, limit: f64, layer: Option<&LayerName>, share: f64) -> Budget {
+    /// What a limit of all links (`None`) or of those to a layer leaves, in bytes per second of `s · α`. `share` of the control messages there go
+    /// that way.
+    fn budget(&self, limit: f64, layer: Option<&LayerName>, share: f64) -> f64 {
         let link = layer.map_or(Some(&self.all), |layer| self.links.get(layer));
         let control = link.map_or(0.0, WireFactor::control_bytes_per_s) * share;
-        Budget {
-            wire_bytes_per_s: limit,
-            message_bytes_per_s: match self.bandwidth.wire_overhead {
-                WireOverhead::Measured => budget(limit, control, self.of_messages(layer)),
-                WireOverhead::Off => limit,
-            },
+        match self.bandwidth.wire_overhead {
+            WireOverhead::Measured => budget(limit, control, self.of_messages(layer)),
+            WireOverhead::Off => limit,
         }
     }
 
@@ -217,7 +176,7 @@ impl Limiter {
 
     /// How much of the control messages to a layer goes to one flow of it.
     fn control_share(&self, layer: &LayerName) -> f64 {
-        let flows = self.measured.links.keys().filter(|flow| flow.layer == *layer).count();
+        let flows = self.measured.keys().filter(|flow| flow.layer == *layer).count();
         1.0 / flows.max(1) as f64
     }
 
@@ -225,20 +184,7 @@ impl Limiter {
     pub fn run(&mut self, now: Instant, demands: &[Demand<'_>]) -> &Rates {
         let budgets = self.budgets();
         let terms = terms(&self.bandwidth);
-        let of_flow = |(flow, (budget, passing)): (&FlowId, &(Budget, bool))| {
-            let budget = FlowBudget {
-                bytes_per_s: budget.message_bytes_per_s,
-                passing: *passing,
-            };
-            (flow.clone(), budget)
-        };
-        let of_layer = |(layer, budget): (&LayerName, &Budget)| (layer.clone(), budget.message_bytes_per_s);
-        let messages = Budgets {
-            process: budgets.process.message_bytes_per_s,
-            links: budgets.links.iter().map(of_layer).collect(),
-            flows: budgets.flows.iter().map(of_flow).collect(),
-        };
-        let rates = rates(&messages, &terms, demands);
+        let rates = rates(&budgets, &terms, demands);
         let on_the_wire = |(flow, bytes_per_s): (FlowId, f64)| {
             let control = self.links.get(&flow.layer).map_or(0.0, WireFactor::control_bytes_per_s);
             let wire = bytes_per_s * self.of_messages(Some(&flow.layer)) + control * self.control_share(&flow.layer);
@@ -297,7 +243,8 @@ impl Limiter {
         if self.bandwidth.wire_overhead == WireOverhead::Measured {
             factor?.of_messages(self.bandwidth.overhead)?;
         }
-        Some(self.budget(limit, layer, 1.0).wire_factor())
+        // What has to be allowed on the wire for a byte of `s · α`.
+        Some(limit / self.budget(limit, layer, 1.0).max(f64::MIN_POSITIVE))
     }
 
     /// Wire bytes per second that the links to all flows (`None`) or to those of a layer carry that lanes go to; `None` while one of them was not
@@ -310,7 +257,7 @@ impl Limiter {
                 continue;
             }
             for flow in flows {
-                match self.measured.links.get(flow) {
+                match self.measured.get(flow) {
                     Some(LinkRate::Carries(bytes_per_s)) => *sum.get_or_insert(0.0) += *bytes_per_s,
                     Some(LinkRate::Free | LinkRate::Passing(_)) | None => return None,
                 }
@@ -352,22 +299,20 @@ fn tell(told: &mut Option<(Instant, bool)>, limit_mbps: f64, rates: &Rates, now:
 }
 
 /// Whether a budget has come, gone or moved.
-fn has_moved(before: &AllBudgets, after: &AllBudgets) -> bool {
-    let moved = |before: &Budget, after: &Budget| {
-        let by = (after.message_bytes_per_s - before.message_bytes_per_s).abs();
-        by > MOVED * before.message_bytes_per_s
-    };
+fn has_moved(before: &Budgets, after: &Budgets) -> bool {
+    let moved = |before: f64, after: f64| (after - before).abs() > MOVED * before;
     let of_links = before.links.len() != after.links.len()
         || after
             .links
             .iter()
-            .any(|(layer, after)| before.links.get(layer).is_none_or(|before| moved(before, after)));
+            .any(|(layer, after)| before.links.get(layer).is_none_or(|before| moved(*before, *after)));
     let of_flows = before.flows.len() != after.flows.len()
-        || after.flows.iter().any(|(flow, (after, passing))| {
-            let before = before.flows.get(flow);
-            before.is_none_or(|(before, was_passing)| was_passing != passing || moved(before, after))
+        || after.flows.iter().any(|(flow, after)| {
+            let differs =
+                |before: &FlowBudget| before.passing != after.passing || moved(before.bytes_per_s, after.bytes_per_s);
+            before.flows.get(flow).is_none_or(differs)
         });
-    moved(&before.process, &after.process) || of_links || of_flows
+    moved(before.process, after.process) || of_links || of_flows
 }
 
 #[cfg(test)]
@@ -415,22 +360,21 @@ mod tests {
         })
     }
 
-    fn measured(links: &[(&str, LinkRate)]) -> Measured {
-        Measured {
-            links: links.iter().map(|(name, rate)| (flow(name), *rate)).collect(),
-        }
+    /// The links to these flows are measured.
+    fn look(limiter: &mut Limiter, now: Instant, links: &[(&str, LinkRate)]) {
+        let links = links.iter().map(|(name, rate)| (flow(name), *rate)).collect();
+        limiter.look(now, Totals::default(), &BTreeMap::new(), links);
     }
 
-    fn look(limiter: &mut Limiter, now: Instant, measured: Measured) {
-        limiter.look(now, Totals::default(), &BTreeMap::new(), measured);
+    /// What a camera to one flow may send.
+    fn camera_hz(limiter: &mut Limiter) -> f64 {
+        limiter.run(Instant::now(), &[camera(&[flow("cloud/a")])]).topics[0].lanes_hz[0]
     }
 
     #[test]
     fn without_the_wire_factor_the_whole_limit_is_given_out() {
-        let cloud = [flow("cloud/a")];
         let mut limiter = limiter(8.0, WireOverhead::Off);
-        let hz = limiter.run(Instant::now(), &[camera(&cloud)]).topics[0].lanes_hz[0];
-        assert!((hz - 1_048_576.0 / 100_000.0).abs() < 1e-9);
+        assert!((camera_hz(&mut limiter) - 1_048_576.0 / 100_000.0).abs() < 1e-9);
         assert_eq!(limiter.wire_factor(None), Some(1.0));
     }
 
@@ -478,12 +422,7 @@ mod tests {
                 control_wire: seconds * 1_000,
                 reckoned: seconds * 1_000_000,
             };
-            limiter.look(
-                now,
-                totals,
-                &BTreeMap::from([(cloud.clone(), totals)]),
-                Measured::default(),
-            );
+            limiter.look(now, totals, &BTreeMap::from([(cloud.clone(), totals)]), BTreeMap::new());
             if limiter.is_due(now) {
                 limiter.run(now, &[camera(&receivers)]);
                 runs.push(second);
@@ -507,42 +446,32 @@ mod tests {
 
     #[test]
     fn a_link_that_carries_less_than_its_limit_bounds_its_lanes() {
-        let (cloud, receivers) = (cloud(), [flow("cloud/a")]);
+        let cloud = cloud();
         let mut limiter = limiter(80.0, WireOverhead::Off);
         limiter.set_bandwidth(BandwidthSection {
             links: BTreeMap::from([(cloud.clone(), blaze_domain::node_file::LinkLimit { limit_mbps: 40.0 })]),
             ..limiter.bandwidth().clone()
         });
-        let hz = |limiter: &mut Limiter| limiter.run(Instant::now(), &[camera(&receivers)]).topics[0].lanes_hz[0];
-        assert!((hz(&mut limiter) - 5.0 * 1_048_576.0 / 100_000.0).abs() < 1e-9);
-        look(
-            &mut limiter,
-            Instant::now(),
-            measured(&[("cloud/a", LinkRate::Carries(1e6))]),
-        );
+        assert!((camera_hz(&mut limiter) - 5.0 * 1_048_576.0 / 100_000.0).abs() < 1e-9);
+        look(&mut limiter, Instant::now(), &[("cloud/a", LinkRate::Carries(1e6))]);
         assert!(limiter.due);
-        assert!((hz(&mut limiter) - 10.0).abs() < 1e-9);
+        assert!((camera_hz(&mut limiter) - 10.0).abs() < 1e-9);
         assert_eq!(limiter.measured_bytes_per_s(Some(&cloud)), Some(1e6));
     }
 
     /// A replica that gets nothing says nothing of the link to the one that gets all.
     #[test]
     fn an_idle_replica_does_not_hide_a_slow_link() {
-        let receivers = [flow("cloud/a")];
         let mut limiter = limiter(80.0, WireOverhead::Off);
         let links = [
             ("cloud/a", LinkRate::Carries(1e6)),
             ("cloud/b", LinkRate::Free),
             ("fog/c", LinkRate::Free),
         ];
-        look(&mut limiter, Instant::now(), measured(&links));
-        let hz = limiter.run(Instant::now(), &[camera(&receivers)]).topics[0].lanes_hz[0];
-        assert!((hz - 10.0).abs() < 1e-9, "{hz}");
-        assert_eq!(
-            limiter.measured_bytes_per_s(None),
-            Some(1e6),
-            "lanes go to one flow alone"
-        );
+        look(&mut limiter, Instant::now(), &links);
+        assert!((camera_hz(&mut limiter) - 10.0).abs() < 1e-9);
+        let measured = limiter.measured_bytes_per_s(None);
+        assert_eq!(measured, Some(1e6), "lanes go to one flow alone");
     }
 
     #[test]
@@ -556,7 +485,7 @@ mod tests {
                 ("cloud/b", LinkRate::Carries(2e6)),
                 ("fog/c", c),
             ];
-            look(&mut limiter, Instant::now(), measured(&links));
+            look(&mut limiter, Instant::now(), &links);
             let layer = |name: &str| limiter.measured_bytes_per_s(Some(&name.parse().unwrap()));
             (
                 limiter.measured_bytes_per_s(None),
@@ -578,7 +507,7 @@ mod tests {
         look(
             &mut limiter,
             Instant::now(),
-            measured(&[("cloud/a", LinkRate::Passing(150_000.0))]),
+            &[("cloud/a", LinkRate::Passing(150_000.0))],
         );
         let demands = [camera(&receivers), topic("odom", 1_000, &receivers)];
         let rates = limiter.run(Instant::now(), &demands);
@@ -591,7 +520,7 @@ mod tests {
         look(
             &mut limiter,
             Instant::now(),
-            measured(&[("cloud/a", LinkRate::Carries(150_000.0))]),
+            &[("cloud/a", LinkRate::Carries(150_000.0))],
         );
         assert!(limiter.due && !limiter.run(Instant::now(), &demands).feasible);
     }
@@ -613,7 +542,7 @@ mod tests {
         }
         assert_eq!(told.len(), 3, "{told:?}");
         // What could not be told then is told when its time has come.
-        look(&mut limiter, start + SECOND * 60, Measured::default());
+        look(&mut limiter, start + SECOND * 60, &[]);
         assert_eq!(
             limiter.told.map(|(_, feasible)| feasible),
             limiter.last().map(|rates| rates.feasible)

@@ -104,17 +104,6 @@ impl Assembly {
 
     /// Notes a range. Returns whether any of it is new.
     fn note(&mut self, start: u32, end: u32) -> bool {
-        if let Some(last) = self.ranges.last_mut()
-            && start >= last.1
-        {
-            if start == last.1 {
-                last.1 = end;
-            } else {
-                self.ranges.push((start, end));
-            }
-            self.received += (end - start) as usize;
-            return true;
-        }
         let from = self.ranges.partition_point(|range| range.1 < start);
         let to = self.ranges.partition_point(|range| range.0 <= end);
         let (mut joined, mut known) = ((start, end), 0);

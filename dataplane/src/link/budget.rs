@@ -66,10 +66,6 @@ pub struct LinkCapacity {
     pub measured_bytes_per_s: Option<f64>,
     /// How it stands with the estimate.
     pub state: State,
-    /// How much longer the newest round trip took than that of the empty path.
-    pub queueing_delay: Duration,
-    /// Share of bytes that was lost of late, 0 to 1.
-    pub loss: f64,
 }
 
 /// The budgets as they stand: who may send when.
@@ -241,8 +237,6 @@ impl PathBudget {
             bytes_per_s: capacity.bytes_per_s(),
             measured_bytes_per_s: capacity.measured(),
             state: capacity.state(),
-            queueing_delay: capacity.queueing_delay(),
-            loss: capacity.loss(),
         })
     }
 }

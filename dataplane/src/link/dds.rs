@@ -26,9 +26,8 @@ use blaze_domain::{FlowId, Priority};
 use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};
 
-use super::budget::PacketSize;
-use super::transport::{Endpoint, SendOutcome, Transport, TransportEvent};
-use wire::Wire;
+use super::transport::{Endpoint, SendOutcome, TransportEvent};
+pub(crate) use wire::Wire;
 
 /// Most endpoints that are written to at a time.
 const MAX_ENDPOINTS: usize = 1024;
@@ -38,24 +37,6 @@ const MAX_HEARD: usize = 1024;
 /// First part of all link topics.
 const TOPIC_PREFIX: &str = "blaze/link/";
 const CLASSES: usize = Priority::ALL.len();
-
-/// Largest datagram that a transport with these settings takes, in bytes.
-#[must_use]
-pub fn max_datagram_bytes(mtu: usize, chunking: Chunking, listen: IpAddr) -> usize {
-    Wire::new(mtu, chunking, listen.is_loopback()).max_datagram_bytes()
-}
-
-/// Bytes that a datagram takes on the wire with these settings.
-#[must_use]
-pub fn wire_bytes(mtu: usize, chunking: Chunking, listen: IpAddr, datagram_bytes: usize) -> usize {
-    Wire::new(mtu, chunking, listen.is_loopback()).bytes(datagram_bytes)
-}
-
-/// What datagrams become on the wire, for the budgets of an engine.
-#[must_use]
-pub fn packets(mtu: usize, chunking: Chunking, listen: IpAddr) -> PacketSize {
-    Wire::new(mtu, chunking, listen.is_loopback()).packets()
-}
 
 /// Called with everything that happens. It runs in the threads of the transport and must not wait for long.
 pub type EventSink = Arc<dyn Fn(TransportEvent) + Send + Sync>;
@@ -210,6 +191,85 @@ impl DdsTransport {
         status
     }
 
+    /// Sends one datagram to one endpoint on the topic of a class. Never waits.
+    #[must_use]
+    pub fn send(&self, to: &Endpoint, class: Priority, datagram: Bytes) -> SendOutcome {
+        let fits = datagram.len() <= self.shared.wire.max_datagram_bytes();
+        let sent = fits
+            && self
+                .shared
+                .writers
+                .read()
+                .get(to)
+                .and_then(|writers| writers[class as usize].as_ref())
+                .is_some_and(|writer| writer.write(datagram));
+        if sent {
+            SendOutcome::Sent
+        } else {
+            self.shared.not_sent.fetch_add(1, Ordering::Relaxed);
+            SendOutcome::NotSent
+        }
+    }
+
+    /// Makes writers to an endpoint, if there are none.
+    pub fn connect(&self, to: &Endpoint) {
+        {
+            let mut wanted = self.shared.wanted.lock();
+            if wanted.len() >= MAX_ENDPOINTS && !wanted.contains_key(to) {
+                return;
+            }
+            let classes = wanted.entry(to.clone()).or_default();
+            if *classes == [true; CLASSES] {
+                return;
+            }
+            *classes = [true; CLASSES];
+        }
+        self.wake();
+    }
+
+    /// Drops the writers of some classes to an endpoint, with what they hold.
+    pub fn disconnect(&self, to: &Endpoint, classes: &[Priority]) {
+        {
+            let mut wanted = self.shared.wanted.lock();
+            if let Some(flags) = wanted.get_mut(to) {
+                classes.iter().for_each(|class| flags[*class as usize] = false);
+                if *flags == [false; CLASSES] {
+                    wanted.remove(to);
+                }
+            }
+        }
+        {
+            let mut writers = self.shared.writers.write();
+            if let Some(slots) = writers.get_mut(to) {
+                let taken = classes.iter().filter_map(|class| slots[*class as usize].take());
+                self.shared.discarded.lock().extend(taken);
+                if slots.iter().all(Option::is_none) {
+                    writers.remove(to);
+                }
+            }
+        }
+        self.wake();
+    }
+
+    /// Other hosts where flows may be, as learnt from other flows; in the form of [`DdsTransport::addresses`].
+    pub fn learn_addresses(&self, addresses: &[String]) {
+        self.shared
+            .relay
+            .learn(addresses.iter().filter_map(|address| address.parse().ok()));
+    }
+
+    /// The addresses where this flow can be found.
+    #[must_use]
+    pub fn addresses(&self) -> Vec<String> {
+        vec![self.shared.address.to_string()]
+    }
+
+    /// Bytes that a datagram of that length takes on the wire: Ethernet payload, that is IP packets with their headers.
+    #[must_use]
+    pub fn wire_bytes(&self, datagram_bytes: usize) -> usize {
+        self.shared.wire.bytes(datagram_bytes)
+    }
+
     fn wake(&self) {
         if let Some(thread) = &self.thread {
             thread.thread().unpark();
@@ -227,90 +287,6 @@ impl Drop for DdsTransport {
             // Its panics are caught inside.
             let _ = thread.join();
         }
-    }
-}
-
-impl Transport for DdsTransport {
-    fn send(&self, to: &Endpoint, class: Priority, datagram: Bytes) -> SendOutcome {
-        let fits = datagram.len() <= self.shared.wire.max_datagram_bytes();
-        let sent = fits
-            && self
-                .shared
-                .writers
-                .read()
-                .get(to)
-                .and_then(|writers| writers[index(class)].as_ref())
-                .is_some_and(|writer| writer.write(datagram));
-        if sent {
-            SendOutcome::Sent
-        } else {
-            self.shared.not_sent.fetch_add(1, Ordering::Relaxed);
-            SendOutcome::NotSent
-        }
-    }
-
-    fn connect(&self, to: &Endpoint) {
-        {
-            let mut wanted = self.shared.wanted.lock();
-            if wanted.len() >= MAX_ENDPOINTS && !wanted.contains_key(to) {
-                return;
-            }
-            let classes = wanted.entry(to.clone()).or_default();
-            if *classes == [true; CLASSES] {
-                return;
-            }
-            *classes = [true; CLASSES];
-        }
-        self.wake();
-    }
-
-    fn disconnect(&self, to: &Endpoint, classes: &[Priority]) {
-        {
-            let mut wanted = self.shared.wanted.lock();
-            if let Some(flags) = wanted.get_mut(to) {
-                classes.iter().for_each(|class| flags[index(*class)] = false);
-                if *flags == [false; CLASSES] {
-                    wanted.remove(to);
-                }
-            }
-        }
-        {
-            let mut writers = self.shared.writers.write();
-            if let Some(slots) = writers.get_mut(to) {
-                let taken = classes.iter().filter_map(|class| slots[index(*class)].take());
-                self.shared.discarded.lock().extend(taken);
-                if slots.iter().all(Option::is_none) {
-                    writers.remove(to);
-                }
-            }
-        }
-        self.wake();
-    }
-
-    fn learn_addresses(&self, addresses: &[String]) {
-        self.shared
-            .relay
-            .learn(addresses.iter().filter_map(|address| address.parse().ok()));
-    }
-
-    fn addresses(&self) -> Vec<String> {
-        vec![self.shared.address.to_string()]
-    }
-
-    fn wire_bytes(&self, datagram_bytes: usize) -> usize {
-        self.shared.wire.bytes(datagram_bytes)
-    }
-
-    fn max_datagram_bytes(&self) -> usize {
-        self.shared.wire.max_datagram_bytes()
-    }
-}
-
-fn index(class: Priority) -> usize {
-    match class {
-        Priority::Control => 0,
-        Priority::State => 1,
-        Priority::Bulk => 2,
     }
 }
 

@@ -17,7 +17,6 @@ use std::time::{Duration, Instant};
 use blaze_domain::{DropReason, FlowId, LayerKind, Priority};
 use blaze_proto::link::LinkControl;
 use blaze_proto::link::link_control::{Body, Egress, LayerScope, State};
-use bytes::Bytes;
 use lru::LruCache;
 use prost::Message as _;
 
@@ -26,10 +25,10 @@ use super::budget::{Budgets, LinkBudgets, LinkCapacity};
 use super::clock::Clocks;
 use super::event::{Begun, LaneId, Ledger, LinkCounters, LinkEvent, PeerInfo, Submit, Tally, Transmit};
 use super::lifecycle::Missed;
-use super::peer::{FORGET_AFTER, HELLO_EVERY, MAX_CONTROLS, Peer, Phase};
+use super::peer::{HELLO_EVERY, MAX_CONTROLS, Peer, Phase};
 use super::sender::SendClass;
 use super::transport::Endpoint;
-use super::wire::{HEADER_BYTES, RECORD_BYTES, SenderId, class_index};
+use super::wire::{HEADER_BYTES, RECORD_BYTES, SenderId};
 
 /// Smallest datagram size that an engine uses, in bytes.
 pub const MIN_DATAGRAM_BYTES: usize = 1024;
@@ -38,8 +37,6 @@ pub const MIN_DATAGRAM_BYTES: usize = 1024;
 pub const MAX_PEERS: usize = 128;
 /// Flows that are remembered as heard when they have no place any more; beyond that those that went first are forgotten.
 const MAX_HEARD: NonZeroUsize = NonZeroUsize::new(8 * MAX_PEERS).unwrap();
-/// Most GUID prefixes that a Hello announces.
-const MAX_GUID_PREFIXES: usize = 4;
 
 /// Bounds of an engine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -84,13 +81,6 @@ pub struct EngineConfig {
     pub limits: Limits,
 }
 
-/// Place of a peer, to find it without its name; invalid once the peer is forgotten or begins a new life.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct PeerIndex {
-    pub(super) at: usize,
-    sender: SenderId,
-}
-
 /// See the module.
 #[derive(Debug)]
 pub struct Engine {
@@ -101,7 +91,6 @@ pub struct Engine {
     pub(super) layer_away: bool,
     pub(super) registry: (u64, u64),
     pub(super) addresses: Addresses,
-    pub(super) guid_prefixes: Vec<Bytes>,
     pub(super) egress: Option<Egress>,
     pub(super) peers: Vec<Option<Peer>>,
     pub(super) by_flow: HashMap<FlowId, usize>,
@@ -138,7 +127,6 @@ impl Engine {
             layer_away: false,
             registry: (0, 0),
             addresses: Addresses::default(),
-            guid_prefixes: Vec::new(),
             egress: None,
             peers: Vec::new(),
             by_flow: HashMap::new(),
@@ -180,7 +168,7 @@ impl Engine {
     }
 
     /// Version and digest of the announced registry state, for the next Hellos.
-    pub fn set_registry(&mut self, _now: Instant, version: u64, digest: u64) {
+    pub fn set_registry(&mut self, version: u64, digest: u64) {
         self.registry = (version, digest);
     }
 
@@ -203,13 +191,6 @@ impl Engine {
     /// Own addresses for the next Hellos.
     pub fn set_addresses(&mut self, addresses: Vec<String>) {
         self.addresses.set_own(addresses);
-    }
-
-    /// GUID prefixes of the own DDS participants, at most 4, for the next Hellos.
-    pub fn set_guid_prefixes(&mut self, prefixes: Vec<Bytes>) {
-        self.guid_prefixes = prefixes;
-        self.guid_prefixes.retain(|prefix| prefix.len() <= 12);
-        self.guid_prefixes.truncate(MAX_GUID_PREFIXES);
     }
 
     /// Demand and limit of the own egress, for the next Hellos.
@@ -263,14 +244,6 @@ impl Engine {
         }
     }
 
-    /// Place of a flow, for [`Engine::submit_to`].
-    #[must_use]
-    pub fn peer_index(&self, flow: &FlowId) -> Option<PeerIndex> {
-        let at = *self.by_flow.get(flow)?;
-        let sender = self.peers[at].as_ref()?.sender;
-        Some(PeerIndex { at, sender })
-    }
-
     /// Takes a message for a peer. From then on it ends in exactly one [`LinkEvent::LaneOut`] or
     /// [`LinkEvent::LaneDropped`], or in what [`Engine::drop_lane`] returns. Older ones that wait give way if the queue is
     /// full.
@@ -279,19 +252,8 @@ impl Engine {
     /// The reason why it was not taken, for the caller to count: `no_destination` (the flow is not known), `link_down` (it
     /// is not up), `lifespan` (too old already).
     pub fn submit(&mut self, now: Instant, submit: Submit<'_>) -> Result<(), DropReason> {
-        let index = self.peer_index(submit.to).ok_or(DropReason::NoDestination)?;
-        self.submit_to(now, index, submit)
-    }
-
-    /// As [`Engine::submit`], without looking at `submit.to`.
-    ///
-    /// # Errors
-    /// As [`Engine::submit`].
-    pub fn submit_to(&mut self, now: Instant, to: PeerIndex, submit: Submit<'_>) -> Result<(), DropReason> {
-        let peer = self.peers.get_mut(to.at).and_then(Option::as_mut);
-        let peer = peer
-            .filter(|peer| peer.sender == to.sender)
-            .ok_or(DropReason::NoDestination)?;
+        let at = *self.by_flow.get(submit.to).ok_or(DropReason::NoDestination)?;
+        let peer = self.peers[at].as_ref().ok_or(DropReason::NoDestination)?;
         if !peer.is_connected() {
             return Err(DropReason::LinkDown);
         }
@@ -301,10 +263,10 @@ impl Engine {
             return Err(DropReason::Lifespan);
         }
         if !peer.has_work() {
-            self.note_rest(now, to.at);
+            self.note_rest(now, at);
         }
-        if let Some(peer) = &mut self.peers[to.at] {
-            peer.send[class_index(submit.class)].submit(submit, &mut self.ledger);
+        if let Some(peer) = &mut self.peers[at] {
+            peer.send[submit.class as usize].submit(submit, &mut self.ledger);
         }
         Ok(())
     }
@@ -329,7 +291,7 @@ impl Engine {
     ///
     /// # Errors
     /// `no_destination`, `link_down`, `too_large` (it must fit one datagram) or `queue_full`.
-    pub fn send_control(&mut self, _now: Instant, to: &FlowId, body: Body) -> Result<(), DropReason> {
+    pub fn send_control(&mut self, to: &FlowId, body: Body) -> Result<(), DropReason> {
         let at = *self.by_flow.get(to).ok_or(DropReason::NoDestination)?;
         let peer = self.peers[at].as_mut().ok_or(DropReason::NoDestination)?;
         if !peer.is_connected() {
@@ -348,7 +310,7 @@ impl Engine {
     }
 
     /// Says Goodbye to every peer with the next datagrams.
-    pub fn goodbye(&mut self, _now: Instant) {
+    pub fn goodbye(&mut self) {
         for peer in self.peers.iter_mut().flatten() {
             peer.goodbye_due = peer.phase != Phase::Gone;
         }
@@ -393,8 +355,12 @@ impl Engine {
     /// One peer.
     #[must_use]
     pub fn peer(&self, flow: &FlowId) -> Option<PeerInfo> {
-        let peer = self.peers[*self.by_flow.get(flow)?].as_ref()?;
-        (peer.phase != Phase::Gone).then(|| peer.info())
+        let peer = self.known(flow).filter(|peer| peer.phase != Phase::Gone);
+        peer.map(Peer::info)
+    }
+
+    fn known(&self, flow: &FlowId) -> Option<&Peer> {
+        self.peers[*self.by_flow.get(flow)?].as_ref()
     }
 
     /// Flows that found no place among the peers, and wait for one.
@@ -415,25 +381,18 @@ impl Engine {
         self.peers.iter().flatten().map(Peer::reserved).sum()
     }
 
-    /// How long a peer that is down is remembered.
-    #[must_use]
-    pub fn forgets_after() -> Duration {
-        FORGET_AFTER
-    }
-
     /// Whether a flow lives and answers when it is asked what it has written.
     #[must_use]
     pub fn answers_written(&self, flow: &FlowId) -> bool {
-        let peer = self.by_flow.get(flow).and_then(|at| self.peers[*at].as_ref());
-        let says_so = |peer: &Peer| peer.hello.as_ref().is_some_and(|hello| hello.answers_written);
-        peer.is_some_and(|peer| peer.is_connected() && says_so(peer))
+        let peer = self.known(flow).filter(|peer| peer.is_connected());
+        let hello = peer.and_then(|peer| peer.hello.as_ref());
+        hello.is_some_and(|hello| hello.answers_written)
     }
 
     /// Whether a flow says that it decompresses; one that was never heard does not.
     #[must_use]
     pub fn takes_lz4(&self, flow: &FlowId) -> bool {
-        let peer = self.by_flow.get(flow).and_then(|at| self.peers[*at].as_ref());
-        let hello = peer.and_then(|peer| peer.hello.as_ref());
+        let hello = self.known(flow).and_then(|peer| peer.hello.as_ref());
         hello.is_some_and(|hello| hello.takes_lz4)
     }
 
@@ -441,30 +400,15 @@ impl Engine {
     /// cannot be written to: yes, as nothing waits for it.
     #[must_use]
     pub fn has_room(&self, flow: &FlowId, class: Priority, bytes: usize) -> bool {
-        let peer = self.by_flow.get(flow).and_then(|at| self.peers[*at].as_ref());
-        let full = |peer: &Peer| peer.is_connected() && !peer.send[class_index(class)].has_room(bytes);
-        !peer.is_some_and(full)
-    }
-
-    /// Whether nothing waits to be sent to anybody but LinkControl.
-    #[must_use]
-    pub fn is_drained(&self) -> bool {
-        let mut classes = self.peers.iter().flatten().flat_map(|peer| &peer.send);
-        classes.all(|class| class.queue_bytes() == 0)
-    }
-
-    /// What waits for peers of a class, in bytes.
-    #[must_use]
-    pub fn queued_bytes(&self, class: Priority) -> usize {
-        let peers = self.peers.iter().flatten();
-        peers.map(|peer| peer.send[class_index(class)].queue_bytes()).sum()
+        let peer = self.known(flow).filter(|peer| peer.is_connected());
+        peer.is_none_or(|peer| peer.send[class as usize].has_room(bytes))
     }
 
     /// The next datagram, most urgent first: LinkControl and probes, then control, state and bulk, each in turn over the
     /// peers. `None`: nothing to send now.
     pub fn poll_transmit(&mut self, now: Instant) -> Option<Transmit> {
-        self.transmit_control(now)
+        self.poll_control(now)
             .or_else(|| self.transmit_messages(now))
-            .or_else(|| self.transmit_control(now))
+            .or_else(|| self.poll_control(now))
     }
 }

@@ -5,8 +5,9 @@ use std::time::{Duration, Instant};
 
 use blaze_domain::{DropReason, FlowId, LayerKind, Priority, WriterId};
 use blaze_proto::Frame;
-use blaze_proto::link::link_control::{Body, Hello, LayerScope, State};
+use blaze_proto::link::link_control::{Body, Hello};
 use bytes::Bytes;
+use serde::Serialize;
 
 use super::budget::LinkCapacity;
 use super::transport::Endpoint;
@@ -57,8 +58,6 @@ pub struct Transmit {
     pub class: Priority,
     /// The datagram.
     pub datagram: Bytes,
-    /// Bytes of messages in it; the rest is the link's own.
-    pub user_bytes: usize,
     /// It carries no message: LinkControl or a probe.
     pub control: bool,
 }
@@ -119,12 +118,7 @@ pub enum LinkEvent {
         hello: Box<Hello>,
     },
     /// A peer can be written to: first heard, or back.
-    PeerUp {
-        /// The peer.
-        flow: FlowId,
-        /// Its life.
-        epoch: u64,
-    },
+    PeerUp(Endpoint),
     /// A peer does not acknowledge: nothing is sent to it for the moment, what waits stays.
     PeerSuspect {
         /// The peer.
@@ -137,27 +131,15 @@ pub enum LinkEvent {
     },
     /// A peer is gone; what waited for it was dropped.
     PeerDown {
-        /// The peer.
-        flow: FlowId,
-        /// The life that ended.
-        epoch: u64,
+        /// The peer, and its life that ended.
+        endpoint: Endpoint,
         /// Why.
         reason: DownReason,
     },
     /// A peer that was down is not waited for any more.
-    PeerForgotten {
-        /// The peer.
-        flow: FlowId,
-        /// Its life.
-        epoch: u64,
-    },
+    PeerForgotten(Endpoint),
     /// The engine holds nothing of this life of a peer any more: what the transport has for it can go.
-    PeerRemoved {
-        /// The peer.
-        flow: FlowId,
-        /// Its life.
-        epoch: u64,
-    },
+    PeerRemoved(Endpoint),
     /// There was no place for a flow; told once in a while, however many there are.
     PeerRefused {
         /// One of them.
@@ -166,12 +148,7 @@ pub enum LinkEvent {
         peers: usize,
     },
     /// A flow that was refused has a place now: writers to it are to be made.
-    PeerAdmitted {
-        /// The flow.
-        flow: FlowId,
-        /// Its life.
-        epoch: u64,
-    },
+    PeerAdmitted(Endpoint),
     /// Addresses that were not known before.
     Addresses(Vec<String>),
     /// The last byte of a message was sent for the first time: for rates. Each message has at most one of these.
@@ -187,12 +164,8 @@ pub enum LinkEvent {
     LaneOut {
         /// Its lane.
         lane: LaneId,
-        /// Messages, 1.
-        messages: u64,
         /// Bytes of the payload.
         bytes: usize,
-        /// Since it arrived at this flow.
-        wait: Duration,
     },
     /// A message is about to be dropped of which some parts have left and others have not.
     LaneCut {
@@ -207,10 +180,6 @@ pub enum LinkEvent {
         lane: LaneId,
         /// Why.
         reason: DropReason,
-        /// Messages, 1.
-        messages: u64,
-        /// Bytes of the payload.
-        bytes: usize,
     },
     /// Something that came over the link was dropped here.
     ReceiverDropped {
@@ -267,7 +236,8 @@ impl Ledger {
         self.lanes.entry(lane).or_default().add(bytes);
     }
 
-    fn left(&mut self, lane: LaneId, bytes: usize) {
+    /// It is not in the lane any more; whoever took it out counts it.
+    pub(crate) fn left(&mut self, lane: LaneId, bytes: usize) {
         if let Some(tally) = self.lanes.get_mut(&lane) {
             tally.remove(bytes);
             if tally.messages == 0 {
@@ -280,14 +250,9 @@ impl Ledger {
         self.events.push_back(LinkEvent::LaneSent { lane, bytes, wait });
     }
 
-    pub(crate) fn out(&mut self, lane: LaneId, bytes: usize, wait: Duration) {
+    pub(crate) fn out(&mut self, lane: LaneId, bytes: usize) {
         self.left(lane, bytes);
-        self.events.push_back(LinkEvent::LaneOut {
-            lane,
-            messages: 1,
-            bytes,
-            wait,
-        });
+        self.events.push_back(LinkEvent::LaneOut { lane, bytes });
     }
 
     pub(crate) fn cut(&mut self, lane: LaneId, begun: Begun) {
@@ -296,17 +261,7 @@ impl Ledger {
 
     pub(crate) fn dropped(&mut self, lane: LaneId, bytes: usize, reason: DropReason) {
         self.left(lane, bytes);
-        self.events.push_back(LinkEvent::LaneDropped {
-            lane,
-            reason,
-            messages: 1,
-            bytes,
-        });
-    }
-
-    /// Dropped at the caller's wish, who counts it.
-    pub(crate) fn withdrawn(&mut self, lane: LaneId, bytes: usize) {
-        self.left(lane, bytes);
+        self.events.push_back(LinkEvent::LaneDropped { lane, reason });
     }
 
     pub(crate) fn queued(&self, lane: LaneId) -> Tally {
@@ -315,7 +270,8 @@ impl Ledger {
 }
 
 /// Whether a peer can be written to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum PeerState {
     /// It says Hello and acknowledges.
     Up,
@@ -340,10 +296,6 @@ pub struct PeerInfo {
     pub digest: u64,
     /// Whether it can be written to.
     pub state: PeerState,
-    /// What it says of itself, once it said Hello.
-    pub hello_state: Option<State>,
-    /// Layer broker that it uses, and its identity.
-    pub layer_scope: (LayerScope, u64),
     /// When its last Hello came.
     pub last_heard: Option<Instant>,
     /// Round trip, once measured.

@@ -141,9 +141,8 @@ impl Engine {
         while self.has_place()
             && let Some(endpoint) = self.waiting.pop_front()
         {
-            let Endpoint { flow, epoch } = endpoint.clone();
-            if self.peer_discovered(now, endpoint) {
-                self.ledger.events.push_back(LinkEvent::PeerAdmitted { flow, epoch });
+            if self.peer_discovered(now, endpoint.clone()) {
+                self.ledger.events.push_back(LinkEvent::PeerAdmitted(endpoint));
             }
         }
     }
@@ -201,7 +200,8 @@ impl Engine {
 
     fn forget_missed(&mut self, flow: FlowId) {
         if let Some(Missed { epoch, .. }) = self.missed.remove(&flow) {
-            self.ledger.events.push_back(LinkEvent::PeerForgotten { flow, epoch });
+            let endpoint = Endpoint { flow, epoch };
+            self.ledger.events.push_back(LinkEvent::PeerForgotten(endpoint));
         }
     }
 
@@ -239,11 +239,8 @@ impl Engine {
         }
         peer.since = now;
         if was_connected {
-            self.ledger.events.push_back(LinkEvent::PeerDown {
-                flow: peer.endpoint.flow.clone(),
-                epoch: peer.endpoint.epoch,
-                reason,
-            });
+            let endpoint = peer.endpoint.clone();
+            self.ledger.events.push_back(LinkEvent::PeerDown { endpoint, reason });
         }
     }
 
@@ -254,10 +251,7 @@ impl Engine {
             if peer.was_heard {
                 self.heard.put(peer.endpoint.flow.clone(), ());
             }
-            self.ledger.events.push_back(LinkEvent::PeerRemoved {
-                flow: peer.endpoint.flow,
-                epoch: peer.endpoint.epoch,
-            });
+            self.ledger.events.push_back(LinkEvent::PeerRemoved(peer.endpoint));
         }
     }
 
@@ -267,10 +261,8 @@ impl Engine {
             return;
         };
         if peer.phase == Phase::Down {
-            self.ledger.events.push_back(LinkEvent::PeerForgotten {
-                flow: peer.endpoint.flow.clone(),
-                epoch: peer.endpoint.epoch,
-            });
+            let endpoint = peer.endpoint.clone();
+            self.ledger.events.push_back(LinkEvent::PeerForgotten(endpoint));
         }
         self.remove(at);
     }

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 use blaze_proto::Frame;
 use smallvec::{SmallVec, smallvec};
 
-use super::clock::microseconds;
 use super::event::{Begun, LaneId, StreamKey, Submit};
 use super::wire::Record;
+use crate::lane::measure::micros;
 
 /// Where each part of a message is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -115,7 +115,7 @@ impl Outgoing {
     /// What stands before a part that is sent now.
     pub(crate) fn record(&self, now: Instant, part: usize, part_bytes: usize, flags: u8) -> Record {
         let narrow = |value: usize| u32::try_from(value).unwrap_or(u32::MAX);
-        let age = self.frame.age_us().saturating_add(microseconds(self.waited(now)));
+        let age = self.frame.age_us().saturating_add(micros(self.waited(now)));
         Record {
             message: self.number,
             total: narrow(self.bytes()),

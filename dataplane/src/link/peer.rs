@@ -3,8 +3,8 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use blaze_domain::{DropReason, LayerKind, Priority};
-use blaze_proto::link::link_control::{Hello, Kind, LayerScope, State};
+use blaze_domain::{DropReason, Priority};
+use blaze_proto::link::link_control::Hello;
 use bytes::Bytes;
 
 use super::budget::PathBudget;
@@ -13,7 +13,7 @@ use super::event::{Ledger, PeerInfo, PeerState};
 use super::receiver::ReceiveClass;
 use super::sender::{SendClass, SendLimits};
 use super::transport::Endpoint;
-use super::wire::SenderId;
+use super::wire::{SenderId, kind_from_wire};
 
 /// How often a Hello goes to each peer.
 pub(crate) const HELLO_EVERY: Duration = Duration::from_millis(500);
@@ -188,10 +188,6 @@ impl Peer {
                 Phase::Suspect => PeerState::Suspect,
                 Phase::Connecting | Phase::Down | Phase::Gone => PeerState::Down,
             },
-            hello_state: hello.map(Hello::state).filter(|state| *state != State::Unspecified),
-            layer_scope: hello.map_or((LayerScope::None, 0), |hello| {
-                (hello.layer_scope(), hello.layer_scope_id)
-            }),
             last_heard: self.last_hello,
             rtt: self.round_trip.measured(),
             clock_offset_ns: clock.map(|clock| clock.0),
@@ -204,22 +200,5 @@ impl Peer {
             outstanding_bytes: [0, 1, 2].map(|at| self.send[at].outstanding()),
             queue_bytes: [0, 1, 2].map(|at| self.send[at].queue_bytes()),
         }
-    }
-}
-
-fn kind_from_wire(kind: Kind) -> Option<LayerKind> {
-    match kind {
-        Kind::Edge => Some(LayerKind::Edge),
-        Kind::Fog => Some(LayerKind::Fog),
-        Kind::Cloud => Some(LayerKind::Cloud),
-        Kind::Unspecified => None,
-    }
-}
-
-pub(crate) fn kind_to_wire(kind: LayerKind) -> Kind {
-    match kind {
-        LayerKind::Edge => Kind::Edge,
-        LayerKind::Fog => Kind::Fog,
-        LayerKind::Cloud => Kind::Cloud,
     }
 }

@@ -9,21 +9,6 @@ pub(crate) struct RangeSet {
 impl RangeSet {
     /// Adds the numbers from `first` to `last`. Returns how many were new.
     pub(crate) fn insert(&mut self, first: u64, last: u64) -> u64 {
-        match self.ranges.last_mut() {
-            None => {
-                self.ranges.push((first, last));
-                return last - first + 1;
-            }
-            Some(newest) if first == newest.1.saturating_add(1) => {
-                newest.1 = last;
-                return last - first + 1;
-            }
-            Some(newest) if first > newest.1 => {
-                self.ranges.push((first, last));
-                return last - first + 1;
-            }
-            Some(_) => {}
-        }
         // The ranges that touch or overlap the new one become one.
         let from = self.ranges.partition_point(|range| range.1.saturating_add(1) < first);
         let to = self.ranges.partition_point(|range| range.0 <= last.saturating_add(1));

@@ -14,7 +14,7 @@ use super::peer::{Echo, HELLO_EVERY, Peer, Phase};
 use super::receiver::{Admission, GIVEN_UP_TOLD, Inbox, MISSING_RANGES, MORE_RANGES, ReceiveClass};
 use super::sender::{FeedbackView, SendContext};
 use super::transport::Endpoint;
-use super::wire::{Datagram, LinkHeader, SenderId, VERSION, class_code, class_index};
+use super::wire::{Datagram, LinkHeader, SenderId, VERSION, class_of};
 use crate::limit::capacity::Seen;
 
 /// Without Feedback for this long the way to a peer may have become another one.
@@ -69,13 +69,6 @@ impl Told {
     }
 }
 
-fn class_of(code: u32) -> Option<Priority> {
-    Priority::ALL
-        .iter()
-        .copied()
-        .find(|class| u32::from(class_code(*class)) == code)
-}
-
 impl Engine {
     /// Takes a datagram that came on the topic of a class.
     pub fn receive(&mut self, now: Instant, datagram: Bytes, class: Priority) {
@@ -98,7 +91,7 @@ impl Engine {
     fn messages_received(&mut self, now: Instant, datagram: &Datagram) {
         let header = &datagram.header;
         let Some(at) = self.known_sender(header) else { return };
-        let class = class_index(header.class);
+        let class = header.class as usize;
         let admission = self.with_inbox(now, at, |peer, inbox| peer[class].admit(inbox, header, datagram.len()));
         match admission {
             Some(Admission::New) => {}
@@ -271,10 +264,8 @@ impl Engine {
             self.missed.remove(&flow);
             peer.hello_due = true;
             peer.hello_at = now + HELLO_EVERY;
-            self.ledger.events.push_back(LinkEvent::PeerUp {
-                flow: flow.clone(),
-                epoch: hello.epoch,
-            });
+            let endpoint = peer.endpoint.clone();
+            self.ledger.events.push_back(LinkEvent::PeerUp(endpoint));
         }
         let new = self.addresses.learn(&hello.addresses);
         if !new.is_empty() {
@@ -311,7 +302,7 @@ impl Engine {
             window_bytes: feedback.window_bytes,
             delivered_message: feedback.delivered_message,
         };
-        let sender = &mut peer.send[class_index(class)];
+        let sender = &mut peer.send[class as usize];
         if !sender.feedback(&mut ctx, &view) {
             self.counters.stale += 1;
             return;
@@ -347,10 +338,8 @@ impl Engine {
         let Some(peer) = &mut self.peers[at] else { return };
         peer.phase = Phase::Gone;
         peer.hello_due = false;
-        self.ledger.events.push_back(LinkEvent::PeerForgotten {
-            flow: peer.endpoint.flow.clone(),
-            epoch: peer.endpoint.epoch,
-        });
+        let endpoint = peer.endpoint.clone();
+        self.ledger.events.push_back(LinkEvent::PeerForgotten(endpoint));
     }
 }
 

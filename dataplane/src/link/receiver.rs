@@ -23,10 +23,10 @@ use lru::LruCache;
 use smallvec::SmallVec;
 
 use super::assembly::Assembly;
-use super::clock::microseconds;
 use super::event::{LinkCounters, LinkEvent};
 use super::ranges::RangeSet;
 use super::wire::{LinkHeader, Record};
+use crate::lane::measure::micros;
 
 /// An unfinished message is given up that long after its last part, and so is the one that another waits for. Time in
 /// which nothing of the class comes does not count: the sender may have been cut off, or have more urgent things to send.
@@ -372,7 +372,7 @@ impl ReceiveClass {
             lag,
         } = message;
         let here = inbox.now.saturating_duration_since(first_part) + lag;
-        let age_us = u64::from(age_us).saturating_add(microseconds(here));
+        let age_us = u64::from(age_us).saturating_add(micros(here));
         if frame.lifespan_ms() != 0 && age_us > u64::from(frame.lifespan_ms()) * 1000 {
             inbox.dropped(frame.topic(), DropReason::Lifespan);
             return;

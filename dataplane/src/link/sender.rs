@@ -311,7 +311,7 @@ impl SendClass {
         for key in self.messages.keys(|m| m.lane == lane && !m.is_started()) {
             if let Some(message) = self.take(key) {
                 dropped.add(message.payload_bytes());
-                ledger.withdrawn(lane, message.payload_bytes());
+                ledger.left(lane, message.payload_bytes());
             }
         }
         self.prune_waiting();
@@ -351,7 +351,7 @@ impl SendClass {
 
     /// The next datagram with messages, if there is anything to send and credit for it. Returns it with the bytes of
     /// messages in it.
-    pub(crate) fn transmit(&mut self, ctx: &mut SendContext<'_>) -> Option<(bytes::Bytes, usize)> {
+    pub(crate) fn transmit(&mut self, ctx: &mut SendContext<'_>) -> Option<bytes::Bytes> {
         if !self.has_work() {
             return None;
         }
@@ -366,7 +366,6 @@ impl SendClass {
         if out.is_empty() {
             return None;
         }
-        let user_bytes = out.content_bytes();
         let header = self.header(ctx, sequence, next_number);
         let announces = self.announcement(&header);
         let datagram = out.finish(&header);
@@ -386,7 +385,7 @@ impl SendClass {
         self.last_user_sequence = sequence;
         self.probe_at = Some(ctx.now + (ctx.round_trip * 2).max(Duration::from_millis(100)));
         self.probe_due = false;
-        Some((datagram, user_bytes))
+        Some(datagram)
     }
 
     /// What a header tells that the receiver must learn.
@@ -480,7 +479,7 @@ impl SendClass {
             ctx.ledger.sent(lane, bytes, wait);
             if is_out {
                 self.take(key);
-                ctx.ledger.out(lane, bytes, wait);
+                ctx.ledger.out(lane, bytes);
             }
         }
     }

@@ -390,12 +390,10 @@ impl Sim {
             match event {
                 LinkEvent::Deliver { from, frame, at } => node.delivered.push(Delivered { from, epoch, at, frame }),
                 LinkEvent::LaneSent { lane, .. } => node.lanes.entry(lane).or_default().sent += 1,
-                LinkEvent::LaneOut { lane, messages, .. } => node.lanes.entry(lane).or_default().out += messages,
-                LinkEvent::LaneDropped {
-                    lane, reason, messages, ..
-                } => {
+                LinkEvent::LaneOut { lane, .. } => node.lanes.entry(lane).or_default().out += 1,
+                LinkEvent::LaneDropped { lane, reason } => {
                     let lane = node.lanes.entry(lane).or_default();
-                    *lane.dropped.entry(reason).or_default() += messages;
+                    *lane.dropped.entry(reason).or_default() += 1;
                 }
                 LinkEvent::ReceiverDropped { reason, messages, .. } => {
                     *node.receiver_dropped.entry(reason).or_default() += messages;

@@ -5,16 +5,15 @@ use std::time::Instant;
 use blaze_domain::Priority;
 use blaze_proto::link::LinkControl;
 use blaze_proto::link::link_control::{Body, Clock, Goodbye, Hello};
-use bytes::Bytes;
 use prost::Message as _;
 
 use super::clock::nanoseconds;
 use super::engine::Engine;
 use super::event::Transmit;
-use super::peer::{Peer, Phase, kind_to_wire};
+use super::peer::{Peer, Phase};
 use super::receiver::ReceiveClass;
 use super::sender::{FIRST_WINDOW, SendContext};
-use super::wire::{DatagramBuilder, LinkHeader, VERSION, class_code};
+use super::wire::{DatagramBuilder, LinkHeader, VERSION, class_code, kind_to_wire};
 
 /// Bytes of a Feedback with all ranges that it tells by their sequences.
 const LARGEST_FEEDBACK: usize = 760;
@@ -22,13 +21,8 @@ const LARGEST_FEEDBACK: usize = 760;
 const LARGEST_CONTROL: usize = 1_200;
 
 impl Engine {
-    /// LinkControl or a probe, for the next peer that has any.
-    /// The next datagram that carries no message, if there is one.
+    /// The next datagram that carries no message, LinkControl or a probe, for the next peer that has any.
     pub fn poll_control(&mut self, now: Instant) -> Option<Transmit> {
-        self.transmit_control(now)
-    }
-
-    pub(super) fn transmit_control(&mut self, now: Instant) -> Option<Transmit> {
         let count = self.peers.len();
         for step in 1..=count {
             let at = (self.cursors[3] + step) % count;
@@ -82,7 +76,6 @@ impl Engine {
             to,
             class: Priority::Control,
             datagram,
-            user_bytes: 0,
             control: true,
         })
     }
@@ -118,11 +111,8 @@ impl Engine {
             protocol_min: u32::from(VERSION),
             protocol_max: u32::from(VERSION),
             addresses,
-            dds_guid_prefixes: self.guid_prefixes.clone(),
             clock: Some(clock),
             egress: self.egress,
-            public_key: Bytes::new(),
-            ingress_bytes_per_s: None,
             answers_written: true,
             layer_away: self.layer_away,
             takes_lz4: true,
@@ -171,7 +161,6 @@ impl Engine {
                     to: peer.endpoint.clone(),
                     class: Priority::ALL[index],
                     datagram,
-                    user_bytes: 0,
                     control: true,
                 });
             }
@@ -203,14 +192,13 @@ impl Engine {
                     ledger: &mut self.ledger,
                     counters: &mut self.counters,
                 };
-                if let Some((datagram, user_bytes)) = peer.send[index].transmit(&mut ctx) {
+                if let Some(datagram) = peer.send[index].transmit(&mut ctx) {
                     self.cursors[index] = at;
                     self.budgets.spend(now, layer, &mut peer.path, datagram.len());
                     return Some(Transmit {
                         to: peer.endpoint.clone(),
                         class,
                         datagram,
-                        user_bytes,
                         control: false,
                     });
                 }

@@ -53,27 +53,3 @@ pub enum SendOutcome {
     /// No writer to that endpoint, or it could not take it now; the engine's repair treats it as lost.
     NotSent,
 }
-
-/// Carries datagrams to other flows.
-pub trait Transport: Send + Sync {
-    /// Sends one datagram to one endpoint on the topic of a class. Never waits.
-    fn send(&self, to: &Endpoint, class: Priority, datagram: Bytes) -> SendOutcome;
-
-    /// Makes writers to an endpoint, if there are none.
-    fn connect(&self, to: &Endpoint);
-
-    /// Drops the writers of some classes to an endpoint, with what they hold.
-    fn disconnect(&self, to: &Endpoint, classes: &[Priority]);
-
-    /// Other hosts where flows may be, as learnt from other flows; in the form of [`Transport::addresses`].
-    fn learn_addresses(&self, addresses: &[String]);
-
-    /// The addresses where this flow can be found.
-    fn addresses(&self) -> Vec<String>;
-
-    /// Bytes that a datagram of that length takes on the wire: Ethernet payload, that is IP packets with their headers.
-    fn wire_bytes(&self, datagram_bytes: usize) -> usize;
-
-    /// Largest datagram that [`Transport::send`] takes.
-    fn max_datagram_bytes(&self) -> usize;
-}

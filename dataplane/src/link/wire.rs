@@ -12,8 +12,9 @@
 //! `link_sequence - unsettled` are known to be received or lost, and messages below `message_floor` are delivered or
 //! given up and will never be sent again.
 
-use blaze_domain::{FlowId, Priority};
+use blaze_domain::{FlowId, LayerKind, Priority};
 use blaze_proto::frame::MAX_FRAME_BYTES;
+use blaze_proto::link::link_control::Kind;
 use blaze_proto::{Frame, priority_to_wire};
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use sha2::{Digest, Sha256};
@@ -204,7 +205,6 @@ impl Datagram {
 pub(crate) struct DatagramBuilder {
     bytes: BytesMut,
     records: u16,
-    content: usize,
     limit: usize,
 }
 
@@ -215,18 +215,12 @@ impl DatagramBuilder {
         Self {
             bytes,
             records: 0,
-            content: 0,
             limit,
         }
     }
 
     pub(crate) fn is_empty(&self) -> bool {
         self.records == 0
-    }
-
-    /// Bytes of message content so far.
-    pub(crate) fn content_bytes(&self) -> usize {
-        self.content
     }
 
     /// Bytes that one more record may have.
@@ -248,7 +242,6 @@ impl DatagramBuilder {
         self.bytes.put_u16_le(record.behind);
         self.bytes.put_u32_le(record.age_us);
         self.records += 1;
-        self.content += record.length as usize;
     }
 
     /// Copies the part of a frame that the record names.
@@ -302,12 +295,28 @@ pub(crate) fn class_code(class: Priority) -> u8 {
     u8::try_from(priority_to_wire(class)).unwrap_or(0)
 }
 
-/// Place of a class in arrays of three.
-pub(crate) fn class_index(class: Priority) -> usize {
-    match class {
-        Priority::Control => 0,
-        Priority::State => 1,
-        Priority::Bulk => 2,
+/// The class of a number on the wire.
+pub(crate) fn class_of(code: u32) -> Option<Priority> {
+    let mut classes = Priority::ALL.iter().copied();
+    classes.find(|class| u32::from(class_code(*class)) == code)
+}
+
+/// The kind of a layer that a Hello names.
+pub(crate) fn kind_from_wire(kind: Kind) -> Option<LayerKind> {
+    match kind {
+        Kind::Edge => Some(LayerKind::Edge),
+        Kind::Fog => Some(LayerKind::Fog),
+        Kind::Cloud => Some(LayerKind::Cloud),
+        Kind::Unspecified => None,
+    }
+}
+
+/// The kind of a layer for a Hello.
+pub(crate) fn kind_to_wire(kind: LayerKind) -> Kind {
+    match kind {
+        LayerKind::Edge => Kind::Edge,
+        LayerKind::Fog => Kind::Fog,
+        LayerKind::Cloud => Kind::Cloud,
     }
 }
 

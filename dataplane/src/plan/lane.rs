@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use blaze_domain::node_file::TopicValues;
-use blaze_domain::{Durability, Priority, Reliability, WhyCode};
+use blaze_domain::{Durability, Priority, Reliability};
 
 use super::{LaneSpec, Publisher, Requester};
 use crate::world::{Advertise, OriginFilter, Request};
@@ -47,13 +47,7 @@ impl LaneBuilder {
                 .max(1),
             priority: priority(&pairs),
             from: origins(&pairs),
-            degraded: pairs
-                .iter()
-                .any(|(offer, ask)| asks_too_much(offer, ask))
-                .then_some(WhyCode::QosMismatch),
-            relays: Vec::new(),
-            shared: None,
-            held: false,
+            ..LaneSpec::default()
         };
         self.cap(&mut lane);
         Some(lane)

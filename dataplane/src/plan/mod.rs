@@ -143,7 +143,7 @@ impl Target {
 }
 
 /// What the requesters behind a bridge ask of it, within what is offered.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct LaneSpec {
     /// Highest rate that any requester takes, in messages per second; `None` = as published.
     pub max_rate_hz: Option<f64>,
@@ -159,8 +159,6 @@ pub struct LaneSpec {
     pub priority: Option<Priority>,
     /// Origins that the requesters ask for, sorted; empty = any. Nothing else is carried.
     pub from: Vec<OriginFilter>,
-    /// More is asked than offered; it flows as offered.
-    pub degraded: Option<WhyCode>,
     /// Out of the layer: flows, sorted, that are not on the inter scope, so that what they wrote to the layer scope from their
     /// own nodes is carried as if it was born there.
     pub relays: Vec<FlowId>,

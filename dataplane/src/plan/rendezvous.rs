@@ -20,11 +20,15 @@ pub(crate) fn best<'a>(key: &str, candidates: impl Iterator<Item = &'a FlowId>, 
     ranked.into_iter().map(|(_, flow)| flow).collect()
 }
 
-/// FNV-1a (64 bits) over `topic 0xFF layer 0xFF node`, then the finaliser of SplitMix64, because FNV alone leaves the
-/// high bits of similar names alike. It is part of what flows agree on: a change of it moves topics between versions.
+/// Of `topic 0xFF layer 0xFF node`.
 fn weight(key: &str, flow: &FlowId) -> u64 {
     let parts = [key, flow.layer.as_str(), flow.node.as_str()];
-    let bytes = parts.iter().flat_map(|part| part.bytes().chain([0xFF]));
+    stable_hash(parts.iter().flat_map(|part| part.bytes().chain([0xFF])))
+}
+
+/// FNV-1a (64 bits), then the finaliser of SplitMix64, because FNV alone leaves the high bits of similar names alike, and sums of its values
+/// share their weak low bits. It is part of what flows agree on: a change of it moves topics between versions.
+pub(crate) fn stable_hash(bytes: impl Iterator<Item = u8>) -> u64 {
     let mut hash = bytes.fold(0xCBF2_9CE4_8422_2325_u64, |hash, byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01B3)
     });

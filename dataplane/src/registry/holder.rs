@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use blaze_domain::control::{Common, ControlError, ControlMessage, ErrorCode, LeaseKind};
-use blaze_domain::{FlowId, LayerName, MAX_PAYLOAD_BYTES, MAX_RATE_HZ, NodeName, Scope, TopicName};
+use blaze_domain::{FlowId, MAX_PAYLOAD_BYTES, MAX_RATE_HZ, Scope, TopicName};
 
 use super::leases::{Lease, LeaseKey, Terms};
 
@@ -15,15 +15,8 @@ pub(super) fn key_of(
     common: &Common,
     pointer: &str,
 ) -> Result<LeaseKey, ControlError> {
-    let (layer, node) = holder(scope, me, common, pointer)?;
-    Ok(LeaseKey {
-        scope,
-        kind,
-        layer,
-        node,
-        service: common.service.clone(),
-        instance: common.instance.clone(),
-    })
+    check_source(scope, me, common, pointer)?;
+    Ok(key_here(scope, me, kind, common))
 }
 
 /// The same for a message that is refused: of one from elsewhere the key that it would have if it was from here, so that a right one
@@ -95,27 +88,16 @@ pub(super) fn lease_of<'m>(
     Ok((&common.topic, key_of(scope, me, kind, common, pointer)?, lease))
 }
 
-/// Layer and node of whoever speaks: where it was received, unless it says otherwise and may.
-pub(super) fn holder(
-    scope: Scope,
-    me: &FlowId,
-    common: &Common,
-    pointer: &str,
-) -> Result<(LayerName, Option<NodeName>), ControlError> {
-    let mismatch = |field: &str, found: &str, here: &str| {
-        Err(ControlError::new(
-            ErrorCode::SourceMismatch,
-            format!("{pointer}/{field}"),
-            format!("{found} is not the {field} where the message was received, {here}"),
-        ))
+/// Whoever speaks is where it was received, unless it says otherwise and may.
+fn check_source(scope: Scope, me: &FlowId, common: &Common, pointer: &str) -> Result<(), ControlError> {
+    let (field, found, here) = match (&common.layer, &common.node) {
+        (Some(layer), _) if *layer != me.layer => ("layer", layer.as_str(), me.layer.as_str()),
+        (_, Some(node)) if scope == Scope::Node && *node != me.node => ("node", node.as_str(), me.node.as_str()),
+        _ => return Ok(()),
     };
-    match &common.layer {
-        Some(layer) if *layer != me.layer => return mismatch("layer", layer.as_str(), me.layer.as_str()),
-        _ => {}
-    }
-    match (scope, &common.node) {
-        (Scope::Node, Some(node)) if *node != me.node => mismatch("node", node.as_str(), me.node.as_str()),
-        (Scope::Node, _) => Ok((me.layer.clone(), Some(me.node.clone()))),
-        (Scope::Layer | Scope::Inter, node) => Ok((me.layer.clone(), node.clone())),
-    }
+    Err(ControlError::new(
+        ErrorCode::SourceMismatch,
+        format!("{pointer}/{field}"),
+        format!("{found} is not the {field} where the message was received, {here}"),
+    ))
 }

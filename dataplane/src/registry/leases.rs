@@ -183,6 +183,7 @@ pub struct LapsedLease {
 }
 
 /// All leases of one flow, bounded.
+#[derive(Default)]
 pub(super) struct LeaseTable {
     pub(super) topics: BTreeMap<TopicName, BTreeMap<LeaseKey, Lease>>,
     pub(super) expiry: BTreeSet<(Instant, TopicName, LeaseKey)>,
@@ -213,16 +214,10 @@ impl LeaseTable {
     /// A table without leases; those that the brokers of `stores` keep are still to be read.
     pub(super) fn new(limit: usize, stores: BTreeSet<Scope>) -> Self {
         Self {
-            topics: BTreeMap::new(),
-            expiry: BTreeSet::new(),
-            count: 0,
             limit,
-            lapsed: VecDeque::new(),
-            unsaved: BTreeSet::new(),
             reading: stores.clone(),
             stores,
-            ended: BTreeSet::new(),
-            not_renewable: BTreeSet::new(),
+            ..Self::default()
         }
     }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use blaze_domain::control::{DEFAULT_ENCODING, LeaseKind, Quality};
-use blaze_domain::{Durability, LayerName, NodeName, Priority, Reliability, Scope, ServiceName};
+use blaze_domain::{LayerName, NodeName, Priority, Scope, ServiceName};
 
 use super::leases::{LeaseView, Terms};
 use crate::world::{Advertise, OriginFilter, Request, ScopeEntry, Source, TopicEntry};
@@ -50,7 +50,7 @@ fn merge_advertise<'a>(leases: impl Iterator<Item = LeaseView<'a>> + Clone) -> O
             .map(|(_, bytes)| bytes)
             .collect::<Option<Vec<_>>>()
             .and_then(|all| all.into_iter().max()),
-        encoding: quality.encoding,
+        encoding: quality.encoding.unwrap_or_else(|| DEFAULT_ENCODING.into()),
         type_name: quality.type_name,
         type_hash: quality.type_hash,
         reliability: quality.reliability,
@@ -116,18 +116,8 @@ fn highest_rate(rates: impl Iterator<Item = Option<f64>>) -> Option<f64> {
     rates.collect::<Option<Vec<f64>>>()?.into_iter().reduce(f64::max)
 }
 
-struct MergedQuality {
-    encoding: String,
-    type_name: String,
-    type_hash: String,
-    reliability: Reliability,
-    durability: Durability,
-    depth: u32,
-    lifespan_ms: u32,
-}
-
-/// `None` for no lease at all.
-fn merge_quality<'a>(all: impl Iterator<Item = &'a Quality> + Clone) -> Option<MergedQuality> {
+/// All but the class; `None` for no lease at all.
+fn merge_quality<'a>(all: impl Iterator<Item = &'a Quality> + Clone) -> Option<Quality> {
     let first = all.clone().next()?;
     // Type and hash come from one lease where possible; leases come in the order of their keys, so every flow that sees
     // the same leases takes the same one.
@@ -147,16 +137,14 @@ fn merge_quality<'a>(all: impl Iterator<Item = &'a Quality> + Clone) -> Option<M
     };
     let endless = all.clone().any(|quality| quality.lifespan_ms == 0);
     let longest = all.clone().map(|quality| quality.lifespan_ms).max().unwrap_or(0);
-    Some(MergedQuality {
-        encoding: all
-            .clone()
-            .find_map(|quality| quality.encoding.clone())
-            .unwrap_or_else(|| DEFAULT_ENCODING.into()),
+    Some(Quality {
+        encoding: all.clone().find_map(|quality| quality.encoding.clone()),
         type_name: typed.type_name.clone(),
         type_hash,
         reliability: all.clone().map(|quality| quality.reliability).max()?,
         durability: all.clone().map(|quality| quality.durability).max()?,
         depth: all.map(|quality| quality.depth).max()?,
+        priority: None,
         lifespan_ms: if endless { 0 } else { longest },
     })
 }

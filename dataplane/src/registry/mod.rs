@@ -32,7 +32,6 @@ use std::time::Instant;
 
 use blaze_domain::control::{Answer, ControlError, ErrorCode, EventKind, LeaseKind, ParsedObject, parse_payload};
 use blaze_domain::names::ChannelName;
-use blaze_domain::node_file::AutoBool;
 use blaze_domain::{Durability, FlowId, Scope, TopicName};
 use blaze_proto::link::link_control::{Body, RouteState};
 
@@ -56,14 +55,10 @@ pub use stored::{Restored, UnsavedLease};
 pub use types::{AnswerOut, Changes, ControlOutcome, EventDraft, RegistryConfig, RemoteLease, SyncFaults};
 pub(crate) use wire::MAX_ROUTES;
 
-use crate::world::{FlowState, FlowView, Reach, Role, ScopeEntry, World};
+use crate::world::{FlowState, FlowView, Reach, ScopeEntry, World};
 
-/// A message to another flow that waits for [`Registry::poll`].
-struct Outgoing {
-    /// `None`: to everybody on the channel of the layer broker.
-    to: Option<FlowId>,
-    body: Body,
-}
+/// A message to another flow; `None`: to everybody on the channel of the layer broker.
+type Outgoing = (Option<FlowId>, Body);
 
 /// Where flows hear each other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -93,9 +88,10 @@ pub struct Registry {
     /// Flows whose last life is over, and until when they may come back with the services that they had.
     departed: BTreeMap<FlowId, Instant>,
     world: World,
+    /// What waits for [`Registry::poll`].
     outgoing: VecDeque<Outgoing>,
-    /// For the channel of the layer broker; `None` = everybody there.
-    layer_outgoing: Vec<(Option<FlowId>, Body)>,
+    /// For the channel of the layer broker.
+    layer_outgoing: Vec<Outgoing>,
     /// Where flows stopped that carried a topic out of the layer.
     legacies: Legacies,
     /// Topics whose carrier has changed.
@@ -115,18 +111,9 @@ impl Registry {
     #[must_use]
     pub fn new(mut config: RegistryConfig) -> Self {
         let own = FlowView {
-            kind: config.kind,
-            epoch: config.epoch,
-            state: FlowState::Starting,
-            reach: Reach::Up,
             node_scope: config.node_scope,
             layer_scope: config.layer_scope,
-            topics: BTreeMap::new(),
-            settled: false,
-            parts: BTreeMap::new(),
-            gateway: AutoBool::Auto,
-            role: Role::Gateway,
-            layer_away: false,
+            ..FlowView::new(config.kind, config.epoch)
         };
         Self {
             leases: LeaseTable::new(config.max_leases.min(MAX_LEASED_ENTRIES), config.lease_stores.clone()),
@@ -160,12 +147,6 @@ impl Registry {
     #[must_use]
     pub fn world(&self) -> &World {
         &self.world
-    }
-
-    /// When the flow started.
-    #[must_use]
-    pub fn started(&self) -> Instant {
-        self.config.started
     }
 
     /// What was ignored of other flows' announcements.

@@ -1,16 +1,17 @@
 //! The registry and other flows: their Hellos, what they announce, and what they are told.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use blaze_domain::node_file::AutoBool;
-use blaze_domain::{FlowId, LayerKind, Scope, TopicName};
-use blaze_proto::link::link_control::{Body, Hello, Kind, RouteState, State};
+use blaze_domain::{FlowId, Scope, TopicName};
+use blaze_proto::link::link_control::{Body, Hello, RouteState, State};
 
 use super::gateways::patience;
 use super::remote::Remote;
 use super::types::RemoteLease;
-use super::{Outgoing, Registry, Way};
+use super::{Registry, Way};
+use crate::link::kind_from_wire;
 use crate::world::{FlowState, FlowView, LayerScopeId, OriginFilter, Reach, Role};
 
 /// Most other flows that are followed.
@@ -41,7 +42,7 @@ impl Registry {
 
     /// Another flow said Hello somewhere. Returns the topics to plan anew.
     pub(super) fn hear(&mut self, now: Instant, from: &FlowId, hello: &Hello, way: Way) -> BTreeSet<TopicName> {
-        let Some(kind) = kind_of(hello).filter(|_| {
+        let Some(kind) = kind_from_wire(hello.kind()).filter(|_| {
             *from != self.config.me && from.layer.as_str() == hello.layer && from.node.as_str() == hello.node
         }) else {
             self.faults.bad_hellos += 1;
@@ -87,26 +88,10 @@ impl Registry {
             Way::Layer => self.said_role(now, from, hello),
         };
         let others = self.remotes.len();
-        let view = self.world.flows.entry(from.clone()).or_insert_with(|| FlowView {
-            kind,
-            epoch: hello.epoch,
-            state,
-            reach: Reach::Up,
-            node_scope: false,
-            layer_scope,
-            topics: BTreeMap::new(),
-            settled: false,
-            parts: BTreeMap::new(),
-            gateway,
-            role,
-            layer_away: false,
-        });
+        let new = || FlowView::new(kind, hello.epoch);
+        let view = self.world.flows.entry(from.clone()).or_insert_with(new);
         // One that is heard in two places may say of itself what it said before.
-        let state = if is_new || rank(state) >= rank(view.state) {
-            state
-        } else {
-            view.state
-        };
+        let state = if is_new { state } else { state.max(view.state) };
         let said = (kind, state, layer_scope, gateway, role, hello.layer_away);
         let (scope, away) = (view.layer_scope, view.layer_away);
         let same = !is_new && (view.kind, view.state, scope, view.gateway, view.role, away) == said;
@@ -118,7 +103,7 @@ impl Registry {
             view.role,
             view.layer_away,
         ) = said;
-        let remote = self.remotes.entry(from.clone()).or_insert_with(Remote::new);
+        let remote = self.remotes.entry(from.clone()).or_default();
         if way == Way::Layer {
             remote.link_peers = hello.link_peers;
         }
@@ -179,8 +164,7 @@ impl Registry {
                     if self.outgoing.len() >= MAX_OUTGOING {
                         self.faults.dropped_replies += 1;
                     } else {
-                        let (to, body) = (to.clone(), Body::Snapshot(part));
-                        self.outgoing.push_back(Outgoing { to, body });
+                        self.outgoing.push_back((to.clone(), Body::Snapshot(part)));
                     }
                 }
                 return BTreeSet::new();
@@ -245,7 +229,7 @@ impl Registry {
         let topics = self.all_topics();
         self.remotes.remove(flow);
         self.world.flows.remove(flow);
-        self.outgoing.retain(|message| message.to.as_ref() != Some(flow));
+        self.outgoing.retain(|(to, _)| to.as_ref() != Some(flow));
         topics
     }
 
@@ -268,7 +252,7 @@ impl Registry {
     pub fn poll(&mut self, now: Instant) -> Vec<(FlowId, Body)> {
         let mut messages = Vec::new();
         let mut layer = Vec::new();
-        for Outgoing { to, body } in self.outgoing.drain(..) {
+        for (to, body) in self.outgoing.drain(..) {
             match to {
                 Some(to) => messages.push((to, body)),
                 None => layer.push((None, body)),
@@ -387,23 +371,5 @@ fn is_reachable(remote: &Remote) -> bool {
     match remote.ways.layer {
         Some(sign) => !sign.over,
         None => remote.ways.over_link(),
-    }
-}
-
-/// A flow begins, is ready, and goes: never the other way round in one life.
-fn rank(state: FlowState) -> u8 {
-    match state {
-        FlowState::Starting => 0,
-        FlowState::Ready => 1,
-        FlowState::Draining => 2,
-    }
-}
-
-fn kind_of(hello: &Hello) -> Option<LayerKind> {
-    match hello.kind() {
-        Kind::Edge => Some(LayerKind::Edge),
-        Kind::Fog => Some(LayerKind::Fog),
-        Kind::Cloud => Some(LayerKind::Cloud),
-        Kind::Unspecified => None,
     }
 }

@@ -8,6 +8,8 @@ use std::collections::BTreeMap;
 use blaze_proto::link::link_control as wire;
 use prost::Message;
 
+use crate::plan::rendezvous::stable_hash;
+
 /// Largest encoded LinkControl, in bytes.
 pub const MAX_LINK_CONTROL_BYTES: usize = 1200;
 /// What remains of it for entries, beside the envelope of a Delta with the largest numbers.
@@ -36,52 +38,42 @@ pub(super) fn pieces(entry: wire::Entry) -> Vec<wire::Entry> {
 
 /// The smallest parts of an entry that [`absorb`] joins again, in order.
 fn atoms(entry: &wire::Entry) -> Vec<wire::Entry> {
-    let blank = || wire::Entry {
-        topic: entry.topic.clone(),
-        ..wire::Entry::default()
+    let with = |fill: &dyn Fn(&mut wire::Entry)| {
+        let mut atom = wire::Entry {
+            topic: entry.topic.clone(),
+            ..wire::Entry::default()
+        };
+        fill(&mut atom);
+        atom
     };
     let mut atoms = vec![
-        wire::Entry {
-            node_advertise: entry.node_advertise.clone(),
-            ..blank()
-        },
-        wire::Entry {
-            layer_advertise: entry.layer_advertise.clone(),
-            ..blank()
-        },
-        wire::Entry {
-            outside_advertise: entry.outside_advertise.clone(),
-            ..blank()
-        },
+        with(&|atom| atom.node_advertise.clone_from(&entry.node_advertise)),
+        with(&|atom| atom.layer_advertise.clone_from(&entry.layer_advertise)),
+        with(&|atom| atom.outside_advertise.clone_from(&entry.outside_advertise)),
     ];
-    let mut request = |request: Option<wire::Request>, place: fn(wire::Entry, wire::Request) -> wire::Entry| {
-        let Some(mut request) = request else { return };
+    let mut request = |request: Option<&wire::Request>, place: fn(&mut wire::Entry, wire::Request)| {
+        let Some(mut request) = request.cloned() else { return };
         let filters = std::mem::take(&mut request.from);
-        atoms.push(place(blank(), request));
+        atoms.push(with(&|atom| place(atom, request.clone())));
         atoms.extend(filters.into_iter().map(|filter| {
             let more = wire::Request {
                 from: vec![filter],
                 ..wire::Request::default()
             };
-            place(blank(), more)
+            with(&|atom| place(atom, more.clone()))
         }));
     };
-    request(entry.node_request.clone(), |entry, request| wire::Entry {
-        node_request: Some(request),
-        ..entry
+    request(entry.node_request.as_ref(), |atom, request| {
+        atom.node_request = Some(request);
     });
-    request(entry.layer_request.clone(), |entry, request| wire::Entry {
-        layer_request: Some(request),
-        ..entry
+    request(entry.layer_request.as_ref(), |atom, request| {
+        atom.layer_request = Some(request);
     });
-    request(entry.outside_request.clone(), |entry, request| wire::Entry {
-        outside_request: Some(request),
-        ..entry
+    request(entry.outside_request.as_ref(), |atom, request| {
+        atom.outside_request = Some(request);
     });
-    atoms.extend(entry.route_state.iter().map(|route| wire::Entry {
-        route_state: vec![route.clone()],
-        ..blank()
-    }));
+    let route = |route: &wire::RouteState| with(&|atom| atom.route_state.push(route.clone()));
+    atoms.extend(entry.route_state.iter().map(route));
     atoms
 }
 
@@ -144,11 +136,5 @@ pub(crate) fn entry_hash(entry: &wire::Entry) -> u64 {
 
 /// A hash that is the same in every flow.
 pub(super) fn text_hash(bytes: &[u8]) -> u64 {
-    // FNV-1a, then the finalizer of SplitMix64: sums of plain FNV values would share their weak low bits.
-    let mut hash = bytes.iter().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
-        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
-    });
-    hash = (hash ^ (hash >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    hash = (hash ^ (hash >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    hash ^ (hash >> 31)
+    stable_hash(bytes.iter().copied())
 }

@@ -51,6 +51,7 @@ struct PartialDelta {
 }
 
 /// The announcements of one other flow.
+#[derive(Default)]
 pub(super) struct Remote {
     version: u64,
     digest: u64,
@@ -65,7 +66,8 @@ pub(super) struct Remote {
     failures: u32,
     /// By `to_version`, then `from_version`.
     pending: BTreeMap<(u64, u64), PartialDelta>,
-    retry: Duration,
+    /// After how long what did not come is asked for again, once the round trip is known.
+    retry: Option<Duration>,
     /// How it is reached.
     pub(super) ways: Ways,
     /// Since when it has been ready, without a break.
@@ -84,30 +86,8 @@ pub(super) struct Remote {
 pub(super) type Topics = BTreeMap<TopicName, TopicEntry>;
 
 impl Remote {
-    pub(super) fn new() -> Self {
-        Self {
-            version: 0,
-            digest: 0,
-            entries: BTreeMap::new(),
-            heard: (0, 0),
-            older_hellos: 0,
-            doubt: false,
-            pull_at: None,
-            pull: None,
-            failures: 0,
-            pending: BTreeMap::new(),
-            retry: DEFAULT_RETRY,
-            ways: Ways::default(),
-            ready_since: None,
-            began: None,
-            new_gateway: None,
-            down_since: None,
-            link_peers: 0,
-        }
-    }
-
     pub(super) fn set_round_trip(&mut self, round_trip: Duration) {
-        self.retry = (round_trip * 2).clamp(Duration::from_millis(50), Duration::from_secs(2));
+        self.retry = Some((round_trip * 2).clamp(Duration::from_millis(50), Duration::from_secs(2)));
     }
 
     pub(super) fn routes(&self, topic: &TopicName) -> &[wire::RouteState] {
@@ -225,29 +205,17 @@ impl Remote {
         let mut changed = BTreeSet::new();
         while !self.doubt {
             let version = self.version;
-            let next = self
-                .pending
-                .iter()
-                .rev()
-                .find(|((to, from), delta)| *to > version && *from <= version && delta.missing == 0);
-            let Some((key, _)) = next else {
-                break;
-            };
-            let key = *key;
-            let pieces: Vec<wire::Entry> = if self.pull.is_some() {
+            let follows = |(to, from): (u64, u64)| to > version && from <= version;
+            let mut newest_first = self.pending.iter().rev();
+            let next = newest_first.find(|(key, delta)| follows(**key) && delta.missing == 0);
+            let Some(key) = next.map(|(key, _)| *key) else { break };
+            let delta = if self.pull.is_some() {
                 // The snapshot that is being pulled may be older than this: then it is needed once more.
-                self.pending
-                    .get(&key)
-                    .into_iter()
-                    .flat_map(|delta| delta.parts.iter().flatten().flatten().cloned())
-                    .collect()
+                self.pending.get(&key).map(|delta| delta.parts.clone())
             } else {
-                self.pending
-                    .remove(&key)
-                    .into_iter()
-                    .flat_map(|delta| delta.parts.into_iter().flatten().flatten())
-                    .collect()
+                self.pending.remove(&key).map(|delta| delta.parts)
             };
+            let pieces = delta.into_iter().flatten().flatten().flatten();
             self.apply(pieces, false, topics, faults, &mut changed);
             self.version = key.0;
         }
@@ -281,7 +249,7 @@ impl Remote {
         if self.pull.is_none() && self.pull_at.is_some() {
             // Somebody else has asked for what this one was about to ask for, and all hear the answer.
             self.pull_at = None;
-            self.pull = Some(Pull::overheard(now, self.retry));
+            self.pull = Some(Pull::overheard(now, self.retry.unwrap_or(DEFAULT_RETRY)));
         }
         let Some(pull) = &mut self.pull else {
             faults.unasked_parts += 1;
@@ -410,7 +378,7 @@ impl Remote {
             self.pull_at = None;
             self.pull = Some(Pull::new(now));
         }
-        let retry = self.retry;
+        let retry = self.retry.unwrap_or(DEFAULT_RETRY);
         let pull = self.pull.as_mut().filter(|pull| pull.next_request <= now)?;
         if pull.tries >= MAX_TRIES {
             self.pull = None;

@@ -11,12 +11,12 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::time::Instant;
 
-use blaze_domain::control::{ControlMessage, LeaseKind, parse_payload};
+use blaze_domain::control::{ControlMessage, parse_payload};
 use blaze_domain::{FlowId, NodeName, Scope, TopicName};
 use bytes::Bytes;
 
 use super::Registry;
-use super::holder::holder;
+use super::holder::{key_of, kind_of};
 use super::kept::Taken;
 use super::leases::{LeaseKey, LeaseTable};
 
@@ -87,23 +87,10 @@ fn read(scope: Scope, me: &FlowId, key: &str, value: &[u8]) -> Kept {
 
 /// Whether a message makes the lease that it is kept as.
 fn is_under(scope: Scope, me: &FlowId, message: &ControlMessage, key: &str) -> bool {
-    let kind = match message {
-        ControlMessage::Advertise(_) => LeaseKind::Advertise,
-        ControlMessage::Request(_) => LeaseKind::Request,
-        ControlMessage::Withdraw(_) => return false,
-    };
+    let Some(kind) = kind_of(message) else { return false };
     let common = message.common();
-    holder(scope, me, common, "").is_ok_and(|(layer, node)| {
-        let found = LeaseKey {
-            scope,
-            kind,
-            layer,
-            node,
-            service: common.service.clone(),
-            instance: common.instance.clone(),
-        };
-        StoredKey(&common.topic, &found).to_string() == key
-    })
+    let found = key_of(scope, me, kind, common, "");
+    found.is_ok_and(|found| StoredKey(&common.topic, &found).to_string() == key)
 }
 
 impl Registry {

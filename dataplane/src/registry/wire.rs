@@ -6,12 +6,13 @@
 //! ```
 
 use blaze_domain::control::{DEFAULT_ENCODING, MAX_ENCODING_BYTES, MAX_TYPE_BYTES};
-use blaze_domain::{Durability, Priority, Reliability, TopicName};
+use blaze_domain::{Durability, Reliability, TopicName};
 use blaze_proto::link::link_control as wire;
 use prost::Message;
 
 use super::merge::MAX_FILTERS;
 use super::pieces::MAX_PIECE_BYTES;
+use crate::link::{class_code, class_of};
 use crate::world::{Advertise, OriginFilter, Request, ScopeEntry, Source, TopicEntry};
 
 /// Largest advertisement: with the longest topic it fits a piece.
@@ -70,7 +71,7 @@ fn advertise_to_wire(advertise: &Advertise) -> wire::Advertise {
         reliable: advertise.reliability == Reliability::Reliable,
         transient_local: advertise.durability == Durability::TransientLocal,
         depth: advertise.depth,
-        priority: class_to_wire(advertise.priority),
+        priority: advertise.priority.map_or(0, class_code).into(),
         lifespan_ms: advertise.lifespan_ms,
         sources: Vec::new(),
         // Set while measuring, so that setting it later does not make the message longer.
@@ -97,7 +98,7 @@ fn request_to_wire(request: &Request) -> wire::Request {
         reliable: request.reliability == Reliability::Reliable,
         transient_local: request.durability == Durability::TransientLocal,
         depth: request.depth,
-        priority: class_to_wire(request.priority),
+        priority: request.priority.map_or(0, class_code).into(),
         from: request
             .from
             .iter()
@@ -127,21 +128,6 @@ fn cut(text: &str) -> String {
     text.get(..text.floor_char_boundary(MAX_ROUTE_TEXT))
         .unwrap_or_default()
         .to_owned()
-}
-
-fn class_to_wire(class: Option<Priority>) -> u32 {
-    class.map_or(0, |class| {
-        u32::try_from(blaze_proto::priority_to_wire(class)).unwrap_or(0)
-    })
-}
-
-fn class_from_wire(class: u32) -> Option<Priority> {
-    match class {
-        1 => Some(Priority::Control),
-        2 => Some(Priority::State),
-        3 => Some(Priority::Bulk),
-        _ => None,
-    }
 }
 
 /// Another flow's entry, checked.
@@ -211,7 +197,7 @@ fn advertise_from_wire(message: &wire::Advertise) -> Result<Advertise, EntryFaul
         reliability: reliability(message.reliable),
         durability: durability(message.transient_local),
         depth: message.depth.max(1),
-        priority: class_from_wire(message.priority),
+        priority: class_of(message.priority),
         lifespan_ms: message.lifespan_ms,
         sources,
         more_sources: message.more_sources,
@@ -247,7 +233,7 @@ fn request_from_wire(message: &wire::Request) -> Result<Request, EntryFault> {
         reliability: reliability(message.reliable),
         durability: durability(message.transient_local),
         depth: message.depth.max(1),
-        priority: class_from_wire(message.priority),
+        priority: class_of(message.priority),
         from,
         type_name: message.r#type.clone(),
         type_hash: message.type_hash.clone(),

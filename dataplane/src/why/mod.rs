@@ -216,6 +216,7 @@ impl<'w> Explainer<'_, 'w> {
 
     /// Requesters that are asked about, of all flows, each scope once; or what is wrong.
     fn request_side(&self) -> Result<Vec<Requester<'w>>, Trace> {
+        let world = self.input.world;
         let mut found: Vec<Requester<'w>> = Vec::new();
         let living = self.view.requesters.iter().chain(&self.view.refused).copied();
         let all: Vec<Requester<'w>> = living.chain(self.silent_requesters()).collect();
@@ -224,7 +225,7 @@ impl<'w> Explainer<'_, 'w> {
                 requester.scope != Scope::Node && other.scope == requester.scope && other.group == requester.group
             };
             match found.iter_mut().find(|other| shared(other)) {
-                Some(other) if requester.flow == self.view.me && self.carries(requester.flow) => *other = *requester,
+                Some(other) if requester.flow == self.view.me && world.carries(requester.flow) => *other = *requester,
                 Some(_) => {}
                 None => found.push(*requester),
             }
@@ -243,8 +244,8 @@ impl<'w> Explainer<'_, 'w> {
 
     /// Requesters of flows that carry nothing.
     fn silent_requesters(&self) -> Vec<Requester<'w>> {
-        let mut silent = Vec::new();
-        for (id, flow) in self.input.world.flows.iter().filter(|(id, _)| !self.carries(id)) {
+        let (world, mut silent) = (self.input.world, Vec::new());
+        for (id, flow) in world.flows.iter().filter(|(id, _)| !world.carries(id)) {
             let Some(entry) = flow.topics.get(self.input.topic) else {
                 continue;
             };
@@ -264,13 +265,9 @@ impl<'w> Explainer<'_, 'w> {
     }
 
     fn has_living(&self, group: Group<'_>) -> bool {
-        let mut flows = self.input.world.flows.iter();
-        flows.any(|(id, flow)| self.carries(id) && Group::of(id, flow) == group)
-    }
-
-    fn carries(&self, id: &FlowId) -> bool {
-        let flow = self.input.world.flows.get(id);
-        flow.is_some_and(|flow| flow.state == FlowState::Ready && (flow.reach != Reach::Down || id == self.view.me))
+        let world = self.input.world;
+        let mut flows = world.flows.iter();
+        flows.any(|(id, flow)| world.carries(id) && Group::of(id, flow) == group)
     }
 
     /// Of a node its own requesters; if it has none, those of the layer scope that it is on.

@@ -8,7 +8,7 @@ use super::{BridgeFacts, BridgeState, BrokerFacts, BrokerHealth, Step, StepKind,
 use crate::plan::{
     Blocked, Destination, Pairing, Publisher, Requester, Target, TopicView, asks_too_much, meets_directly, type_detail,
 };
-use crate::world::{FlowState, Reach};
+use crate::world::Reach;
 
 /// The steps of one pair, in the order of a message's way.
 pub(super) struct Trace {
@@ -18,8 +18,18 @@ pub(super) struct Trace {
 impl Trace {
     pub(super) fn failed(flow: &FlowId, step: StepKind, code: WhyCode, detail: String) -> Self {
         let mut trace = Self { steps: Vec::new() };
-        trace.add(flow, step, false, code, detail);
+        trace.fail(flow, step, code, detail);
         trace
+    }
+
+    /// Messages pass a step.
+    fn pass(&mut self, flow: &FlowId, step: StepKind, detail: impl Into<String>) {
+        self.add(flow, step, true, WhyCode::Ok, detail);
+    }
+
+    /// They do not.
+    fn fail(&mut self, flow: &FlowId, step: StepKind, code: WhyCode, detail: impl Into<String>) {
+        self.add(flow, step, false, code, detail);
     }
 
     fn add(&mut self, flow: &FlowId, step: StepKind, ok: bool, code: WhyCode, detail: impl Into<String>) {
@@ -69,20 +79,8 @@ pub(super) struct Tracer<'a, 'w> {
 impl<'w> Tracer<'_, 'w> {
     pub(super) fn trace(&self, publisher: &Publisher<'w>, requester: &Requester<'w>) -> Trace {
         let mut trace = Trace { steps: Vec::new() };
-        trace.add(
-            publisher.flow,
-            StepKind::Advertise,
-            true,
-            WhyCode::Ok,
-            advertised(publisher),
-        );
-        trace.add(
-            requester.flow,
-            StepKind::Request,
-            true,
-            WhyCode::Ok,
-            requested(requester),
-        );
+        trace.pass(publisher.flow, StepKind::Advertise, advertised(publisher));
+        trace.pass(requester.flow, StepKind::Request, requested(requester));
         if self.plan(&mut trace, publisher, requester) {
             self.note_owner(&mut trace, publisher, requester);
             if publisher.scope == Scope::Inter {
@@ -104,34 +102,28 @@ impl<'w> Tracer<'_, 'w> {
         match publisher.pairing(requester.request) {
             Pairing::OtherOrigin => {
                 let detail = format!("`from` of {} matches no publisher", requester.flow);
-                trace.add(flow, plan, false, WhyCode::NoMatchingOrigin, detail);
+                trace.fail(flow, plan, WhyCode::NoMatchingOrigin, detail);
                 return false;
             }
             Pairing::OtherType => {
-                trace.add(
-                    flow,
-                    plan,
-                    false,
-                    WhyCode::TypeMismatch,
-                    type_detail(publisher, requester),
-                );
+                trace.fail(flow, plan, WhyCode::TypeMismatch, type_detail(publisher, requester));
                 return false;
             }
             Pairing::Matches => {}
         }
         if let Some(view) = self.input.world.flows.get(requester.flow)
-            && !self.carries(requester.flow)
+            && !self.input.world.carries(requester.flow)
         {
             let step = if absent(view) == WhyCode::PeerDown {
                 StepKind::Link
             } else {
                 StepKind::Plan
             };
-            trace.add(requester.flow, step, false, absent(view), absence(requester.flow, view));
+            trace.fail(requester.flow, step, absent(view), absence(requester.flow, view));
             return false;
         }
         if let Some(detail) = self.view.denial(publisher, requester) {
-            trace.add(self.view.me, plan, false, WhyCode::AccessDenied, detail);
+            trace.fail(self.view.me, plan, WhyCode::AccessDenied, detail);
             return false;
         }
         if asks_too_much(publisher.advertise, requester.request) {
@@ -143,9 +135,9 @@ impl<'w> Tracer<'_, 'w> {
                 "more is asked than offered: it flows as offered",
             );
         } else if meets_directly(publisher, requester) {
-            trace.add(flow, plan, true, WhyCode::Ok, "one scope: no bridge is needed");
+            trace.pass(flow, plan, "one scope: no bridge is needed");
         } else {
-            trace.add(flow, plan, true, WhyCode::Ok, "they match");
+            trace.pass(flow, plan, "they match");
         }
         self.note_broker(trace, publisher, requester);
         true
@@ -172,7 +164,7 @@ impl<'w> Tracer<'_, 'w> {
         if trace.steps.len() == before {
             let names: Vec<String> = gateways.iter().map(ToString::to_string).collect();
             let detail = format!("over a gateway: {}", names.join(", "));
-            trace.add(self.view.me, StepKind::Plan, true, WhyCode::Ok, detail);
+            trace.pass(self.view.me, StepKind::Plan, detail);
         }
     }
 
@@ -197,11 +189,6 @@ impl<'w> Tracer<'_, 'w> {
         if let (true, Some(broker), Some(step)) = (reliable, broker, trace.steps.last_mut()) {
             let _ = write!(step.detail, "; {} delivers at most once whatever is asked", broker.name);
         }
-    }
-
-    fn carries(&self, id: &FlowId) -> bool {
-        let flow = self.input.world.flows.get(id);
-        flow.is_some_and(|flow| flow.state == FlowState::Ready && (flow.reach != Reach::Down || id == self.view.me))
     }
 
     /// The bridges between a publisher and a requester that match.
@@ -272,7 +259,7 @@ impl<'w> Tracer<'_, 'w> {
             self.own_hop(trace, hop);
         } else if self.denies(hop.flow, requester) {
             let detail = format!("{} says so: its rules flow.access do not allow it", hop.flow);
-            trace.add(hop.flow, StepKind::Plan, false, WhyCode::AccessDenied, detail);
+            trace.fail(hop.flow, StepKind::Plan, WhyCode::AccessDenied, detail);
         } else {
             self.other_hop(trace, hop);
         }
@@ -309,7 +296,7 @@ impl<'w> Tracer<'_, 'w> {
             trace.add(hop.flow, route.step, route.ok, route.code, detail);
         } else if own_layer && receiver.is_some() {
             let detail = format!("{} carries it for the layer and has told nothing of it", hop.flow);
-            trace.add(self.view.me, StepKind::Plan, false, WhyCode::NotOwner, detail);
+            trace.fail(self.view.me, StepKind::Plan, WhyCode::NotOwner, detail);
         }
         self.link(trace, hop);
     }
@@ -319,10 +306,10 @@ impl<'w> Tracer<'_, 'w> {
         let (flow, bridge) = (hop.flow, StepKind::Bridge);
         let way = format!("{} to {}", hop.from, describe(&hop.to));
         if let Some((code, detail)) = self.broker(hop.from).and_then(fault) {
-            return trace.add(flow, bridge, false, code, detail);
+            return trace.fail(flow, bridge, code, detail);
         }
         if let Some(blocked) = self.blocked(hop) {
-            return trace.add(flow, StepKind::Plan, false, blocked.code, blocked.detail.clone());
+            return trace.fail(flow, StepKind::Plan, blocked.code, blocked.detail.clone());
         }
         let planned = self
             .input
@@ -339,16 +326,16 @@ impl<'w> Tracer<'_, 'w> {
             .find(|facts| (facts.from, &facts.to) == (hop.from, &hop.to));
         match facts.map(|facts| &facts.state) {
             Some(BridgeState::Failed(detail)) => {
-                return trace.add(flow, bridge, false, WhyCode::BridgeFailed, format!("{way}: {detail}"));
+                return trace.fail(flow, bridge, WhyCode::BridgeFailed, format!("{way}: {detail}"));
             }
             Some(BridgeState::Up) => {}
             None if unplanned => {}
             Some(BridgeState::Starting) | None => {
                 let what = if planned { "is being made" } else { "is not planned yet" };
-                return trace.add(flow, bridge, false, WhyCode::BridgeStarting, format!("{way} {what}"));
+                return trace.fail(flow, bridge, WhyCode::BridgeStarting, format!("{way} {what}"));
             }
         }
-        trace.add(flow, bridge, true, WhyCode::Ok, way);
+        trace.pass(flow, bridge, way);
         let target = match hop.to {
             Target::Node { .. } => Scope::Node,
             Target::Layer => Scope::Layer,
@@ -356,7 +343,7 @@ impl<'w> Tracer<'_, 'w> {
         };
         // A broker that is away explains what was dropped on the way to it.
         if let Some((code, detail)) = self.broker(target).and_then(fault) {
-            return trace.add(flow, StepKind::Deliver, false, code, detail);
+            return trace.fail(flow, StepKind::Deliver, code, detail);
         }
         if let Some(facts) = facts {
             drops(trace, hop, facts);
@@ -364,7 +351,7 @@ impl<'w> Tracer<'_, 'w> {
         self.link(trace, hop);
         if target != Scope::Inter {
             let counted = facts.map_or_else(String::new, counts);
-            trace.add(flow, StepKind::Deliver, true, WhyCode::Ok, counted);
+            trace.pass(flow, StepKind::Deliver, counted);
         }
     }
 
@@ -394,9 +381,9 @@ impl<'w> Tracer<'_, 'w> {
             .is_some_and(|view| view.reach == Reach::Suspect);
         if suspect {
             let detail = format!("{peer} has not answered for a moment");
-            trace.add(hop.flow, StepKind::Link, false, WhyCode::PeerSuspect, detail);
+            trace.fail(hop.flow, StepKind::Link, WhyCode::PeerSuspect, detail);
         } else {
-            trace.add(hop.flow, StepKind::Link, true, WhyCode::Ok, format!("to {receiver}"));
+            trace.pass(hop.flow, StepKind::Link, format!("to {receiver}"));
         }
     }
 

@@ -19,7 +19,7 @@ use anyhow::Context as _;
 use blaze_domain::Priority;
 use blaze_domain::node_file::Chunking;
 use blaze_flow::link::dds::{DdsConfig, DdsTransport};
-use blaze_flow::link::transport::{Endpoint, SendOutcome, Transport, TransportEvent};
+use blaze_flow::link::transport::{Endpoint, SendOutcome, TransportEvent};
 use bytes::Bytes;
 use clap::Args;
 use parking_lot::Mutex;
@@ -144,7 +144,7 @@ fn exchange_addresses(transport: &DdsTransport, seen: &Mutex<Seen>) {
     for peer in peers {
         transport.connect(&peer);
         let hello = [HELLO, known.join(",").as_bytes()].concat();
-        transport.send(&peer, Priority::Control, hello.into());
+        let _ = transport.send(&peer, Priority::Control, hello.into());
     }
 }
 

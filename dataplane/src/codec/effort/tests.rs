@@ -268,7 +268,7 @@ fn what_does_not_become_smaller_goes_as_it_is_and_is_tried_again() {
     let mut world = World::new(10, RECORDING, 2.0, 30.0);
     world.ratio = 0.98;
     world.run(1.0);
-    assert!(world.effort.is_incompressible() && world.effort.goes_as_it_is());
+    assert!(world.effort.incompressible && world.effort.goes_as_it_is());
     assert!(
         world.effort.wanted().abs() < 1e-9,
         "others may have its part of the pool"

@@ -1,8 +1,7 @@
 //! Topics that go to another flow of the layer by load, and come from one.
 
 use blaze_brokers::Begin;
-use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Advertise, Channel, Delta, Egress, Entry, Hello, Kind, Request, State};
+use blaze_proto::link::link_control::{Advertise, Egress};
 
 use super::*;
 use crate::lane::load::{Loads, TopicLoad};
@@ -52,35 +51,11 @@ impl Pair {
             steps: 0,
             duties: Vec::new(),
         };
-        let robot: FlowId = "edge/r".parse().unwrap();
-        let now = pair.bench.now;
         let hello = Hello {
             registry_version: 1,
-            ..said_by(&robot, Kind::Edge)
+            ..said_by(&"edge/r".parse().unwrap(), Kind::Edge)
         };
-        let request = |name: &str| Entry {
-            topic: name.into(),
-            node_request: Some(Request::default()),
-            ..Entry::default()
-        };
-        let delta = Delta {
-            from_version: 0,
-            to_version: 1,
-            part: 0,
-            parts: 1,
-            entries: TOPICS.map(request).into(),
-        };
-        let hello = Box::new(hello);
-        let core = &mut pair.bench.core;
-        core.link_event(
-            now,
-            LinkEvent::Hello {
-                from: robot.clone(),
-                hello,
-            },
-        );
-        let body = Body::Delta(delta);
-        core.link_event(now, LinkEvent::Control { from: robot, body });
+        pair.bench.link_says(hello, 1, TOPICS.map(asks_for).into());
         for name in TOPICS {
             pair.bench.send(Scope::Layer, &lease("advertise", name));
         }
@@ -94,16 +69,7 @@ impl Pair {
     }
 
     fn say(&mut self, body: Body) {
-        let channel = Channel {
-            from: other().to_string(),
-            epoch: 1,
-            ..Channel::default()
-        };
-        let message = LinkControl {
-            body: Some(body),
-            channel: Some(channel),
-        };
-        self.bench.core.replica_message(self.bench.now, Some(message), Some(0));
+        self.bench.fog_2_says(body, Some(0));
     }
 
     fn hello(&mut self) {
@@ -131,15 +97,8 @@ impl Pair {
         let entries: Vec<Entry> = parts.iter().map(entry).collect();
         self.entries
             .extend(entries.iter().map(|entry| (entry.topic.clone(), entry.clone())));
-        let delta = Delta {
-            from_version: self.version,
-            to_version: self.version + 1,
-            part: 0,
-            parts: 1,
-            entries,
-        };
         self.version += 1;
-        self.say(Body::Delta(delta));
+        self.say(Body::Delta(delta(self.version, entries)));
     }
 
     /// Does what the executor does.
@@ -218,13 +177,8 @@ pub(super) fn said_by(flow: &FlowId, kind: Kind) -> Hello {
         0
     };
     Hello {
-        layer: flow.layer.to_string(),
-        node: flow.node.to_string(),
-        kind: kind.into(),
-        epoch: 1,
-        state: State::Ready.into(),
         layer_scope_id,
-        ..Hello::default()
+        ..hello_of(flow, kind)
     }
 }
 

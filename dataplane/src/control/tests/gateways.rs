@@ -1,7 +1,6 @@
 //! A flow that is to be on the inter scope and cannot, and what stays of services that are only not named any more.
 
-use blaze_proto::link::LinkControl;
-use blaze_proto::link::link_control::{Advertise, Channel, Delta, Entry, Gateway, Hello, Kind, Request, Source};
+use blaze_proto::link::link_control::{Advertise, Gateway, Source};
 
 use super::balance::said_by;
 use super::*;
@@ -16,9 +15,7 @@ fn alone() -> Bench {
         inter_scope: true,
         ..config
     });
-    for scope in LOCAL {
-        bench.core.restore_leases(bench.now, scope, &[]);
-    }
+    bench.read_leases();
     bench.core.hears_replicas(bench.now);
     bench
 }
@@ -32,22 +29,18 @@ impl Bench {
 
     /// What is asked of the inter scope, since the last call.
     fn wishes(&mut self) -> Vec<bool> {
-        let outputs = std::mem::take(&mut self.outputs);
-        let wish = |output| match output {
+        self.wanted(|output| match output {
             Output::Inter { join } => Some(join),
             _ => None,
-        };
-        outputs.into_iter().filter_map(wish).collect()
+        })
     }
 
     /// Whose kept messages are to be forgotten, and but for whom, since the last call.
     fn forgotten(&mut self) -> Vec<(OriginFilter, BTreeSet<OriginFilter>)> {
-        let outputs = std::mem::take(&mut self.outputs);
-        let forgets = |output| match output {
+        self.wanted(|output| match output {
             Output::ForgetWriters { of, but, .. } => Some((of, but)),
             _ => None,
-        };
-        outputs.into_iter().filter_map(forgets).collect()
+        })
     }
 
     fn own(&self) -> (AutoBool, Role) {
@@ -86,24 +79,18 @@ impl Bench {
     }
 
     fn robot_says_in(&mut self, epoch: u64, version: u64, entry: Entry) {
-        let robot: FlowId = "edge/robot-1".parse().unwrap();
-        let (hello, delta) = (
-            Box::new(Hello {
-                epoch,
-                ..said_by(&robot, Kind::Edge)
-            }),
-            Delta {
-                from_version: version - 1,
-                to_version: version,
-                part: 0,
-                parts: 1,
-                entries: vec![entry],
-            },
-        );
-        let from = robot.clone();
-        self.core.link_event(self.now, LinkEvent::Hello { from, hello });
-        let body = Body::Delta(delta);
-        self.core.link_event(self.now, LinkEvent::Control { from: robot, body });
+        let hello = Hello {
+            epoch,
+            ..said_by(&"edge/robot-1".parse().unwrap(), Kind::Edge)
+        };
+        self.link_says(hello, version, vec![entry]);
+    }
+
+    /// The robot's flow says good-bye, or was silent for long.
+    fn forget_robot(&mut self) {
+        let flow = "edge/robot-1".parse().unwrap();
+        let gone = LinkEvent::PeerForgotten(Endpoint { flow, epoch: 1 });
+        self.core.link_event(self.now, gone);
     }
 }
 
@@ -166,12 +153,7 @@ fn a_flow_without_a_group_stays_on_the_inter_scope() {
 #[test]
 fn rules_hold_for_requests_of_other_flows_and_change_while_the_flow_runs() {
     let mut bench = Bench::inside();
-    let request = Entry {
-        topic: TOPIC.into(),
-        node_request: Some(Request::default()),
-        ..Entry::default()
-    };
-    bench.robot_says(1, request);
+    bench.robot_says(1, asks_for(TOPIC));
     bench.send(Scope::Node, &lease("advertise", TOPIC));
     bench.step(300);
     assert_eq!(bench.bridges(TOPIC).len(), 1);
@@ -241,13 +223,7 @@ fn what_is_kept_stays_while_a_flow_begins_a_new_life() {
     bench.send(Scope::Node, &lease("request", TOPIC));
     bench.robot_announces(1, &["mapper", "planner"], false);
     bench.wait(10_000);
-    bench.core.link_event(
-        bench.now,
-        LinkEvent::PeerForgotten {
-            flow: "edge/robot-1".parse().unwrap(),
-            epoch: 1,
-        },
-    );
+    bench.forget_robot();
     bench.wait(20_000);
     assert_eq!(bench.forgotten(), [], "it said good-bye, and may come back");
     bench.robot_announces_in(2, 1, &["mapper"], false);
@@ -271,13 +247,7 @@ fn what_is_kept_of_a_flow_that_does_not_come_back_is_forgotten() {
     bench.send(Scope::Node, &lease("request", TOPIC));
     bench.robot_announces(1, &["mapper"], false);
     bench.wait(400);
-    bench.core.link_event(
-        bench.now,
-        LinkEvent::PeerForgotten {
-            flow: "edge/robot-1".parse().unwrap(),
-            epoch: 1,
-        },
-    );
+    bench.forget_robot();
     bench.wait(50_000);
     assert_eq!(bench.forgotten(), []);
     bench.wait(20_000);
@@ -286,23 +256,13 @@ fn what_is_kept_of_a_flow_that_does_not_come_back_is_forgotten() {
 
 /// Another gateway of the group says on the channel of the layer broker whom it reaches.
 fn fog_2_reaches(bench: &mut Bench, link_peers: u32) {
-    let flow: FlowId = "fog/fog-2".parse().unwrap();
     let hello = Hello {
         gateway: Gateway::Auto.into(),
         is_gateway: true,
         link_peers,
-        ..said_by(&flow, Kind::Fog)
+        ..said_by(&FOG_2.parse().unwrap(), Kind::Fog)
     };
-    let message = LinkControl {
-        body: Some(Body::Hello(hello)),
-        channel: Some(Channel {
-            from: flow.to_string(),
-            epoch: 1,
-            began: 1,
-            to: String::new(),
-        }),
-    };
-    bench.core.replica_message(bench.now, Some(message), Some(0));
+    bench.fog_2_says(Body::Hello(hello), Some(0));
 }
 
 /// Its way to all others is broken, and that of another gateway is not.
@@ -320,8 +280,10 @@ fn a_gateway_that_alone_reaches_nobody_leaves_the_work_to_others() {
     pass(&mut bench, 10, 1);
     assert_eq!(bench.own().1, Role::Gateway);
     let down = LinkEvent::PeerDown {
-        flow: robot.clone(),
-        epoch: 1,
+        endpoint: Endpoint {
+            flow: robot.clone(),
+            epoch: 1,
+        },
         reason: DownReason::Silent,
     };
     bench.core.link_event(bench.now, down);

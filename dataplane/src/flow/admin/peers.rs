@@ -11,8 +11,8 @@ use serde_json::{Value, json};
 use super::super::inter::InterScope;
 use super::{App, answer, rounded};
 use crate::control::ControlCore;
-use crate::link::{MAX_PEERS, PeerState};
-use crate::world::{Carrying, FlowState, Reach};
+use crate::link::MAX_PEERS;
+use crate::world::{Carrying, Reach};
 
 pub(super) async fn peers(State(shared): App) -> Json<Value> {
     let now = Instant::now();
@@ -28,7 +28,7 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
         .map(|peer| {
             json!({
                 "flow": peer.flow, "layer": peer.flow.layer, "kind": peer.kind, "epoch": peer.epoch,
-                "version": peer.version, "state": peer_state(peer.state),
+                "version": peer.version, "state": peer.state,
                 "last_heard_ms": peer.last_heard.map(|at| rounded(now.saturating_duration_since(at).as_secs_f64() * 1e3)),
                 "rtt_ms": peer.rtt.map(|rtt| rounded(rtt.as_secs_f64() * 1e3)),
                 "clock_offset_ms": peer.clock_offset_ns.map(|ns| rounded(ns as f64 / 1e6)),
@@ -39,7 +39,7 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
                 "receiving_bytes_per_s": peer.receiving_bytes_per_s.round(),
                 "queueing_delay_ms": rounded(peer.queueing_delay.as_secs_f64() * 1e3),
                 "capacity": peer.capacity.map(|capacity| json!({
-                    "state": capacity.state.as_str(), "bytes_per_s": capacity.bytes_per_s.round(),
+                    "state": capacity.state, "bytes_per_s": capacity.bytes_per_s.round(),
                     "measured_bytes_per_s": capacity.measured_bytes_per_s.map(f64::round),
                 })),
             })
@@ -72,11 +72,9 @@ pub(super) async fn peers(State(shared): App) -> Json<Value> {
 /// A flow that shares the layer broker, as it is heard there.
 fn replica_row(control: &ControlCore, (flow, silent): (&FlowId, Duration)) -> Value {
     let view = control.world().flows.get(flow);
-    let state = view.map(|view| match (view.reach, view.state) {
-        (Reach::Down, _) => "down",
-        (_, FlowState::Starting) => "starting",
-        (_, FlowState::Ready) => "ready",
-        (_, FlowState::Draining) => "draining",
+    let state = view.map(|view| match view.reach {
+        Reach::Down => json!("down"),
+        Reach::Up | Reach::Suspect => json!(view.state),
     });
     let parts = view.iter().flat_map(|view| view.parts.values());
     let carries = parts.filter(|part| part.carrying == Carrying::Carries).count();
@@ -99,13 +97,5 @@ fn setting(gateway: AutoBool) -> Value {
         AutoBool::Auto => json!("auto"),
         AutoBool::Yes => json!(true),
         AutoBool::No => json!(false),
-    }
-}
-
-fn peer_state(state: PeerState) -> &'static str {
-    match state {
-        PeerState::Up => "up",
-        PeerState::Suspect => "suspect",
-        PeerState::Down => "down",
     }
 }

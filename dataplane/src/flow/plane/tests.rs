@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize};
 
 use blaze_brokers::{Content, Later, PublishOutcome, Publisher, PublisherOptions};
 use blaze_domain::node_file::{Codec, Compression};
-use blaze_domain::{LayerKind, Origin, WriterId};
+use blaze_domain::{DropReason, FlowId, LayerKind, Origin, WriterId};
 use blaze_proto::link::link_control::LayerScope;
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
@@ -76,17 +76,9 @@ fn plane(me: &str) -> Arc<Plane> {
 /// Gives a flow one bridge of the topic.
 fn connect(plane: &Plane, from: Scope, to: Target, publisher: &Arc<Collector>) -> TopicId {
     let lane = LaneSpec {
-        max_rate_hz: None,
-        lifespan_ms: 0,
         reliable: true,
-        durable: false,
         depth: 1,
-        priority: None,
-        from: Vec::new(),
-        degraded: None,
-        relays: Vec::new(),
-        held: false,
-        shared: None,
+        ..LaneSpec::default()
     };
     let plan = TopicPlan {
         bridges: vec![Bridge { from, to, lane }],

@@ -152,8 +152,6 @@ pub(super) struct Loss {
     since: Instant,
     delivered: f64,
     lost: f64,
-    /// Of the last window, for people.
-    pub(super) newest: f64,
     /// Of the window before, if it counts.
     pub(super) previous: Option<f64>,
     /// What is lost whether much is sent or little.
@@ -176,7 +174,6 @@ impl Loss {
             since: now,
             delivered: 0.0,
             lost: 0.0,
-            newest: 0.0,
             previous: None,
             ordinary: 0.0,
         }
@@ -210,7 +207,7 @@ impl Loss {
             lasting: self.previous.map_or(0.0, |previous| previous.min(share)),
             delivered: self.delivered / elapsed.as_secs_f64(),
         };
-        (self.newest, self.previous) = (share, Some(share));
+        self.previous = Some(share);
         self.begin(now);
         Some(lost)
     }

@@ -188,7 +188,7 @@ fn loss_that_does_not_go_away_is_taken_for_ordinary() {
     let entries = simulator.between(10.0, 70.0);
     let low = entries.iter().filter(|entry| entry.least_rate < 0.9 * LIMIT).count();
     assert!((1..=30).contains(&low), "{low} tenths of a second");
-    assert!((0.15..0.25).contains(&simulator.capacity.loss()));
+    assert!((0.15..0.25).contains(&simulator.capacity.loss.ordinary));
 }
 
 #[test]

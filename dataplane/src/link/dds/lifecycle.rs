@@ -14,7 +14,7 @@ use blaze_brokers::dds::{
 };
 use blaze_domain::Priority;
 
-use super::{CLASSES, MAX_HEARD, Shared, index, parse_topic, profile, topic};
+use super::{CLASSES, MAX_HEARD, Shared, parse_topic, profile, topic};
 use crate::link::transport::{Endpoint, TransportEvent};
 
 const TICK: Duration = Duration::from_millis(200);
@@ -198,12 +198,14 @@ impl Lifecycle {
             let wanted = self.shared.wanted.lock();
             let writers = self.shared.writers.read();
             let is_missing = |endpoint: &Endpoint, class: Priority| {
-                writers.get(endpoint).is_none_or(|slots| slots[index(class)].is_none())
+                writers
+                    .get(endpoint)
+                    .is_none_or(|slots| slots[class as usize].is_none())
             };
             let classes = |(endpoint, flags): (&Endpoint, &[bool; CLASSES])| {
                 let missing = Priority::ALL
                     .iter()
-                    .filter(|class| flags[index(**class)] && is_missing(endpoint, **class));
+                    .filter(|class| flags[**class as usize] && is_missing(endpoint, **class));
                 missing.map(|class| (endpoint.clone(), *class)).collect::<Vec<_>>()
             };
             wanted.iter().flat_map(classes).collect()
@@ -214,9 +216,9 @@ impl Lifecycle {
                 Ok(writer) => {
                     // It may have been disconnected meanwhile.
                     let wanted = self.shared.wanted.lock();
-                    if wanted.get(&endpoint).is_some_and(|flags| flags[index(class)]) {
+                    if wanted.get(&endpoint).is_some_and(|flags| flags[class as usize]) {
                         let mut writers = self.shared.writers.write();
-                        writers.entry(endpoint).or_default()[index(class)] = Some(Arc::new(writer));
+                        writers.entry(endpoint).or_default()[class as usize] = Some(Arc::new(writer));
                     }
                 }
                 Err(error) => {
@@ -333,7 +335,7 @@ fn note_readers(shared: &Shared, own: &Endpoint, known: &mut Known, readers: &[F
         // Another participant with this flow's name is a mistake of the operator; the engine tells it from Hello.
         if endpoint != *own {
             let entry = found.entry(endpoint).or_insert((reader.participant, [false; CLASSES]));
-            entry.1[index(class)] = true;
+            entry.1[class as usize] = true;
         }
     }
     // A datagram needs all three topics, so an endpoint counts when it is complete.

@@ -89,7 +89,7 @@ impl Flow {
         self.transport.connect(to);
         for class in Priority::ALL {
             wait_for("first datagram", Duration::from_secs(5), || {
-                self.transport.send(to, *class, Bytes::from_static(b"first"));
+                let _ = self.transport.send(to, *class, Bytes::from_static(b"first"));
                 other
                     .received(*class)
                     .iter()
@@ -140,7 +140,7 @@ fn two_flows_of_one_host_meet_and_exchange_all_classes_in_order() {
     robot.wait_discovered(&fog.endpoint, DISCOVERY);
     fog.wait_discovered(&robot.endpoint, DISCOVERY);
     robot.reach(&fog, &fog.endpoint);
-    let size = robot.transport.max_datagram_bytes();
+    let size = robot.transport.shared.wire.max_datagram_bytes();
     for class in Priority::ALL {
         for number in 0..200_u32 {
             let mut datagram = vec![0; size];

@@ -38,13 +38,13 @@ const SMALLEST_LIMIT: usize = 2048;
 
 /// The sizes of one transport.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Wire {
+pub(crate) struct Wire {
     mtu: usize,
     max_datagram: usize,
 }
 
 impl Wire {
-    pub(super) fn new(mtu: usize, chunking: Chunking, loopback: bool) -> Self {
+    pub(crate) fn new(mtu: usize, chunking: Chunking, loopback: bool) -> Self {
         let mtu = mtu.clamp(SMALLEST_MTU, LOOPBACK_MTU);
         let one_packet = (mtu - MTU_OVERHEAD).min(LARGEST_SAMPLE) - (PAYLOAD_HEADER - 4);
         let max_datagram = match (chunking, loopback) {
@@ -58,12 +58,12 @@ impl Wire {
         }
     }
 
-    pub(super) fn max_datagram_bytes(self) -> usize {
+    pub(crate) fn max_datagram_bytes(self) -> usize {
         self.max_datagram
     }
 
     /// What datagrams become on the wire. Small ones that RustDDS happens to put into one packet take less.
-    pub(super) fn packets(self) -> PacketSize {
+    pub(crate) fn packets(self) -> PacketSize {
         let budget = self.mtu - BUDGET;
         let room = (budget - RTPS_HEADER).saturating_sub(DATA_FRAG);
         PacketSize {
@@ -85,7 +85,7 @@ impl Wire {
     }
 
     /// Bytes of all IP packets of a datagram, headers included.
-    pub(super) fn bytes(self, datagram: usize) -> usize {
+    pub(crate) fn bytes(self, datagram: usize) -> usize {
         self.packets().wire_bytes(datagram)
     }
 }

@@ -10,6 +10,7 @@ use super::{
     FEEDBACK_IDLE, GIVEN_UP_TOLD, Held, Inbox, LONGEST_PATIENCE, MISSING_RANGES, MORE_RANGES, PATIENCE, ReceiveClass,
     SWEEP,
 };
+use crate::link::clock::nanoseconds;
 
 /// What the lists of a Feedback that fill its datagram take besides their numbers, at most: tags and lengths, that of the
 /// Feedback itself included, and `more_highest`.
@@ -104,7 +105,7 @@ impl ReceiveClass {
         }
         let (echo_send_ns, echo_held_ns) = self.echo.map_or((0, 0), |(sent, at)| {
             let held = now.saturating_duration_since(at);
-            (sent, u64::try_from(held.as_nanos()).unwrap_or(u64::MAX))
+            (sent, nanoseconds(held))
         });
         let mut feedback = Feedback {
             link_epoch: self.link_epoch,

@@ -124,8 +124,7 @@ impl SendClass {
             if message.acknowledged == message.parts.len()
                 && let Some(message) = self.take(part.key)
             {
-                ctx.ledger
-                    .out(message.lane, message.payload_bytes(), message.waited(ctx.now));
+                ctx.ledger.out(message.lane, message.payload_bytes());
             }
         }
     }
@@ -164,8 +163,7 @@ impl SendClass {
             if !message.is_sent() {
                 self.drop_message(key, DropReason::ReassemblyTimeout, ctx.ledger);
             } else if let Some(message) = self.take(key) {
-                ctx.ledger
-                    .out(message.lane, message.payload_bytes(), message.waited(ctx.now));
+                ctx.ledger.out(message.lane, message.payload_bytes());
             }
         }
     }
@@ -233,7 +231,7 @@ mod tests {
             keep_newest: 0,
         };
         class.submit(submit, ctx.ledger);
-        let (datagram, _) = class.transmit(&mut ctx).unwrap();
+        let datagram = class.transmit(&mut ctx).unwrap();
         let view = FeedbackView {
             link_epoch: 1,
             highest_sequence: 1,

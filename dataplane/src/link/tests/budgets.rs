@@ -223,7 +223,7 @@ fn whoever_waits_for_its_link_says_until_when() {
         version: 3,
         parts: vec![1],
     });
-    engine.send_control(before, &b, body).unwrap();
+    engine.send_control(&b, body).unwrap();
     let control = engine.poll_transmit(before).unwrap();
     assert!(control.control && control.class == Priority::Control);
     assert!(engine.poll_transmit(before).is_none());

@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use blaze_domain::node_file::{AccessRules, AutoBool, NodeFile};
+use blaze_domain::node_file::AccessRules;
 use blaze_domain::{Durability, FlowId, LayerKind, Reliability, TopicName};
 use serde_json::{Value, json};
 
 use crate::plan::{Bridge, Target, TopicPlan};
+use crate::testing::access;
 use crate::world::{
     Advertise, Carrying, FlowState, FlowView, LayerScopeId, OriginFilter, Part, Reach, Request, Role, ScopeEntry,
     Source, TopicEntry, World,
@@ -59,12 +60,7 @@ pub(crate) fn request() -> Request {
 /// The rules of a node file with this one for all topics: `{"request": {"deny": ["cloud"]}}`.
 pub(crate) fn rules(mut rule: Value) -> AccessRules {
     rule["match"] = "**".into();
-    let file = json!({
-        "layer": {"name": "edge", "kind": "edge"}, "node": {"name": "robot-1"}, "brokers": {"node": {"memory": {}}},
-        "flow": {"access": [rule]},
-    });
-    let (file, _) = NodeFile::read(&file).unwrap();
-    file.flow.access
+    access(&json!([rule]))
 }
 
 /// A filter written `layer/node/service`, where `*` is any.
@@ -79,18 +75,10 @@ pub(crate) fn filter(text: &str) -> OriginFilter {
 
 pub(crate) fn flow(layer_scope: Option<u64>) -> FlowView {
     FlowView {
-        kind: LayerKind::Edge,
-        epoch: 1,
         state: FlowState::Ready,
-        reach: Reach::Up,
         node_scope: true,
         layer_scope: layer_scope.map(LayerScopeId),
-        topics: BTreeMap::new(),
-        settled: false,
-        parts: BTreeMap::new(),
-        gateway: AutoBool::Auto,
-        role: Role::Gateway,
-        layer_away: false,
+        ..FlowView::new(LayerKind::Edge, 1)
     }
 }
 

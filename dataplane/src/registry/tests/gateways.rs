@@ -1,10 +1,11 @@
 //! What a gateway tells of the flows that it speaks for, where it is more than it may tell.
 
-use blaze_proto::link::link_control::{Delta, Entry, Gateway, Request};
+use blaze_proto::link::link_control::{Entry, Gateway, Request};
 
 use super::*;
 use crate::registry::announce::MAX_ENTRIES;
 use crate::registry::remote::Remote;
+use crate::testing::delta;
 
 const MS: Duration = Duration::from_millis(1);
 /// Topics of each of the two members.
@@ -79,13 +80,7 @@ impl Group {
             }),
             ..Entry::default()
         };
-        let delta = Delta {
-            from_version: *version - 1,
-            to_version: *version,
-            part: 0,
-            parts: 1,
-            entries: topics.map(entry).collect(),
-        };
+        let delta = delta(*version, topics.map(entry).collect());
         self.gateway.on_layer_control(self.now, &from, 1, Body::Delta(delta));
     }
 
@@ -179,7 +174,7 @@ fn what_services_of_the_gateway_lease_is_told_before_what_others_do() {
 
 #[test]
 fn what_goes_makes_room_for_what_comes_in_the_same_delta() {
-    let mut remote = Remote::new();
+    let mut remote = Remote::default();
     let (now, mut topics, mut faults) = (Instant::now(), BTreeMap::new(), SyncFaults::default());
     let entry = |topic: String, removed| Entry {
         topic,
@@ -190,14 +185,7 @@ fn what_goes_makes_room_for_what_comes_in_the_same_delta() {
     let mut version = 0;
     let mut tell = |entries: Vec<Entry>| {
         version += 1;
-        let delta = Delta {
-            from_version: version - 1,
-            to_version: version,
-            part: 0,
-            parts: 1,
-            entries,
-        };
-        remote.on_delta(now, delta, &mut topics, &mut faults)
+        remote.on_delta(now, delta(version, entries), &mut topics, &mut faults)
     };
     for first in (0..MAX_ENTRIES).step_by(1_000) {
         tell((first..first + 1_000).map(|n| entry(format!("t{n}"), false)).collect());

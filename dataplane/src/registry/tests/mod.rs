@@ -8,13 +8,13 @@ mod sync;
 
 use std::time::Duration;
 
-use blaze_domain::LayerKind;
 use blaze_domain::control::{AdvertiseMessage, ControlMessage, RequestMessage};
 use blaze_domain::node_file::AccessRules;
-use blaze_proto::link::link_control::{Hello, Kind, State};
+use blaze_proto::link::link_control::{Hello, State};
 use serde_json::{Value, json};
 
 use super::*;
+use crate::link::kind_to_wire;
 use crate::world::LayerScopeId;
 
 fn config(me: &str, epoch: u64, started: Instant) -> RegistryConfig {
@@ -45,12 +45,7 @@ fn hello(registry: &Registry) -> Hello {
     Hello {
         layer: registry.world().me.layer.to_string(),
         node: registry.world().me.node.to_string(),
-        kind: match own.kind {
-            LayerKind::Edge => Kind::Edge,
-            LayerKind::Fog => Kind::Fog,
-            LayerKind::Cloud => Kind::Cloud,
-        }
-        .into(),
+        kind: kind_to_wire(own.kind).into(),
         epoch: own.epoch,
         registry_version,
         registry_digest,
@@ -58,4 +53,13 @@ fn hello(registry: &Registry) -> Hello {
         layer_scope_id: own.layer_scope.map_or(0, |id| id.0),
         ..Hello::default()
     }
+}
+
+/// A lease that stays until it is withdrawn.
+fn lease(op: &str, topic: &str, service: &str) -> Value {
+    json!({"op": op, "topic": topic, "service": service, "ttl_s": 0})
+}
+
+fn say(registry: &mut Registry, now: Instant, scope: Scope, message: &Value) -> ControlOutcome {
+    registry.control(now, scope, message.to_string().as_bytes())
 }

@@ -1,10 +1,11 @@
 //! Flows that hear each other on the channel of their layer broker.
 
 use blaze_brokers::Begin;
-use blaze_proto::link::link_control::Goodbye;
+use blaze_proto::link::link_control::{Goodbye, Kind};
 
 use super::*;
 use crate::registry::{Load, REST};
+use crate::testing::{delta, hello_of};
 use crate::world::{Carrying, Handover, SETTLED_AFTER};
 
 const MS: Duration = Duration::from_millis(1);
@@ -53,12 +54,7 @@ impl Pair {
 
     fn hello(&mut self, from: usize) {
         let said = Hello {
-            state: match self.flows[from].world().own().unwrap().state {
-                FlowState::Starting => State::Starting,
-                FlowState::Ready => State::Ready,
-                FlowState::Draining => State::Draining,
-            }
-            .into(),
+            state: State::from(self.flows[from].world().own().unwrap().state).into(),
             ..hello(&self.flows[from])
         };
         let (name, ms) = (self.names()[from].clone(), self.server_ms());
@@ -94,7 +90,7 @@ impl Pair {
     }
 
     fn say(&mut self, at: usize, scope: Scope, message: &Value) {
-        self.flows[at].control(self.now, scope, message.to_string().as_bytes());
+        say(&mut self.flows[at], self.now, scope, message);
     }
 
     fn carries(&mut self, at: usize, carrying: &Carrying) {
@@ -105,10 +101,6 @@ impl Pair {
     fn sees(&self, at: usize) -> &FlowView {
         &self.flows[at].world().flows[&self.names()[1 - at]]
     }
-}
-
-fn lease(op: &str, topic: &str, service: &str) -> Value {
-    json!({"op": op, "topic": topic, "service": service, "ttl_s": 0})
 }
 
 #[test]
@@ -343,30 +335,16 @@ fn one_that_gave_or_got_a_topic_by_name_rests_for_ten_seconds() {
 
 /// A robot that one of them reaches asks for the topic, or does so no more.
 fn robot_asks(pair: &mut Pair, version: u64, asks: bool) {
-    use blaze_proto::link::link_control::{Body, Delta, Entry, Kind, Request};
+    use blaze_proto::link::link_control::{Entry, Request};
     let robot = id("edge/robot-1");
-    let hello = Hello {
-        layer: "edge".into(),
-        node: "robot-1".into(),
-        kind: Kind::Edge.into(),
-        epoch: 1,
-        state: State::Ready.into(),
-        ..Hello::default()
-    };
-    let delta = Delta {
-        from_version: version - 1,
-        to_version: version,
-        part: 0,
-        parts: 1,
-        entries: vec![Entry {
-            topic: "t".into(),
-            node_request: asks.then(Request::default),
-            ..Entry::default()
-        }],
+    let entry = Entry {
+        topic: "t".into(),
+        node_request: asks.then(Request::default),
+        ..Entry::default()
     };
     let now = pair.now;
-    pair.flows[1].on_hello(now, &robot, &hello);
-    pair.flows[1].on_control(now, &robot, Body::Delta(delta));
+    pair.flows[1].on_hello(now, &robot, &hello_of(&robot, Kind::Edge));
+    pair.flows[1].on_control(now, &robot, Body::Delta(delta(version, vec![entry])));
 }
 
 #[test]

@@ -7,25 +7,54 @@ use bytes::Bytes;
 
 type Kept = BTreeMap<(Scope, String), Bytes>;
 
-fn keeping(me: &str, now: Instant) -> Registry {
-    Registry::new(RegistryConfig {
-        lease_stores: BTreeSet::from([Scope::Node, Scope::Layer]),
-        layer_answers_need_id: false,
-        ..config(me, 1, now)
-    })
+const SECOND: Duration = Duration::from_secs(1);
+
+/// A life of `edge/robot-1`, and what its brokers keep of its leases.
+struct Life {
+    now: Instant,
+    registry: Registry,
+    kept: Kept,
 }
 
-/// Does what brokers would do. Returns how many changes there were.
-fn save(registry: &mut Registry, kept: &mut Kept) -> usize {
-    let unsaved = registry.take_unsaved();
-    let count = unsaved.len();
-    for lease in unsaved {
-        match lease.value {
-            Some(value) => kept.insert((lease.scope, lease.key), value),
-            None => kept.remove(&(lease.scope, lease.key)),
-        };
+impl Life {
+    /// It has not read what is kept.
+    fn begin(now: Instant, kept: Kept) -> Self {
+        let registry = Registry::new(RegistryConfig {
+            lease_stores: BTreeSet::from([Scope::Node, Scope::Layer]),
+            layer_answers_need_id: false,
+            ..config("edge/robot-1", 1, now)
+        });
+        Self { now, registry, kept }
     }
-    count
+
+    /// The first one: nothing is kept.
+    fn first() -> Self {
+        let mut first = Self::begin(Instant::now(), Kept::new());
+        first.restore();
+        first
+    }
+
+    fn restore(&mut self) -> [Restored; 2] {
+        let kept = self.kept.clone();
+        [Scope::Node, Scope::Layer].map(|scope| self.registry.restore(self.now, scope, &of_scope(&kept, scope)))
+    }
+
+    fn send(&mut self, scope: Scope, json: &Value) -> ControlOutcome {
+        send(&mut self.registry, self.now, scope, json)
+    }
+
+    /// Does what brokers would do. Returns how many changes there were.
+    fn save(&mut self) -> usize {
+        let unsaved = self.registry.take_unsaved();
+        let count = unsaved.len();
+        for lease in unsaved {
+            match lease.value {
+                Some(value) => self.kept.insert((lease.scope, lease.key), value),
+                None => self.kept.remove(&(lease.scope, lease.key)),
+            };
+        }
+        count
+    }
 }
 
 fn of_scope(kept: &Kept, scope: Scope) -> Vec<(String, Bytes)> {
@@ -37,8 +66,8 @@ fn send(registry: &mut Registry, now: Instant, scope: Scope, json: &Value) -> Co
     registry.control(now, scope, json.to_string().as_bytes())
 }
 
-fn restore_all(registry: &mut Registry, now: Instant, kept: &Kept) -> [Restored; 2] {
-    [Scope::Node, Scope::Layer].map(|scope| registry.restore(now, scope, &of_scope(kept, scope)))
+fn lease(op: &str, topic: &str, ttl_s: u64) -> Value {
+    json!({"op": op, "topic": topic, "service": "a", "ttl_s": ttl_s})
 }
 
 /// What a lease is, without its time.
@@ -54,159 +83,98 @@ fn terms(registry: &Registry) -> Vec<String> {
 
 #[test]
 fn leases_survive_a_restart_of_the_flow_with_their_whole_ttl() {
-    let start = Instant::now();
-    let mut kept = Kept::new();
-    let mut first = keeping("edge/robot-1", start);
-    restore_all(&mut first, start, &kept);
-    send(
-        &mut first,
-        start,
-        Scope::Node,
-        &json!([
-            {"op": "advertise", "topic": "imu/data", "service": "driver", "epoch": 7, "rate_hz": 50.5, "max_bytes": 400,
-             "encoding": "application/json", "reliability": "reliable", "durability": "transient_local", "depth": 3,
-             "priority": "control", "lifespan_ms": 900, "type": "x/T", "type_hash": "h"},
-            {"op": "request", "topic": "map", "service": "driver", "ttl_s": 0, "bare": true, "max_rate_hz": 2.5,
-             "from": {"layer": "fog", "service": "mapper"}},
-        ]),
-    );
-    send(
-        &mut first,
-        start,
-        Scope::Layer,
-        &json!({"op": "request", "topic": "imu/data", "service": "logger", "ttl_s": 60}),
-    );
-    assert_eq!(save(&mut first, &mut kept), 3);
+    let mut first = Life::first();
+    let of_node = json!([
+        {"op": "advertise", "topic": "imu/data", "service": "driver", "epoch": 7, "rate_hz": 50.5, "max_bytes": 400,
+         "encoding": "application/json", "reliability": "reliable", "durability": "transient_local", "depth": 3,
+         "priority": "control", "lifespan_ms": 900, "type": "x/T", "type_hash": "h"},
+        {"op": "request", "topic": "map", "service": "driver", "ttl_s": 0, "bare": true, "max_rate_hz": 2.5,
+         "from": {"layer": "fog", "service": "mapper"}},
+    ]);
+    first.send(Scope::Node, &of_node);
+    first.send(Scope::Layer, &lease("request", "imu/data", 60));
+    assert_eq!(first.save(), 3);
     assert_eq!(
-        kept.keys().map(|(_, key)| key.as_str()).collect::<Vec<_>>(),
+        first.kept.keys().map(|(_, key)| key.as_str()).collect::<Vec<_>>(),
         [
             "advertise|imu/data|edge|robot-1|driver|0",
             "request|map|edge|robot-1|driver|0",
-            "request|imu/data|edge||logger|0"
+            "request|imu/data|edge||a|0"
         ]
     );
 
-    let later = start + Duration::from_secs(1000);
-    let mut second = keeping("edge/robot-1", later);
-    assert!(second.is_reading(Scope::Node));
-    let [node, layer] = restore_all(&mut second, later, &kept);
+    let later = first.now + 1000 * SECOND;
+    let mut second = Life::begin(later, first.kept.clone());
+    assert!(second.registry.is_reading(Scope::Node));
+    let [node, layer] = second.restore();
     assert_eq!((node.restored, layer.restored), (2, 1));
     assert_eq!(node.changed, BTreeSet::from([topic("imu/data"), topic("map")]));
-    assert!(!second.is_reading(Scope::Node) && !second.is_reading(Scope::Layer));
-    assert_eq!(terms(&second), terms(&first));
-    assert_eq!(second.next_expiry(), Some(later + Duration::from_secs(15)));
-    assert_eq!(save(&mut second, &mut kept), 0, "what was read is not written again");
-    assert_eq!(
-        second.world().own().unwrap().topics,
-        first.world().own().unwrap().topics
-    );
+    assert!(!second.registry.is_reading(Scope::Node) && !second.registry.is_reading(Scope::Layer));
+    assert_eq!(terms(&second.registry), terms(&first.registry));
+    assert_eq!(second.registry.next_expiry(), Some(later + 15 * SECOND));
+    assert_eq!(second.save(), 0, "what was read is not written again");
+    let [of_second, of_first] = [&second, &first].map(|life| &life.registry.world().own().unwrap().topics);
+    assert_eq!(of_second, of_first);
 }
 
 #[test]
 fn only_what_changes_is_written() {
-    let now = Instant::now();
-    let mut kept = Kept::new();
-    let mut registry = keeping("edge/robot-1", now);
-    restore_all(&mut registry, now, &kept);
-    let with = |epoch: u64, rate: u64| json!({"op": "advertise", "topic": "t", "service": "a", "epoch": epoch, "rate_hz": rate});
-    send(&mut registry, now, Scope::Node, &with(1, 10));
-    assert_eq!(save(&mut registry, &mut kept), 1);
-    for second in 1..4 {
-        send(
-            &mut registry,
-            now + Duration::from_secs(second),
-            Scope::Node,
-            &with(1, 10),
-        );
-        assert_eq!(save(&mut registry, &mut kept), 0, "a renewal");
+    let mut life = Life::first();
+    let advertise = |epoch: u64, rate: u64| json!({"op": "advertise", "topic": "t", "service": "a", "epoch": epoch, "rate_hz": rate});
+    let withdraw = json!({"op": "withdraw", "topic": "t", "service": "a", "epoch": 2});
+    for (said, changes, left, what) in [
+        (&advertise(1, 10), 1, 1, "a lease"),
+        (&advertise(1, 10), 0, 1, "a renewal"),
+        (&advertise(2, 10), 1, 1, "another life"),
+        (&advertise(2, 20), 1, 1, "other terms"),
+        (&withdraw, 1, 0, "its end"),
+        (&withdraw, 0, 0, "nothing to withdraw"),
+        (&advertise(3, 1), 1, 1, "a lease again"),
+    ] {
+        life.now += SECOND;
+        life.send(Scope::Node, said);
+        assert_eq!((life.save(), life.kept.len()), (changes, left), "{what}");
     }
-    send(&mut registry, now, Scope::Node, &with(2, 10));
-    assert_eq!(save(&mut registry, &mut kept), 1, "another life");
-    send(&mut registry, now, Scope::Node, &with(2, 20));
-    assert_eq!(save(&mut registry, &mut kept), 1, "other terms");
-    send(
-        &mut registry,
-        now,
-        Scope::Node,
-        &json!({"op": "withdraw", "topic": "t", "service": "a", "epoch": 2}),
-    );
-    assert_eq!((save(&mut registry, &mut kept), kept.len()), (1, 0));
-    send(
-        &mut registry,
-        now,
-        Scope::Node,
-        &json!({"op": "withdraw", "topic": "t", "service": "a", "epoch": 2}),
-    );
-    assert_eq!(save(&mut registry, &mut kept), 0, "nothing to withdraw");
-    send(&mut registry, now, Scope::Node, &with(3, 1));
-    assert_eq!((save(&mut registry, &mut kept), kept.len()), (1, 1));
-    registry.expire(now + Duration::from_secs(15));
-    assert_eq!((save(&mut registry, &mut kept), kept.len()), (1, 0), "it lapsed");
+    life.registry.expire(life.now + 15 * SECOND);
+    assert_eq!((life.save(), life.kept.len()), (1, 0), "it lapsed");
 }
 
 #[test]
 fn what_services_say_while_leases_are_read_counts_for_more() {
-    let now = Instant::now();
-    let mut kept = Kept::new();
-    let mut first = keeping("edge/robot-1", now);
-    restore_all(&mut first, now, &kept);
+    let mut first = Life::first();
     for name in ["renewed", "ended", "lapsed", "quiet"] {
-        send(
-            &mut first,
-            now,
-            Scope::Node,
-            &json!({"op": "advertise", "topic": name, "service": "a", "rate_hz": 1}),
-        );
+        first.send(Scope::Node, &lease("advertise", name, 15));
     }
-    save(&mut first, &mut kept);
+    first.save();
+    let was = of_scope(&first.kept, Scope::Node);
+    let mut second = Life::begin(first.now, first.kept);
+    second.send(Scope::Node, &lease("advertise", "renewed", 20));
+    second.send(Scope::Node, &lease("withdraw", "ended", 15));
+    second.send(Scope::Node, &lease("advertise", "lapsed", 1));
+    second.registry.expire(second.now + SECOND);
+    second.save();
 
-    let mut second = keeping("edge/robot-1", now);
-    let was = of_scope(&kept, Scope::Node);
-    send(
-        &mut second,
-        now,
-        Scope::Node,
-        &json!({"op": "advertise", "topic": "renewed", "service": "a", "rate_hz": 2}),
-    );
-    send(
-        &mut second,
-        now,
-        Scope::Node,
-        &json!({"op": "withdraw", "topic": "ended", "service": "a"}),
-    );
-    send(
-        &mut second,
-        now,
-        Scope::Node,
-        &json!({"op": "advertise", "topic": "lapsed", "service": "a", "ttl_s": 1}),
-    );
-    second.expire(now + Duration::from_secs(1));
-    save(&mut second, &mut kept);
-    let restored = second.restore(now, Scope::Node, &was);
+    let restored = second.registry.restore(second.now, Scope::Node, &was);
     assert_eq!((restored.restored, restored.newer), (1, 3));
-    let leased: Vec<_> = second.leases().map(|lease| lease.topic.to_string()).collect();
+    let leased: Vec<_> = second.registry.leases().map(|lease| lease.topic.to_string()).collect();
     assert_eq!(leased, ["quiet", "renewed"]);
-    save(&mut second, &mut kept);
-    let names: Vec<_> = kept.keys().map(|(_, key)| key.split('|').nth(1).unwrap()).collect();
+    second.save();
+    let names: Vec<_> = second
+        .kept
+        .keys()
+        .map(|(_, key)| key.split('|').nth(1).unwrap())
+        .collect();
     assert_eq!(names, ["quiet", "renewed"]);
-    assert!(
-        String::from_utf8_lossy(&kept[&(Scope::Node, "advertise|renewed|edge|robot-1|a|0".into())])
-            .contains("\"rate_hz\":2")
-    );
+    let renewed = &second.kept[&(Scope::Node, "advertise|renewed|edge|robot-1|a|0".into())];
+    assert!(String::from_utf8_lossy(renewed).contains("\"ttl_s\":20"), "{renewed:?}");
     // Now that they are read, a withdrawn lease may come back.
-    send(
-        &mut second,
-        now,
-        Scope::Node,
-        &json!({"op": "advertise", "topic": "ended", "service": "a"}),
-    );
-    assert_eq!(second.lease_count(), 3);
+    second.send(Scope::Node, &lease("advertise", "ended", 15));
+    assert_eq!(second.registry.lease_count(), 3);
 }
 
 #[test]
 fn what_is_no_lease_of_this_flow_is_left_alone() {
-    let now = Instant::now();
-    let mut registry = keeping("edge/robot-1", now);
+    let Life { mut registry, now, .. } = Life::begin(Instant::now(), Kept::new());
     let good = r#"{"op":"advertise","topic":"t","service":"a"}"#;
     let entry = |key: &str, value: &str| (key.to_owned(), Bytes::from(value.to_owned()));
     let restored = registry.restore(
@@ -239,22 +207,18 @@ fn what_is_no_lease_of_this_flow_is_left_alone() {
 
 #[test]
 fn nothing_lapses_while_nobody_can_renew() {
-    let start = Instant::now();
-    let mut registry = keeping("edge/robot-1", start);
-    restore_all(&mut registry, start, &Kept::new());
-    let advertise = |service: &str| json!({"op": "advertise", "topic": "t", "service": service});
-    send(&mut registry, start, Scope::Node, &advertise("a"));
-    send(&mut registry, start, Scope::Layer, &advertise("a"));
-    registry.set_renewable(start, Scope::Node, false);
-    let later = start + Duration::from_secs(16);
-    assert_eq!(registry.expire(later).lapsed.len(), 1, "that of the other scope");
-    let back = start + Duration::from_secs(29);
-    registry.set_renewable(back, Scope::Node, true);
-    assert_eq!(
-        registry.expire(back + Duration::from_millis(14_999)),
-        Changes::default()
-    );
-    assert_eq!(registry.expire(back + Duration::from_secs(15)).lapsed.len(), 1);
+    let mut life = Life::first();
+    let start = life.now;
+    life.send(Scope::Node, &lease("advertise", "t", 15));
+    life.send(Scope::Layer, &lease("advertise", "t", 15));
+    life.registry.set_renewable(start, Scope::Node, false);
+    let lapsed = life.registry.expire(start + 16 * SECOND).lapsed;
+    assert_eq!(lapsed.len(), 1, "that of the other scope");
+    let back = start + 29 * SECOND;
+    life.registry.set_renewable(back, Scope::Node, true);
+    let before = back + Duration::from_millis(14_999);
+    assert_eq!(life.registry.expire(before), Changes::default());
+    assert_eq!(life.registry.expire(back + 15 * SECOND).lapsed.len(), 1);
 }
 
 #[test]
@@ -264,96 +228,64 @@ fn a_topic_that_kafka_cannot_tell_from_another_is_refused() {
         layer_names: LayerNames::Kafka { prefix_bytes: 60 },
         ..config("fog/fog-1", 1, now)
     });
-    let refusal = |outcome: ControlOutcome| {
-        let answer = outcome.answers.into_iter().next().unwrap();
-        let error = &answer.body["error"];
-        (
-            error["code"].as_str().unwrap_or("").to_owned(),
-            error["pointer"].as_str().unwrap_or("").to_owned(),
-        )
+    // The code and the place of a refusal; empty where there is none.
+    let said = |registry: &mut Registry, scope, op: &str, topic: &str| {
+        let object = json!({"op": op, "topic": topic, "service": "a", "id": "1", "reply_to": "blaze/reply/x"});
+        let error = &send(registry, now, scope, &object).answers[0].body["error"];
+        ["code", "pointer"].map(|key| error[key].as_str().unwrap_or("").to_owned())
     };
-    let object = |op: &str, topic: &str| json!({"op": op, "topic": topic, "service": "a", "id": "1", "reply_to": "blaze/reply/x"});
-    let none = (String::new(), String::new());
-    let collision = ("name_collision".to_owned(), "/topic".to_owned());
-    assert_eq!(
-        refusal(send(&mut registry, now, Scope::Layer, &object("advertise", "imu/data"))),
-        none
-    );
-    assert_eq!(
-        refusal(send(&mut registry, now, Scope::Layer, &object("request", "imu/data"))),
-        none
-    );
-    assert_eq!(
-        refusal(send(&mut registry, now, Scope::Layer, &object("request", "imu_data"))),
-        collision
-    );
-    assert_eq!(
-        refusal(send(&mut registry, now, Scope::Node, &object("request", "imu_data"))),
-        none,
-        "Redis has both"
-    );
+    let (none, collision) = (["", ""], ["name_collision", "/topic"]);
     let long = "t".repeat(190);
-    let found = refusal(send(&mut registry, now, Scope::Layer, &object("advertise", &long)));
-    assert_eq!(found, ("name_not_expressible".to_owned(), "/topic".to_owned()));
+    for (scope, op, topic, expected) in [
+        (Scope::Layer, "advertise", "imu/data", none),
+        (Scope::Layer, "request", "imu/data", none),
+        (Scope::Layer, "request", "imu_data", collision),
+        // Redis has both.
+        (Scope::Node, "request", "imu_data", none),
+        (
+            Scope::Layer,
+            "advertise",
+            long.as_str(),
+            ["name_not_expressible", "/topic"],
+        ),
+    ] {
+        assert_eq!(said(&mut registry, scope, op, topic), expected, "{op} {topic}");
+    }
     // A topic that is only delivered there holds its name, too, until it is not any more.
     registry.put_on_layer(&topic("a/b")).unwrap();
-    assert_eq!(
-        refusal(send(&mut registry, now, Scope::Layer, &object("advertise", "a_b"))),
-        collision
-    );
+    assert_eq!(said(&mut registry, Scope::Layer, "advertise", "a_b"), collision);
     registry.take_off_layer(&topic("a/b"));
-    assert_eq!(
-        refusal(send(&mut registry, now, Scope::Layer, &object("advertise", "a_b"))),
-        none
-    );
+    assert_eq!(said(&mut registry, Scope::Layer, "advertise", "a_b"), none);
     assert!(registry.put_on_layer(&topic("a/b")).is_err());
-    assert_eq!(
-        refusal(send(&mut registry, now, Scope::Layer, &object("withdraw", "imu/data"))),
-        none
-    );
-    assert_eq!(
-        refusal(send(&mut registry, now, Scope::Layer, &object("request", "imu_data"))),
-        none,
-        "it is free now"
-    );
+    assert_eq!(said(&mut registry, Scope::Layer, "withdraw", "imu/data"), none);
+    let again = said(&mut registry, Scope::Layer, "request", "imu_data");
+    assert_eq!(again, none, "it is free now");
 }
 
 #[test]
 fn a_scope_of_another_flow_is_as_if_it_were_not_there() {
-    let now = Instant::now();
-    let mut registry = keeping("edge/robot-1", now);
-    let mut kept = Kept::new();
-    restore_all(&mut registry, now, &kept);
-    send(
-        &mut registry,
-        now,
-        Scope::Node,
-        &json!({"op": "advertise", "topic": "t", "service": "a", "ttl_s": 0}),
-    );
-    send(
-        &mut registry,
-        now,
-        Scope::Layer,
-        &json!({"op": "request", "topic": "t", "service": "b", "ttl_s": 0}),
-    );
-    let before = registry.world().own().unwrap().clone();
-    save(&mut registry, &mut kept);
-    let changed = registry.set_in_use(now, Scope::Layer, true);
+    let mut life = Life::first();
+    let now = life.now;
+    life.send(Scope::Node, &lease("advertise", "t", 0));
+    life.send(Scope::Layer, &lease("request", "t", 0));
+    let before = life.registry.world().own().unwrap().clone();
+    life.save();
+    let changed = life.registry.set_in_use(now, Scope::Layer, true);
     assert_eq!(changed, BTreeSet::from([topic("t")]));
-    let own = registry.world().own().unwrap();
+    let own = life.registry.world().own().unwrap();
     assert!(own.layer_scope.is_none() && own.node_scope);
     let entry = &own.topics[&topic("t")];
     assert!(entry.node.advertise.is_some() && entry.layer.request.is_none());
-    registry.set_in_use(now, Scope::Node, true);
-    let own = registry.world().own().unwrap();
+    life.registry.set_in_use(now, Scope::Node, true);
+    let own = life.registry.world().own().unwrap();
     assert!(!own.node_scope && own.topics.is_empty());
-    assert_eq!(registry.lease_count(), 0, "they are the other's");
-    assert_eq!(save(&mut registry, &mut kept), 0, "and nothing that is kept is touched");
-    registry.set_in_use(now, Scope::Node, false);
-    registry.set_in_use(now, Scope::Layer, false);
-    assert!(registry.is_reading(Scope::Node) && registry.is_reading(Scope::Layer));
-    restore_all(&mut registry, now, &kept);
-    assert_eq!(*registry.world().own().unwrap(), before);
+    assert_eq!(life.registry.lease_count(), 0, "they are the other's");
+    assert_eq!(life.save(), 0, "and nothing that is kept is touched");
+    life.registry.set_in_use(now, Scope::Node, false);
+    life.registry.set_in_use(now, Scope::Layer, false);
+    assert!(life.registry.is_reading(Scope::Node) && life.registry.is_reading(Scope::Layer));
+    life.restore();
+    assert_eq!(*life.registry.world().own().unwrap(), before);
 }
 
 proptest! {
@@ -363,25 +295,22 @@ proptest! {
         steps in proptest::collection::vec((0..3_usize, 0..5_u8, 0..3_u8, 0..3_u32, any::<bool>(), 0..2500_u64), 1..40),
         restarts in proptest::collection::btree_set(0..40_usize, 0..4),
     ) {
-        let mut now = Instant::now();
-        let mut kept = Kept::new();
-        let mut registry = keeping("edge/robot-1", now);
-        restore_all(&mut registry, now, &kept);
+        let mut life = Life::first();
         for (index, (op, name, service, ttl, on_node, wait)) in steps.into_iter().enumerate() {
             let op = ["advertise", "request", "withdraw"][op];
             let scope = if on_node { Scope::Node } else { Scope::Layer };
-            send(&mut registry, now, scope, &json!({"op": op, "topic": format!("t{name}"), "service": format!("s{service}"), "ttl_s": ttl}));
-            save(&mut registry, &mut kept);
-            now += Duration::from_millis(wait);
-            registry.expire(now);
-            save(&mut registry, &mut kept);
-            prop_assert_eq!(kept.len(), registry.lease_count());
+            life.send(scope, &json!({"op": op, "topic": format!("t{name}"), "service": format!("s{service}"), "ttl_s": ttl}));
+            life.save();
+            life.now += Duration::from_millis(wait);
+            life.registry.expire(life.now);
+            life.save();
+            prop_assert_eq!(life.kept.len(), life.registry.lease_count());
             if restarts.contains(&index) {
-                let mut next = keeping("edge/robot-1", now);
-                restore_all(&mut next, now, &kept);
-                prop_assert_eq!(terms(&next), terms(&registry));
-                prop_assert!(next.take_unsaved().is_empty());
-                registry = next;
+                let mut next = Life::begin(life.now, life.kept.clone());
+                next.restore();
+                prop_assert_eq!(terms(&next.registry), terms(&life.registry));
+                prop_assert!(next.registry.take_unsaved().is_empty());
+                life = next;
             }
         }
     }

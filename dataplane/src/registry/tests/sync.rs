@@ -112,6 +112,11 @@ impl Net {
         }
     }
 
+    /// A service of the first flow's node says something.
+    fn say(&mut self, message: &Value) {
+        say(&mut self.registries[0], self.now, Scope::Node, message);
+    }
+
     /// One random change of a random registry.
     fn change(&mut self) {
         let index = usize::try_from(self.random.below(self.registries.len() as u64)).unwrap();
@@ -139,8 +144,7 @@ impl Net {
             object["ttl_s"] = json!([0, 2, 86_400][usize::try_from(self.random.below(3)).unwrap()]);
             objects.push(object);
         }
-        let payload = Value::from(objects).to_string();
-        self.registries[index].control(self.now, scope, payload.as_bytes());
+        say(&mut self.registries[index], self.now, scope, &Value::from(objects));
         if self.random.percent(30) {
             let routes = (0..self.random.below(3))
                 .map(|_| RouteState {
@@ -259,8 +263,7 @@ fn quiet_registries_say_nothing_but_hello() {
 fn on_a_good_channel_deltas_are_enough() {
     let mut net = Net::new(2, &FLOWS, 0, 2);
     net.run(600);
-    let advertise = json!({"op": "advertise", "topic": "imu", "service": "a", "ttl_s": 0});
-    net.registries[0].control(net.now, Scope::Node, advertise.to_string().as_bytes());
+    net.say(&lease("advertise", "imu", "a"));
     net.run(30);
     assert_eq!(net.differences(), Vec::<String>::new());
     assert_eq!(net.registries[0].announced().0, 1);
@@ -278,8 +281,7 @@ fn one_lost_delta_is_repaired_by_the_next() {
     net.run(600);
     for (name, loss) in [("a", 100), ("b", 0)] {
         net.loss_percent = loss;
-        let advertise = json!({"op": "advertise", "topic": name, "service": "a", "ttl_s": 0});
-        net.registries[0].control(net.now, Scope::Node, advertise.to_string().as_bytes());
+        net.say(&lease("advertise", name, "a"));
         net.run(30);
     }
     assert_eq!(net.differences(), Vec::<String>::new());
@@ -318,8 +320,7 @@ fn a_large_registry_is_pulled_at_the_pace_of_the_receiver() {
     // Then a change is a single small Delta again.
     let before = net.sent["snapshot"];
     net.loss_percent = 0;
-    let withdraw = json!({"op": "withdraw", "topic": "area/7/camera/image", "service": "driver"});
-    net.registries[0].control(net.now, Scope::Node, withdraw.to_string().as_bytes());
+    net.say(&json!({"op": "withdraw", "topic": "area/7/camera/image", "service": "driver"}));
     net.run(60);
     assert_eq!(net.differences(), Vec::<String>::new());
     assert!(net.sent["snapshot"] <= before + 1);
@@ -328,8 +329,7 @@ fn a_large_registry_is_pulled_at_the_pace_of_the_receiver() {
     net.registries.push(late);
     net.next_hello.push(net.now);
     for index in 0..40 {
-        let advertise = json!({"op": "advertise", "topic": format!("new/{index}"), "service": "a", "ttl_s": 0});
-        net.registries[0].control(net.now, Scope::Node, advertise.to_string().as_bytes());
+        net.say(&lease("advertise", &format!("new/{index}"), "a"));
         net.run(100);
     }
     net.run(2_000);
@@ -345,12 +345,21 @@ fn pair() -> (Registry, Registry, Instant) {
     )
 }
 
+/// What one has to say reaches the other. Returns how much that was.
+fn exchange(from: &mut Registry, to: &mut Registry, at: Instant) -> usize {
+    let (me, said) = (from.world().me.clone(), from.poll(at));
+    let count = said.len();
+    for (_, body) in said {
+        to.on_control(at, &me, body);
+    }
+    count
+}
+
 #[test]
 fn a_new_life_replaces_what_the_old_one_announced() {
     let (mut robot, mut fog, now) = pair();
     let me = robot.world().me.clone();
-    let advertise = json!({"op": "advertise", "topic": "imu", "service": "a"});
-    robot.control(now, Scope::Node, advertise.to_string().as_bytes());
+    say(&mut robot, now, Scope::Node, &lease("advertise", "imu", "a"));
     fog.on_hello(now, &me, &hello(&robot));
     // The first Hello was said before anything was announced; the Delta follows from there.
     let from = fog.world().me.clone();
@@ -375,17 +384,13 @@ fn a_view_that_ran_ahead_of_its_flow_is_corrected() {
     let (mut robot, mut fog, now) = pair();
     let (me, fog_id) = (robot.world().me.clone(), fog.world().me.clone());
     robot.on_hello(now, &fog_id, &hello(&fog));
-    let advertise = json!({"op": "advertise", "topic": "imu", "service": "a"});
-    robot.control(now, Scope::Node, advertise.to_string().as_bytes());
+    say(&mut robot, now, Scope::Node, &lease("advertise", "imu", "a"));
     robot.poll(now + Duration::from_millis(20));
     fog.on_hello(now, &me, &hello(&robot));
     // A Delta of an earlier life comes late.
     let stale = Delta {
         from_version: 0,
-        to_version: 70,
-        part: 0,
-        parts: 1,
-        entries: Vec::new(),
+        ..delta(70, Vec::new())
     };
     fog.on_control(now, &me, Body::Delta(stale));
     assert!(fog.all_topics().is_empty());
@@ -395,12 +400,8 @@ fn a_view_that_ran_ahead_of_its_flow_is_corrected() {
         if at.duration_since(now).as_millis() % 500 == 0 {
             fog.on_hello(at, &me, &hello(&robot));
         }
-        for (_, body) in fog.poll(at) {
-            robot.on_control(at, &fog_id, body);
-        }
-        for (_, body) in robot.poll(at) {
-            fog.on_control(at, &me, body);
-        }
+        exchange(&mut fog, &mut robot, at);
+        exchange(&mut robot, &mut fog, at);
     }
     assert!(fog.is_in_step_with(&me));
     assert_eq!(fog.all_topics(), BTreeSet::from([topic("imu")]));
@@ -433,8 +434,7 @@ fn many_flows_are_pulled_a_few_at_a_time() {
 fn state_and_reach_of_others_replan_everything() {
     let (robot, mut fog, now) = pair();
     let me = robot.world().me.clone();
-    let advertise = json!({"op": "advertise", "topic": "imu", "service": "a"});
-    fog.control(now, Scope::Node, advertise.to_string().as_bytes());
+    say(&mut fog, now, Scope::Node, &lease("advertise", "imu", "a"));
     let all = BTreeSet::from([topic("imu")]);
     let mut hello = hello(&robot);
     assert_eq!(fog.on_hello(now, &me, &hello), all);
@@ -460,8 +460,7 @@ fn nothing_is_sent_to_a_flow_that_is_down() {
     let mut hello = hello(&robot);
     hello.registry_version = 3;
     fog.on_hello(now, &me, &hello);
-    let advertise = json!({"op": "advertise", "topic": "imu", "service": "a"});
-    fog.control(now, Scope::Node, advertise.to_string().as_bytes());
+    say(&mut fog, now, Scope::Node, &lease("advertise", "imu", "a"));
     fog.set_reach(now, &me, Reach::Down);
     assert!(fog.poll(now + Duration::from_secs(1)).is_empty());
     assert_eq!(fog.next_poll(), None);
@@ -489,13 +488,8 @@ fn a_wrong_digest_is_repaired_without_a_storm() {
         if at.duration_since(now).as_millis() % 500 == 0 {
             fog.on_hello(at, &me, &lie);
         }
-        for (_, body) in fog.poll(at) {
-            asked += 1;
-            robot.on_control(at, &fog_id, body);
-        }
-        for (_, body) in robot.poll(at) {
-            fog.on_control(at, &me, body);
-        }
+        asked += exchange(&mut fog, &mut robot, at);
+        exchange(&mut robot, &mut fog, at);
     }
     assert!((5..30).contains(&asked), "{asked} requests in a minute");
     assert!(!fog.is_in_step_with(&me));
@@ -514,12 +508,12 @@ fn hostile_announcements_are_counted_and_ignored() {
         ..Entry::default()
     };
     let delta = |from_version, to_version, part, parts, entries| {
+        let rest = delta(to_version, entries);
         Body::Delta(Delta {
             from_version,
-            to_version,
             part,
             parts,
-            entries,
+            ..rest
         })
     };
     fog.on_control(now, &me, delta(0, 1, 0, 1, vec![entry("a")]));
@@ -622,14 +616,7 @@ fn flows_and_their_entries_are_bounded() {
                 ..Entry::default()
             })
             .collect();
-        let delta = Delta {
-            from_version: version,
-            to_version: version + 1,
-            part: 0,
-            parts: 1,
-            entries,
-        };
-        fog.on_control(now, &new, Body::Delta(delta));
+        fog.on_control(now, &new, Body::Delta(delta(version + 1, entries)));
     }
     assert_eq!(fog.world().flows[&new].topics.len() as u64, limit);
     assert_eq!(fog.faults().too_many_entries, 20_000 - limit);

@@ -3,6 +3,7 @@
 use blaze_domain::node_file::{BandwidthSection, WireOverhead};
 
 use super::*;
+use crate::lane::allocation::LaneFacts;
 use crate::limit::limiter::Limiter;
 use crate::link::Begun;
 
@@ -16,7 +17,7 @@ struct Limited {
 }
 
 impl Limited {
-    fn new(limit_bytes_per_s: f64, lane: crate::plan::LaneSpec, rate_hz: Option<f64>) -> Self {
+    fn new(limit_bytes_per_s: f64, lane: LaneSpec, rate_hz: Option<f64>) -> Self {
         let bridge = Bridge {
             lane,
             ..bridge(Scope::Node, to_cloud())
@@ -86,18 +87,24 @@ impl Limited {
         self.bench.link.submitted.len() - before
     }
 
+    fn rates(&self) -> Vec<Option<f64>> {
+        self.path().bridges.iter().map(|bridge| bridge.allocated_hz).collect()
+    }
+
+    /// What is shown of the lanes of the topic.
+    fn lanes(&mut self) -> Vec<LaneFacts> {
+        let (facts, _) = self.bench.core.allocation_facts(self.bench.now, None, 10);
+        facts.into_iter().flat_map(|topic| topic.lanes).collect()
+    }
+
     fn path(&self) -> &TopicPath {
         self.bench.core.path(self.bench.topic)
     }
 
     fn dropped(&self) -> Vec<(DropReason, u64)> {
+        let bridges = self.path().bridges.iter();
         let mut all: BTreeMap<DropReason, u64> = BTreeMap::new();
-        for (reason, count) in self
-            .path()
-            .bridges
-            .iter()
-            .flat_map(|bridge| bridge.stats.dropped.iter())
-        {
+        for (reason, count) in bridges.flat_map(|bridge| bridge.stats.dropped.iter()) {
             *all.entry(reason).or_default() += count;
         }
         all.into_iter().collect()
@@ -146,10 +153,7 @@ fn whoever_publishes_far_more_than_it_says_is_held_to_its_word() {
 
 #[test]
 fn but_a_reliable_lane_is_not() {
-    let lane = crate::plan::LaneSpec {
-        reliable: true,
-        ..lane_spec()
-    };
+    let lane = lane_with(|lane| lane.reliable = true);
     let mut limited = Limited::new(1_000_000.0, lane, Some(10.0));
     limited.publish(100, 100, 20);
     assert_eq!(limited.dropped(), []);
@@ -193,10 +197,7 @@ fn a_new_limit_holds_from_the_next_run_on() {
 /// What a requester asks for is the smaller, and gives the reason.
 #[test]
 fn a_lane_runs_at_the_smaller_of_asked_and_allocated() {
-    let lane = crate::plan::LaneSpec {
-        max_rate_hz: Some(5.0),
-        ..lane_spec()
-    };
+    let lane = lane_with(|lane| lane.max_rate_hz = Some(5.0));
     let mut limited = Limited::new(1_000_000.0, lane, Some(30.0));
     let passed = limited.publish(30, 100_000, 10);
     assert!((49..=53).contains(&passed), "{passed}");
@@ -269,16 +270,12 @@ fn a_slow_publisher_is_not_taken_for_one_that_exceeds() {
 #[test]
 fn whoever_exceeds_is_said_to_until_it_does_not_any_more() {
     let mut limited = Limited::new(1_000_000.0, lane_spec(), Some(10.0));
-    let lane = |limited: &mut Limited| {
-        let (facts, _) = limited.bench.core.allocation_facts(limited.bench.now, None, 10);
-        facts[0].lanes[0].clone()
-    };
     limited.publish(100, 100, 8);
-    let held = lane(&mut limited);
+    let held = limited.lanes().remove(0);
     assert!(held.exceeds_advertised && held.limited && held.skipped > 0, "{held:?}");
     assert_eq!(held.allocated_hz, Some(10.0));
     limited.publish(10, 100, 8);
-    let free = lane(&mut limited);
+    let free = limited.lanes().remove(0);
     assert!(
         !free.exceeds_advertised && !free.limited && free.allocated_hz == Some(10.0),
         "{free:?}"
@@ -337,15 +334,8 @@ fn what_goes_to_one_receiver_from_two_scopes_is_one_lane() {
         let passed = publish(&mut limited, scopes, 10);
         assert!((99..=101).contains(&passed), "{passed} in 10 s from {scopes:?}");
     }
-    let allocated: Vec<_> = limited
-        .path()
-        .bridges
-        .iter()
-        .map(|bridge| bridge.allocated_hz)
-        .collect();
-    assert_eq!(allocated, [Some(10.0); 2]);
-    let (facts, _) = limited.bench.core.allocation_facts(limited.bench.now, None, 10);
-    assert_eq!(facts[0].lanes.len(), 1);
+    assert_eq!(limited.rates(), [Some(10.0); 2]);
+    assert_eq!(limited.lanes().len(), 1);
     // What is asked for at most is asked for together, too.
     let mut limited = Limited::with(1_000_000.0, both(Some(5.0)), Some(40.0));
     publish(&mut limited, [Scope::Node, Scope::Layer], 2);
@@ -361,10 +351,7 @@ fn what_goes_to_one_receiver_from_two_scopes_is_one_lane() {
 /// Else a flow that has to skip half would seem to carry no more than it can.
 #[test]
 fn what_the_budget_skips_is_load_and_what_nobody_asks_for_is_not() {
-    let lane = crate::plan::LaneSpec {
-        max_rate_hz: Some(20.0),
-        ..lane_spec()
-    };
+    let lane = lane_with(|lane| lane.max_rate_hz = Some(20.0));
     let mut limited = Limited::new(1_000_000.0, lane, Some(40.0));
     let mut load = 0;
     for _ in 0..20 {
@@ -388,11 +375,7 @@ fn what_the_budget_skips_is_load_and_what_nobody_asks_for_is_not() {
 
 #[test]
 fn what_is_kept_for_late_joiners_passes_whatever_the_rate() {
-    let lane = crate::plan::LaneSpec {
-        max_rate_hz: Some(1.0),
-        durable: true,
-        ..lane_spec()
-    };
+    let lane = lane_with(|lane| (lane.max_rate_hz, lane.durable) = (Some(1.0), true));
     let mut limited = Limited::new(1_000.0, lane, None);
     let now = limited.bench.now;
     let mut batch: Vec<Received> = (1..=20u8)
@@ -424,15 +407,7 @@ fn a_lane_that_drains_has_no_rate_any_more() {
     let (cloud, fog) = (bridge(Scope::Node, to_cloud()), bridge(Scope::Node, to_fog));
     let mut limited = Limited::with(1_000_000.0, vec![cloud, fog.clone()], Some(30.0));
     limited.publish(30, 100_000, 2);
-    let rates = |limited: &Limited| -> Vec<Option<f64>> {
-        limited
-            .path()
-            .bridges
-            .iter()
-            .map(|bridge| bridge.allocated_hz)
-            .collect()
-    };
-    assert_eq!(rates(&limited), [Some(5.0); 2]);
+    assert_eq!(limited.rates(), [Some(5.0); 2]);
     let info = TopicInfo {
         rate_hz: Some(30.0),
         ..TopicInfo::default()
@@ -440,43 +415,29 @@ fn a_lane_that_drains_has_no_rate_any_more() {
     limited.bench.apply(vec![fog], info);
     assert!(limited.bench.core.take_lanes_changed());
     limited.allocate();
-    assert_eq!(rates(&limited), [None, Some(10.0)]);
-    let (facts, _) = limited.bench.core.allocation_facts(limited.bench.now, None, 10);
-    let lanes = facts[0]
-        .lanes
-        .iter()
-        .map(|lane| (lane.receiver.to_string(), lane.allocated_hz));
-    let lanes: Vec<_> = lanes.collect();
+    assert_eq!(limited.rates(), [None, Some(10.0)]);
+    let lanes: Vec<_> = limited
+        .lanes()
+        .into_iter()
+        .map(|lane| (lane.receiver.to_string(), lane.allocated_hz))
+        .collect();
     assert_eq!(
         lanes,
         [("cloud/cloud-1".to_owned(), None), ("fog/fog-1".to_owned(), Some(10.0))]
     );
     limited.bench.apply(Vec::new(), TopicInfo::default());
     limited.allocate();
-    assert_eq!(rates(&limited), [None, None]);
+    assert_eq!(limited.rates(), [None, None]);
     assert!(limited.path().granted.is_none() && limited.bench.core.wanted(limited.bench.now).is_empty());
-    assert!(
-        limited
-            .bench
-            .core
-            .allocation_facts(limited.bench.now, None, 10)
-            .0
-            .is_empty()
-    );
+    assert!(limited.lanes().is_empty());
 }
 
 #[test]
 fn facts_are_taken_a_few_topics_at_a_time() {
     let mut limited = Limited::new(1_000_000.0, lane_spec(), Some(1.0));
     let now = limited.bench.now;
-    let plan = TopicPlan {
-        bridges: vec![bridge(Scope::Node, to_cloud())],
-        ..TopicPlan::default()
-    };
     for name in ["a", "b", "c", "d"] {
-        let core = &mut limited.bench.core;
-        let id = core.intern(&name.parse().unwrap(), now).unwrap();
-        core.apply(now, id, TopicInfo::default(), &plan, |_| Err(String::new()));
+        limited.bench.add(name, vec![bridge(Scope::Node, to_cloud())]);
     }
     limited.allocate();
     let (mut names, mut after) = (Vec::new(), None);
@@ -495,20 +456,10 @@ fn facts_are_taken_a_few_topics_at_a_time() {
 /// Images are admitted as unevenly as they come. Of a fast topic one more may wait for that; of a slow one an older image is of no use.
 #[test]
 fn of_a_fast_topic_more_than_one_image_may_wait() {
-    let lane = || crate::plan::LaneSpec {
-        reliable: false,
-        depth: 1,
-        ..lane_spec()
-    };
     for (bytes_per_s, waiting) in [(1_000_000.0, 1), (2_500_000.0, 3)] {
-        let mut limited = Limited::new(bytes_per_s, lane(), Some(30.0));
+        let mut limited = Limited::new(bytes_per_s, lane_spec(), Some(30.0));
         limited.publish(30, 100_000, 2);
-        let path = limited.path();
-        assert_eq!(
-            path.bridges[0].keep_newest(),
-            waiting,
-            "{:?}",
-            path.bridges[0].allocated_hz
-        );
+        let bridge = &limited.path().bridges[0];
+        assert_eq!(bridge.keep_newest(), waiting, "{:?}", bridge.allocated_hz);
     }
 }

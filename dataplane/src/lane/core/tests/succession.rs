@@ -23,13 +23,7 @@ fn reliable(flow: &str) -> Vec<Bridge> {
 }
 
 fn of_cloud(sequence: u64) -> Frame {
-    let origin = Origin {
-        layer: "cloud".into(),
-        node: "cloud-9".into(),
-        ..Origin::default()
-    };
-    let header = Header::new("imu/data", origin, WriterId([7; 16]), sequence, WALL);
-    Frame::new(&header, Bytes::new()).unwrap().with_hops_and_age(1, 0)
+    message(["cloud", "cloud-9", ""], 7, sequence, 0, 0).with_hops_and_age(1, 0)
 }
 
 impl Bench {
@@ -314,7 +308,7 @@ fn what_was_held_goes_on_where_there_is_never_room() {
 #[test]
 fn a_question_is_answered_whatever_else_happens() {
     let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer)]);
-    bench.core.deliver(bench.now, of_cloud(1), &mut bench.link);
+    bench.deliver(of_cloud(1));
     bench.out.queued.store(1, Ordering::SeqCst);
     let Bench { core, link, now, .. } = &mut bench;
     core.written_asked(*now, "cloud/a".parse().unwrap(), "imu/data".to_owned(), 1, link);
@@ -326,7 +320,7 @@ fn a_question_is_answered_whatever_else_happens() {
     assert_eq!(bench.link.told.len(), 1);
     // Nor an early message.
     let mut bench = Bench::new(vec![]);
-    bench.core.deliver(bench.now, of_cloud(1), &mut bench.link);
+    bench.deliver(of_cloud(1));
     bench.core.stir();
     let look_at = bench.core.drain(bench.now, &mut bench.link).unwrap();
     bench.core.drain(look_at, &mut bench.link);
@@ -392,26 +386,9 @@ fn not_all_questions_are_asked_at_once() {
     let mut bench = Bench::of_a();
     let topics = MAX_ASKS + 5;
     for number in 0..topics {
-        let id = bench
-            .core
-            .intern(&format!("t/{number}").parse().unwrap(), bench.now)
-            .unwrap();
         for flow in ["a", "b"] {
-            let plan = TopicPlan {
-                bridges: reliable(flow),
-                ..TopicPlan::default()
-            };
-            bench
-                .core
-                .apply(bench.now, id, TopicInfo::default(), &plan, |_| Err(String::new()));
-            let content = Content::Bare {
-                payload: Bytes::from_static(b"a"),
-                identity: None,
-            };
-            let mut batch = vec![received(content, bench.now)];
-            bench
-                .core
-                .ingest(bench.now, WALL, id, Scope::Node, &mut batch, &mut bench.link);
+            let id = bench.add(&format!("t/{number}"), reliable(flow));
+            bench.take_on(id, Scope::Node, vec![bare("a")]);
         }
     }
     bench.link.waiting.clear();
@@ -435,7 +412,7 @@ fn a_question_is_answered_when_the_broker_has_what_had_come_by_then() {
     ask(&mut bench, "imu/data", 2);
     assert_eq!(answers(&mut bench), [yes(1), yes(2)]);
     for sequence in 1..=3 {
-        bench.core.deliver(bench.now, of_cloud(sequence), &mut bench.link);
+        bench.deliver(of_cloud(sequence));
     }
     bench.out.queued.store(3, Ordering::SeqCst);
     assert!(bench.core.has_unwritten());
@@ -444,7 +421,7 @@ fn a_question_is_answered_when_the_broker_has_what_had_come_by_then() {
         ask(&mut bench, "imu/data", token);
     }
     assert!(answers(&mut bench).is_empty());
-    bench.core.deliver(bench.now, of_cloud(4), &mut bench.link);
+    bench.deliver(of_cloud(4));
     bench.out.queued.store(2, Ordering::SeqCst);
     bench.pass(LATER);
     assert!(
@@ -459,7 +436,7 @@ fn a_question_is_answered_when_the_broker_has_what_had_come_by_then() {
 #[test]
 fn questions_that_wait_are_bounded() {
     let mut bench = Bench::new(vec![bridge(Scope::Inter, Target::Layer)]);
-    bench.core.deliver(bench.now, of_cloud(1), &mut bench.link);
+    bench.deliver(of_cloud(1));
     bench.out.queued.store(1, Ordering::SeqCst);
     let ask = |bench: &mut Bench, asker: u64, topic: String, token: u64| {
         let Bench { core, link, now, .. } = bench;
@@ -481,26 +458,14 @@ fn questions_that_wait_are_bounded() {
     assert_eq!(answered(&mut bench), 1_024, "those beyond ask again");
     for number in 0..1_000 {
         let topic = format!("t/{number}");
-        let id = bench.core.intern(&topic.parse().unwrap(), bench.now).unwrap();
-        let plan = TopicPlan {
-            bridges: vec![bridge(Scope::Inter, Target::Layer)],
-            ..TopicPlan::default()
-        };
-        let out = Arc::clone(&bench.out);
-        bench.core.apply(bench.now, id, TopicInfo::default(), &plan, |_| {
-            Ok(NewWriter {
-                publisher: Arc::clone(&out) as Arc<dyn Publisher>,
-                options: PublisherOptions::default(),
-            })
-        });
+        bench.add(&topic, vec![bridge(Scope::Inter, Target::Layer)]);
         let origin = Origin {
             layer: "cloud".into(),
-            node: "cloud-9".into(),
             ..Origin::default()
         };
         let header = Header::new(&topic, origin, WriterId([7; 16]), 1, WALL);
-        let came = Frame::new(&header, Bytes::new()).unwrap().with_hops_and_age(1, 0);
-        bench.core.deliver(bench.now, came, &mut bench.link);
+        let came = Frame::new(&header, Bytes::new()).unwrap();
+        bench.deliver(came.with_hops_and_age(1, 0));
         ask(&mut bench, 1, topic, number);
     }
     assert_eq!(answered(&mut bench), 256, "of one flow");
@@ -509,7 +474,7 @@ fn questions_that_wait_are_bounded() {
 #[test]
 fn what_waits_for_its_bridge_is_not_written() {
     let mut bench = Bench::new(vec![]);
-    bench.core.deliver(bench.now, of_cloud(1), &mut bench.link);
+    bench.deliver(of_cloud(1));
     let asker: FlowId = "cloud/a".parse().unwrap();
     let Bench { core, link, now, .. } = &mut bench;
     core.written_asked(*now, asker, "imu/data".to_owned(), 1, link);
@@ -525,7 +490,7 @@ fn a_bridge_from_the_link_that_drains_stays_while_messages_come() {
     bench.apply(vec![], TopicInfo::default());
     for sequence in 1..=100 {
         bench.pass(DRAIN / 2);
-        bench.core.deliver(bench.now, of_cloud(sequence), &mut bench.link);
+        bench.deliver(of_cloud(sequence));
     }
     let until_then = (LONGEST_WAIT.as_millis() / (DRAIN / 2).as_millis()) as usize;
     let written = bench.out.frames.lock().len();

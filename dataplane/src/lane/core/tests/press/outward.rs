@@ -46,7 +46,7 @@ fn of_large_best_effort_messages_the_newest_wait_and_what_is_begun_stays() {
 #[test]
 fn small_messages_never_give_way_and_need_not_wait_for_large_ones() {
     let mut hands = Hands::new(vec![lane("cloud/c", false)]);
-    let other = hands.other_topic(lane("cloud/c", false));
+    let other = hands.bench.add("odom", vec![lane("cloud/c", false)]);
     hands.publish_on(other, LARGE);
     hands.publish_all(1, 1..=5, SMALL);
     assert_eq!((hands.quick, hands.long), (5, 1));
@@ -77,29 +77,19 @@ fn a_frame_that_replaces_a_waiting_one_has_its_turn() {
 }
 
 impl Hands {
-    /// A second topic with one lane.
-    fn other_topic(&mut self, lane: Bridge) -> TopicId {
-        let core = &mut self.bench.core;
-        let topic = core.intern(&"odom".parse().unwrap(), self.bench.now).unwrap();
-        let plan = TopicPlan {
-            bridges: vec![lane],
-            ..TopicPlan::default()
-        };
-        core.apply(self.bench.now, topic, TopicInfo::default(), &plan, |_| {
-            Err(String::new())
-        });
-        topic
-    }
-
     fn publish_on(&mut self, topic: TopicId, bytes: usize) {
         let content = Content::Bare {
             payload: Bytes::from(vec![0; bytes]),
             identity: None,
         };
-        let mut batch = vec![received(content, self.bench.now)];
-        let Bench { core, link, now, .. } = &mut self.bench;
-        core.ingest(*now, WALL, topic, Scope::Node, &mut batch, link);
+        self.bench.take_on(topic, Scope::Node, vec![content]);
         self.look();
+    }
+
+    /// Whether what the link got since the last call is compressed.
+    fn sent_compressed(&mut self) -> Vec<bool> {
+        let sent = std::mem::take(&mut self.bench.link.submitted);
+        sent.iter().map(|(.., frame)| frame.is_compressed()).collect()
     }
 }
 
@@ -107,7 +97,7 @@ impl Hands {
 fn one_topic_neither_fills_the_stage_nor_keeps_the_others_waiting() {
     const MIB: usize = 1 << 20;
     let mut hands = Hands::new(vec![lane("cloud/c", true)]);
-    let other = hands.other_topic(lane("cloud/c", true));
+    let other = hands.bench.add("odom", vec![lane("cloud/c", true)]);
     hands.publish_all(1, 1..=20, MIB);
     assert_eq!(hands.dropped(0), [(DropReason::QueueFull, 12)], "8 MiB wait");
     hands.publish_on(other, LARGE);
@@ -163,10 +153,8 @@ fn a_receiver_that_does_not_decompress_gets_what_was_published() {
     hands.bench.link.old = vec![old("fog/f")];
     hands.publish(1, 1, LARGE);
     hands.run();
-    let sent = std::mem::take(&mut hands.bench.link.submitted);
-    let compressed: Vec<bool> = sent.iter().map(|(.., frame)| frame.is_compressed()).collect();
-    assert_eq!(compressed, [true, false]);
-    assert_eq!(sent[1].2.payload().len(), LARGE);
+    assert_eq!(hands.bench.link.submitted[1].2.payload().len(), LARGE);
+    assert_eq!(hands.sent_compressed(), [true, false]);
     assert_eq!(
         hands.path().sent_size.largest(),
         LARGE as u64,
@@ -183,14 +171,7 @@ fn a_receiver_that_does_not_decompress_gets_what_was_published() {
     hands.begin(Urgency::Long);
     hands.bench.link.old = vec![old("cloud/c")];
     hands.end(0);
-    let compressed: Vec<bool> = hands
-        .bench
-        .link
-        .submitted
-        .iter()
-        .map(|(.., frame)| frame.is_compressed())
-        .collect();
-    assert_eq!(compressed, [false, true]);
+    assert_eq!(hands.sent_compressed(), [false, true]);
 }
 
 #[test]

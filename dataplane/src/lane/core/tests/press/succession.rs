@@ -154,17 +154,7 @@ fn durable(flow: &str) -> Vec<Bridge> {
 
 /// A message that is kept with others before it.
 fn kept(sequence: u64, bytes: usize, depth: u32) -> Content {
-    let origin = Origin {
-        layer: "edge".into(),
-        node: "robot-1".into(),
-        service: "imu".into(),
-        ..Origin::default()
-    };
-    let header = Header {
-        depth,
-        ..Header::new("imu/data", origin, WriterId([1; 16]), sequence, WALL)
-    };
-    Content::Frame(Frame::new(&header, Bytes::from(vec![0; bytes])).unwrap())
+    Content::Frame(message(["edge", "robot-1", "imu"], 1, sequence, depth, bytes))
 }
 
 /// More at once than may wait for the codec: nobody publishes it again, so the rest goes as it is.

@@ -17,7 +17,7 @@ use blaze_flow::link::{Engine, EngineConfig, Limits};
 use blaze_flow::plan::{PlanRules, Target};
 use blaze_flow::registry::LayerNames;
 use blaze_flow::world::{FlowState, LayerScopeId};
-use blaze_proto::link::link_control::{LayerScope, State};
+use blaze_proto::link::link_control::LayerScope;
 use blaze_proto::{Frame, Header};
 use bytes::Bytes;
 use parking_lot::Mutex;
@@ -512,9 +512,9 @@ impl<'a> Simulation<'a> {
                 | Output::Prepare { .. }
                 | Output::Release { .. }
                 | Output::ForgetWriters { .. } => {}
-                Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
-                Output::Announce { version, digest } => engine.set_registry(now, version, digest),
-                Output::State(state) => engine.set_state(now, hello_state(state)),
+                Output::Link { to, body } => drop(engine.send_control(&to, *body)),
+                Output::Announce { version, digest } => engine.set_registry(version, digest),
+                Output::State(state) => engine.set_state(now, state.into()),
                 Output::Plan { topic, plan, info, .. } => {
                     let Some(id) = flow.plane.core.intern(&topic, now) else {
                         continue;
@@ -679,13 +679,5 @@ impl<'a> Simulation<'a> {
             text.push_str("not all flows are ready");
         }
         text
-    }
-}
-
-fn hello_state(state: FlowState) -> State {
-    match state {
-        FlowState::Starting => State::Starting,
-        FlowState::Ready => State::Ready,
-        FlowState::Draining => State::Draining,
     }
 }

@@ -9,8 +9,6 @@ use blaze_flow::control::{Duty, Output, read_replica_message};
 use blaze_flow::lane::path::TopicInfo;
 use blaze_flow::lane::writer::NewWriter;
 use blaze_flow::plan::{Bridge, Target, TopicPlan};
-use blaze_flow::world::FlowState;
-use blaze_proto::link::link_control::State;
 use rand::RngExt;
 
 use super::parts::{Life, Packet, Record, channel};
@@ -172,19 +170,12 @@ impl World {
                 flow.control.joined(now);
             }
             Output::Inter { join: false } => {
-                engine.goodbye(now);
+                engine.goodbye();
                 flow.leaves = Some(now);
             }
-            Output::Link { to, body } => drop(engine.send_control(now, &to, *body)),
-            Output::Announce { version, digest } => engine.set_registry(now, version, digest),
-            Output::State(state) => {
-                let said = match state {
-                    FlowState::Starting => State::Starting,
-                    FlowState::Ready => State::Ready,
-                    FlowState::Draining => State::Draining,
-                };
-                engine.set_state(now, said);
-            }
+            Output::Link { to, body } => drop(engine.send_control(&to, *body)),
+            Output::Announce { version, digest } => engine.set_registry(version, digest),
+            Output::State(state) => engine.set_state(now, state.into()),
             _ => {}
         }
     }
@@ -285,7 +276,7 @@ impl World {
                 if written && (over || (flow.control.has_handed_over() && !flow.plane.core.is_draining())) {
                     flow.control.say_goodbye();
                     if let Some(engine) = &mut flow.plane.engine {
-                        engine.goodbye(now);
+                        engine.goodbye();
                     }
                     flow.life = Life::Gone(now);
                 }
