@@ -31,7 +31,7 @@ impl<T> Flights<T> {
 
     /// The next one that has arrived by `now`.
     pub(crate) fn arrived(&mut self, now: Instant) -> Option<T> {
-        let next = self.waiting.first_entry().filter(|next| next.key().0 <= now)?;
-        Some(next.remove())
+        self.next_due().filter(|due| *due <= now)?;
+        self.waiting.pop_first().map(|(_, load)| load)
     }
 }
