@@ -30,8 +30,8 @@ pub(super) enum FilterError {
     System { what: &'static str, error: io::Error },
     #[error("no socket of this process has one of the ports {0:?}")]
     NoSocket(Vec<u16>),
-    #[error("the program is wrong: {0}")]
-    Program(#[from] assembler::AssembleError),
+    #[error("the program is wrong")]
+    Program,
 }
 
 fn system(what: &'static str) -> impl FnOnce(io::Error) -> FilterError {

@@ -27,6 +27,9 @@ mod watch;
 mod writer;
 
 use std::net::{IpAddr, Ipv4Addr};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::thread;
 
 use blaze_domain::node_file::MAX_DDS_DOMAIN;
 
@@ -94,6 +97,24 @@ pub fn check(domain: u16, address: IpAddr) -> Result<Ipv4Addr, DdsError> {
         _ if domain > MAX_DDS_DOMAIN => Err(DdsError::Domain(domain)),
         IpAddr::V4(one) if !(one.is_unspecified() || one.is_multicast() || one.is_broadcast()) => Ok(one),
         _ => Err(DdsError::Address(address)),
+    }
+}
+
+/// Drops what is left of a participant. Its end may hang, so it is left to a thread of its own, which calls `over` and tells
+/// the receiver when it is over.
+pub fn lay_aside(remains: impl Send + 'static, over: impl FnOnce() + Send + 'static) -> Option<Receiver<()>> {
+    let (done, receiver) = sync_channel(1);
+    let thread = thread::Builder::new().name("dds-remains".into()).spawn(move || {
+        let _ = catch_unwind(AssertUnwindSafe(|| drop(remains)));
+        over();
+        let _ = done.send(());
+    });
+    match thread {
+        Ok(_) => Some(receiver),
+        Err(error) => {
+            tracing::error!(%error, "no thread for the end of a DDS participant");
+            None
+        }
     }
 }
 

@@ -53,8 +53,6 @@ pub struct RelayStatus {
     pub announces_multicast: bool,
     /// Addresses that are known.
     pub addresses: usize,
-    /// Addresses that were forgotten to make room for others.
-    pub forgotten: u64,
     /// Names that do not resolve.
     pub unresolved: Vec<String>,
 }
@@ -132,7 +130,6 @@ impl Relay {
             state.learnt.push_back(address);
             while state.learnt.len() + state.configured.len() > MAX_ADDRESSES && state.learnt.len() > 1 {
                 state.learnt.pop_front();
-                state.status.forgotten += 1;
             }
         }
     }

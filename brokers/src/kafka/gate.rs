@@ -20,11 +20,6 @@ impl Gate {
         self.stood_back.store(stood_back, Ordering::Release);
     }
 
-    /// Whether the scope belongs to another flow.
-    pub(super) fn is_stood_back(&self) -> bool {
-        self.stood_back.load(Ordering::Acquire)
-    }
-
     /// Whether the server answers.
     pub(super) fn is_open(&self) -> bool {
         self.up.load(Ordering::Acquire)
@@ -32,6 +27,6 @@ impl Gate {
 
     /// Whether a topic is used now.
     pub(super) fn lets(&self, stays_open: bool) -> bool {
-        stays_open || !self.is_stood_back()
+        stays_open || !self.stood_back.load(Ordering::Acquire)
     }
 }

@@ -13,14 +13,8 @@ use crate::port::{BrokerError, FlowSide};
 
 /// The flow's side of a Redis.
 pub(super) struct RedisFlowSide {
-    shared: Arc<Shared>,
-    leases: Arc<Leases>,
-}
-
-impl RedisFlowSide {
-    pub(super) fn new(shared: Arc<Shared>, leases: Arc<Leases>) -> Self {
-        Self { shared, leases }
-    }
+    pub(super) shared: Arc<Shared>,
+    pub(super) leases: Arc<Leases>,
 }
 
 #[async_trait]

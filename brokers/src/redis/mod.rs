@@ -322,8 +322,10 @@ impl Broker for RedisBroker {
 
     fn flow_side(&self) -> Option<Arc<dyn FlowSide>> {
         let flow = self.flow.as_ref()?;
-        let side = RedisFlowSide::new(Arc::clone(&self.shared), Arc::clone(&flow.leases));
-        Some(Arc::new(side))
+        Some(Arc::new(RedisFlowSide {
+            shared: Arc::clone(&self.shared),
+            leases: Arc::clone(&flow.leases),
+        }))
     }
 
     async fn close(&self) {

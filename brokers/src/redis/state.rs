@@ -52,11 +52,6 @@ impl Line {
         matches!(self, Self::ReadSmall | Self::ReadLarge)
     }
 
-    /// Whether it is there from the beginning; the others come with the first large publisher or reader.
-    fn is_core(self) -> bool {
-        !self.is_large()
-    }
-
     pub(super) fn index(self) -> usize {
         self as usize
     }
@@ -136,11 +131,12 @@ pub(super) struct Conditions {
 
 impl Conditions {
     fn new(scope: Scope, place: String) -> Self {
+        // Those for large messages come with the first large publisher or reader.
         let start = |line: Line| {
-            if line.is_core() {
-                LineState::Starting
-            } else {
+            if line.is_large() {
                 LineState::Unused
+            } else {
+                LineState::Starting
             }
         };
         Self {
@@ -185,8 +181,8 @@ impl Conditions {
     }
 
     fn core_is_up(&self) -> bool {
-        let up = |line: &Line| *self.line(*line) == LineState::Up;
-        Line::ALL.iter().filter(|line| line.is_core()).all(up)
+        let up = |line: Line| *self.line(line) == LineState::Up;
+        up(Line::PublishSmall) && up(Line::ReadSmall)
     }
 
     fn scope_open(&self) -> bool {

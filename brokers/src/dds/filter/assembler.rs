@@ -76,17 +76,6 @@ pub(super) const JUMP: u16 = 0x05;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Label(usize);
 
-/// Why a program cannot be assembled.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(in super::super) enum AssembleError {
-    #[error("a label is nowhere")]
-    Unbound,
-    #[error("the jump at {0} does not go forward, or too far")]
-    Distance(usize),
-    #[error("{0} instructions, {MAX_INSTRUCTIONS} are possible")]
-    Length(usize),
-}
-
 /// What the kernel takes.
 const MAX_INSTRUCTIONS: usize = 4096;
 
@@ -151,29 +140,18 @@ impl Assembler {
         });
     }
 
-    /// The program with all jumps resolved.
-    pub(super) fn finish(mut self) -> Result<Vec<Instruction>, AssembleError> {
-        if self.code.len() > MAX_INSTRUCTIONS {
-            return Err(AssembleError::Length(self.code.len()));
-        }
+    /// The program with all jumps resolved; `None` if a label is nowhere, a jump is too far, or the program too long.
+    pub(super) fn finish(mut self) -> Option<Vec<Instruction>> {
         for (at, jump, label) in self.jumps {
-            let target = self
-                .labels
-                .get(label.0)
-                .copied()
-                .flatten()
-                .ok_or(AssembleError::Unbound)?;
-            let distance = target.checked_sub(at + 1).ok_or(AssembleError::Distance(at))?;
-            let short = u8::try_from(distance).map_err(|_| AssembleError::Distance(at));
-            let Some(instruction) = self.code.get_mut(at) else {
-                return Err(AssembleError::Unbound);
-            };
+            let target = self.labels.get(label.0).copied().flatten()?;
+            let distance = target.checked_sub(at + 1)?;
+            let instruction = self.code.get_mut(at)?;
             match jump {
-                Jump::Always => instruction.k = u32::try_from(distance).map_err(|_| AssembleError::Distance(at))?,
-                Jump::IfTrue => instruction.if_true = short?,
-                Jump::IfFalse => instruction.if_false = short?,
+                Jump::Always => instruction.k = u32::try_from(distance).ok()?,
+                Jump::IfTrue => instruction.if_true = u8::try_from(distance).ok()?,
+                Jump::IfFalse => instruction.if_false = u8::try_from(distance).ok()?,
             }
         }
-        Ok(self.code)
+        (self.code.len() <= MAX_INSTRUCTIONS).then_some(self.code)
     }
 }

@@ -118,20 +118,21 @@ fn still_bound(duplicate: OwnedFd, port: u16) -> Option<Socket> {
 /// Attaches the largest filter for which the system has room.
 fn attach_one(socket: &Socket, samples: Samples, shape: &mut Shape) -> Result<(), FilterError> {
     if *shape == Shape::LARGE {
-        match socket.attach_filter(&filters(&program(Shape::LARGE, samples)?)) {
+        match socket.attach_filter(&filters(Shape::LARGE, samples)?) {
             Ok(()) => return Ok(()),
             Err(error) if Errno::from_io_error(&error) == Some(Errno::NOMEM) => *shape = Shape::SMALL,
             Err(error) => return Err(system("the filter was refused")(error)),
         }
     }
     socket
-        .attach_filter(&filters(&program(*shape, samples)?))
+        .attach_filter(&filters(*shape, samples)?)
         .map_err(system("the filter was refused"))
 }
 
-fn filters(program: &[Instruction]) -> Vec<SockFilter> {
+fn filters(shape: Shape, samples: Samples) -> Result<Vec<SockFilter>, FilterError> {
+    let program = program(shape, samples).ok_or(FilterError::Program)?;
     let convert = |it: &Instruction| SockFilter::new(it.code, it.if_true, it.if_false, it.k);
-    program.iter().map(convert).collect()
+    Ok(program.iter().map(convert).collect())
 }
 
 fn errno(what: &'static str) -> impl FnOnce(Errno) -> FilterError {

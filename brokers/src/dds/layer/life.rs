@@ -5,7 +5,7 @@ use std::net::UdpSocket;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::mpsc::Receiver;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -13,8 +13,8 @@ use super::make::Generation;
 use super::presence::SILENT;
 use super::shared::Shared;
 use super::slot::Slot;
-use crate::dds::DdsError;
 use crate::dds::reader::StoppableThread;
+use crate::dds::{DdsError, lay_aside};
 use crate::port::Health;
 
 const TICK: Duration = Duration::from_millis(100);
@@ -157,26 +157,13 @@ impl Lifecycle {
         self.next_attempt = self.built + RETRY;
     }
 
-    /// Drops the participant and all that belongs to it. Its end may hang, so it is left to a thread of its own, which
-    /// tells when it is over.
+    /// Drops the participant and all that belongs to it.
     fn lay_aside(&mut self) -> Option<Receiver<()>> {
         let writers = self.shared.slots.take_all();
         let readers = self.shared.channels.take_readers();
         self.shared.writers.write().clear();
         self.shared.best_effort.write().clear();
-        let remains = (writers, readers, self.generation.take());
-        let (done, receiver) = sync_channel(1);
-        let thread = thread::Builder::new().name("dds-remains".into()).spawn(move || {
-            let _ = catch_unwind(AssertUnwindSafe(|| drop(remains)));
-            let _ = done.send(());
-        });
-        match thread {
-            Ok(_) => Some(receiver),
-            Err(error) => {
-                tracing::error!(%error, "no thread for the end of a DDS participant");
-                None
-            }
-        }
+        lay_aside((writers, readers, self.generation.take()), || {})
     }
 
     fn give_birth(&mut self, now: Instant) {

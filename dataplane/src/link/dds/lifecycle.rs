@@ -5,12 +5,12 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::mpsc::Receiver;
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use blaze_brokers::dds::{
-    DdsError, EndpointWatch, FoundReader, GuidPrefix, Illness, Participant, ParticipantConfig, Pulse, Reader,
+    DdsError, EndpointWatch, FoundReader, GuidPrefix, Illness, Participant, ParticipantConfig, Pulse, Reader, lay_aside,
 };
 use blaze_domain::Priority;
 
@@ -128,27 +128,15 @@ impl Lifecycle {
         self.next_attempt = self.built + RETRY;
     }
 
-    /// Drops the participant and all that belongs to it. Its end may hang, so it is left to a thread of its own, which
-    /// tells when it is over.
+    /// Drops the participant and all that belongs to it.
     fn lay_aside(&mut self) -> Option<Receiver<()>> {
         let writers: Vec<_> = self.shared.writers.write().drain().collect();
         let discarded = std::mem::take(&mut *self.shared.discarded.lock());
-        let remains = (writers, discarded, self.generation.take());
-        let (done, receiver) = sync_channel(1);
         let shared = Arc::clone(&self.shared);
         shared.remains.fetch_add(1, Ordering::Relaxed);
-        let thread = thread::Builder::new().name("dds-remains".into()).spawn(move || {
-            let _ = catch_unwind(AssertUnwindSafe(|| drop(remains)));
+        lay_aside((writers, discarded, self.generation.take()), move || {
             shared.remains.fetch_sub(1, Ordering::Relaxed);
-            let _ = done.send(());
-        });
-        match thread {
-            Ok(_) => Some(receiver),
-            Err(error) => {
-                tracing::error!(%error, "no thread for the end of a DDS participant");
-                None
-            }
-        }
+        })
     }
 
     fn give_birth(&mut self, now: Instant) {
