@@ -8,7 +8,7 @@ use blaze_brokers::{Broker as _, Content, PublisherOptions, SubscribeOptions, Su
 use blaze_domain::names::ChannelName;
 use blaze_domain::{Durability, Reliability, Scope};
 use blaze_sdk::{
-    Advertise, FlowError, FlowEventKind, LeaseState, OriginFilter, RefusalCode, Request, ServiceManager, ServiceOptions,
+    Advertise, FlowError, FlowEventKind, LeaseState, OriginFilter, Request, ServiceManager, ServiceOptions,
 };
 use bytes::Bytes;
 use serde_json::{Value, json};
@@ -232,34 +232,6 @@ async fn after_an_outage_of_the_broker_leases_are_sent_at_once() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_refusal_gives_code_pointer_and_detail() {
-    let hub = MemoryHub::new("t");
-    let mut flow = FakeFlow::start(&hub).await;
-    let service = service(&hub).await;
-    let (refused, ()) = tokio::join!(service.flow().advertise(imu()), async {
-        let (_, sent) = flow.next().await;
-        let error = json!({"code": "source_mismatch", "pointer": "/node", "detail": "this is robot-2"});
-        let answer = json!([{"id": "not-mine", "ok": true}, {"id": sent["id"], "ok": false, "flow": "edge/robot-2", "error": error}]);
-        flow.say(sent["reply_to"].as_str().unwrap(), &answer);
-    });
-    let error = refused.unwrap_err();
-    assert_eq!(
-        error,
-        FlowError::Refused {
-            code: RefusalCode::SourceMismatch,
-            pointer: "/node".to_owned(),
-            detail: "this is robot-2".to_owned(),
-            flow: Some("edge/robot-2".to_owned()),
-        }
-    );
-    assert!(!error.may_retry());
-    assert!(
-        flow.next_within(TTL * 3).await.is_none(),
-        "nothing is left to renew or withdraw"
-    );
-}
-
-#[tokio::test(start_paused = true)]
 async fn an_unanswered_advertise_is_sent_again_with_one_id_and_fails_in_time() {
     let hub = MemoryHub::new("t");
     let mut flow = FakeFlow::start(&hub).await;
@@ -281,21 +253,6 @@ async fn an_unanswered_advertise_is_sent_again_with_one_id_and_fails_in_time() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_late_flow_is_enough() {
-    let hub = MemoryHub::new("t");
-    let service = service(&hub).await;
-    hub.cut();
-    let (lease, ()) = tokio::join!(service.flow().advertise(imu()), async {
-        tokio::time::sleep(Duration::from_secs(4)).await;
-        hub.restore();
-        let mut flow = FakeFlow::start(&hub).await;
-        let (_, sent) = flow.next().await;
-        flow.agree(&sent);
-    });
-    assert_eq!(lease.unwrap().state(), LeaseState::Held);
-}
-
-#[tokio::test(start_paused = true)]
 async fn dropping_a_lease_withdraws_it_and_so_does_not_waiting_for_it() {
     let hub = MemoryHub::new("t");
     let mut flow = FakeFlow::start(&hub).await;
@@ -314,23 +271,6 @@ async fn dropping_a_lease_withdraws_it_and_so_does_not_waiting_for_it() {
     assert!(asking.await.is_err());
     assert_eq!(flow.next().await.1["op"], "advertise");
     assert_eq!(flow.next().await.1["op"], "withdraw");
-}
-
-#[tokio::test(start_paused = true)]
-async fn withdrawing_waits_for_the_flow() {
-    let hub = MemoryHub::new("t");
-    let mut flow = FakeFlow::start(&hub).await;
-    let service = service(&hub).await;
-    let lease = advertised(&service, &mut flow, imu()).await;
-    let start = Instant::now();
-    let (withdrawn, ()) = tokio::join!(lease.withdraw(), async {
-        let (_, lost) = flow.next().await;
-        let (_, again) = flow.next().await;
-        assert_eq!(lost, again);
-        flow.agree(&again);
-    });
-    withdrawn.unwrap();
-    assert!(start.elapsed() >= Duration::from_millis(180), "{:?}", start.elapsed());
 }
 
 #[tokio::test(start_paused = true)]
@@ -386,34 +326,4 @@ async fn values_that_cannot_be_are_refused_without_a_message() {
         "{refused}"
     );
     assert!(flow.next_within(TTL).await.is_none());
-}
-
-#[tokio::test(start_paused = true)]
-async fn many_leases_travel_in_arrays() {
-    let hub = MemoryHub::new("t");
-    let mut flow = FakeFlow::start(&hub).await;
-    let service = service(&hub).await;
-    let asked: Vec<_> = (0..500)
-        .map(|number| {
-            service
-                .flow()
-                .advertise(Advertise::new(format!("t/{number}").parse().unwrap()))
-        })
-        .collect();
-    let all = futures::future::join_all(asked);
-    let (leases, payloads) = tokio::join!(all, async {
-        let mut answered = 0;
-        let mut payloads = 0;
-        while answered < 500 {
-            if flow.waiting.is_empty() {
-                payloads += 1;
-            }
-            let (_, sent) = flow.next().await;
-            flow.agree(&sent);
-            answered += 1;
-        }
-        payloads
-    });
-    assert!(leases.iter().all(Result::is_ok));
-    assert!((3..=10).contains(&payloads), "{payloads} payloads for 500 leases");
 }

@@ -11,7 +11,7 @@
 
 mod oracle;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use blaze_flow::limit::allocate::{Allocation, Class, Grant, Lane, Sharing, Terms, Topic, allocate};
 use num_rational::BigRational;
@@ -350,48 +350,8 @@ fn generate(seed: u64) -> Case {
     case
 }
 
-/// What the sets were like.
-#[derive(Debug, Default, Clone, Copy)]
-struct Tally {
-    sets: u64,
-    topics: u64,
-    fair: u64,
-    standard_exceeds: u64,
-    floors_exceed: u64,
-    /// Sets of which rounding alone decides whether they are feasible.
-    undecided: u64,
-    /// Sets of short numbers that are exactly at the limit of what is feasible.
-    exactly_at_limit: u64,
-    full: u64,
-    at_cap: u64,
-    at_rest: u64,
-    at_floor: u64,
-    /// Topics of which rounding alone decided whether they have their full demand.
-    jumps: u64,
-    /// Pairs of large topics of which the name decides which is first, and which different limits hold.
-    ties: u64,
-    /// Topics whose lanes run at different rates.
-    lanes_apart: u64,
-}
-
-impl Tally {
-    fn add(&mut self, other: &Self) {
-        self.sets += other.sets;
-        self.topics += other.topics;
-        self.fair += other.fair;
-        self.standard_exceeds += other.standard_exceeds;
-        self.floors_exceed += other.floors_exceed;
-        self.undecided += other.undecided;
-        self.exactly_at_limit += other.exactly_at_limit;
-        self.full += other.full;
-        self.at_cap += other.at_cap;
-        self.at_rest += other.at_rest;
-        self.at_floor += other.at_floor;
-        self.jumps += other.jumps;
-        self.ties += other.ties;
-        self.lanes_apart += other.lanes_apart;
-    }
-}
+/// What the sets were like: how many there were of each sort.
+type Tally = BTreeMap<&'static str, u64>;
 
 /// Fails with a sentence unless something holds.
 fn ensure(holds: bool, what: impl FnOnce() -> String) -> Result<(), String> {
@@ -451,31 +411,32 @@ fn compare(case: &Case, topics: &[Topic<'_>], got: &Allocation, wanted: &Shares)
     let noise = noise(budget);
     let order_undecided = near(&wanted.standard_excess).abs() <= noise;
     let odds = Odds { noise, order_undecided };
-    let mut tally = Tally {
-        sets: 1,
-        topics: topics.len() as u64,
-        ..Tally::default()
-    };
+    let mut tally = Tally::new();
+    let mut count = |what, more: bool| *tally.entry(what).or_default() += u64::from(more);
+    count("sets", true);
     ensure(got.grants.len() == topics.len(), || {
         format!("{} grants", got.grants.len())
     })?;
     for ((topic, grant), share) in topics.iter().zip(&got.grants).zip(&wanted.shares) {
         let jump = compare_topic(topic, grant, share, &terms, odds)?;
-        tally.jumps += u64::from(jump);
-        *match share.limit {
-            Limit::Full => &mut tally.full,
-            Limit::Cap => &mut tally.at_cap,
-            Limit::Rest => &mut tally.at_rest,
-            Limit::Floor => &mut tally.at_floor,
-        } += 1;
-        tally.lanes_apart += u64::from(share.lanes.windows(2).any(|pair| pair[0] != pair[1]));
+        // Rounding alone decided whether the topic has its full demand.
+        count("jumps", jump);
+        let limit = match share.limit {
+            Limit::Full => "full",
+            Limit::Cap => "at cap",
+            Limit::Rest => "at rest",
+            Limit::Floor => "at floor",
+        };
+        count(limit, true);
+        count("lanes apart", share.lanes.windows(2).any(|pair| pair[0] != pair[1]));
     }
     for (at, topic) in topics.iter().enumerate() {
         for (other_at, other) in topics.iter().enumerate().skip(at + 1) {
             let demand = |topic: &Topic<'_>| topic.size_bytes as f64 * topic.advertised_hz;
             let (share, other_share) = (&wanted.shares[at], &wanted.shares[other_at]);
             let by_name = share.large && case.terms.sharing == Sharing::Paper && demand(topic) == demand(other);
-            tally.ties += u64::from(by_name && share.limit != other_share.limit);
+            // The name decides which is first, and different limits hold.
+            count("ties", by_name && share.limit != other_share.limit);
         }
     }
     ensure(close(got.used_bytes_per_s, near(&wanted.used), noise), || {
@@ -488,11 +449,17 @@ fn compare(case: &Case, topics: &[Topic<'_>], got: &Allocation, wanted: &Shares)
     ensure(!clear || got.feasible == wanted.feasible, || {
         format!("feasible is {}", got.feasible)
     })?;
-    tally.undecided += u64::from(!clear);
-    tally.exactly_at_limit += u64::from(wanted.excess.is_zero() && case.short && budget > 0.0);
-    tally.fair += u64::from(case.terms.sharing == Sharing::Fair);
-    tally.standard_exceeds += u64::from(wanted.standard_excess.is_positive());
-    tally.floors_exceed += u64::from(!wanted.feasible && !wanted.standard_excess.is_positive());
+    count("undecided", !clear);
+    count(
+        "exactly at limit",
+        wanted.excess.is_zero() && case.short && budget > 0.0,
+    );
+    count("fair", case.terms.sharing == Sharing::Fair);
+    count("standard exceeds", wanted.standard_excess.is_positive());
+    count(
+        "floors exceed",
+        !wanted.feasible && !wanted.standard_excess.is_positive(),
+    );
     Ok(tally)
 }
 
@@ -612,12 +579,18 @@ fn seeds() -> Vec<u64> {
     super::seeds(20_000, 1_000_000)
 }
 
+fn add(tally: &mut Tally, other: Tally) {
+    for (what, count) in other {
+        *tally.entry(what).or_default() += count;
+    }
+}
+
 /// Checks some sets; returns what they were like and the first failures.
 fn check_all(seeds: impl Iterator<Item = u64>) -> (Tally, Vec<String>) {
     let (mut tally, mut failures) = (Tally::default(), Vec::new());
     for seed in seeds {
         match check(seed) {
-            Ok(one) => tally.add(&one),
+            Ok(one) => add(&mut tally, one),
             Err(failure) => failures.push(failure),
         }
         if failures.len() == 5 {
@@ -652,7 +625,7 @@ fn rates_are_those_of_exact_arithmetic() {
         let running: Vec<_> = (0..threads).map(spawn).collect();
         for thread in running {
             let (one, failed) = thread.join().unwrap();
-            tally.add(&one);
+            add(&mut tally, one);
             failures.extend(failed);
         }
     });
@@ -661,21 +634,22 @@ fn rates_are_those_of_exact_arithmetic() {
 
     // The sets are worth something only where all of this is among them.
     if seeds.len() > 1 {
-        let in_each = |count: u64, sets: u64| count * sets >= tally.sets;
-        assert!(
-            in_each(tally.fair, 3) && in_each(tally.standard_exceeds, 10) && in_each(tally.floors_exceed, 20),
-            "{tally:?}"
-        );
-        assert!(
-            in_each(tally.at_cap, 4) && in_each(tally.at_rest, 4) && in_each(tally.at_floor, 4),
-            "{tally:?}"
-        );
-        assert!(
-            in_each(tally.full, 1) && in_each(tally.lanes_apart, 1) && in_each(tally.ties, 50),
-            "{tally:?}"
-        );
-        assert!(in_each(tally.exactly_at_limit, 100), "{tally:?}");
-        assert!(!in_each(tally.undecided, 5) && !in_each(tally.jumps, 5), "{tally:?}");
+        let in_each = |what: &str, sets: u64| tally.get(what).unwrap_or(&0) * sets >= tally["sets"];
+        for (what, sets) in [
+            ("fair", 3),
+            ("standard exceeds", 10),
+            ("floors exceed", 20),
+            ("at cap", 4),
+            ("at rest", 4),
+            ("at floor", 4),
+            ("full", 1),
+            ("lanes apart", 1),
+            ("ties", 50),
+            ("exactly at limit", 100),
+        ] {
+            assert!(in_each(what, sets), "{what}: {tally:?}");
+        }
+        assert!(!in_each("undecided", 5) && !in_each("jumps", 5), "{tally:?}");
     }
 }
 
