@@ -302,6 +302,24 @@ impl FlowProcess {
         Ok(())
     }
 
+    /// Kills it, starts it again, and waits until it is ready.
+    ///
+    /// # Errors
+    /// As [`FlowProcess::start`].
+    pub fn restart(&mut self) -> anyhow::Result<()> {
+        self.kill()?;
+        self.relaunch()?;
+        self.wait_ready()
+    }
+
+    /// Messages that came out of all its bridges.
+    #[must_use]
+    pub fn delivered(&self) -> u64 {
+        let bridges = self.bridges();
+        let out = bridges.iter().filter_map(|bridge| bridge["out"]["messages"].as_u64());
+        out.sum()
+    }
+
     /// Bridges as `GET /v1/bridges` shows them.
     #[must_use]
     pub fn bridges(&self) -> Vec<Value> {

@@ -167,27 +167,3 @@ fn sync_ms(folder: &Path) -> anyhow::Result<f64> {
     times.sort_unstable();
     Ok(times.get(SYNCS / 2).context("no write")?.as_secs_f64() * 1e3)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_deepest_mount_is_the_one_that_counts() {
-        let mounts = "/dev/vda / ext4 rw 0 0\ntmpfs /var tmpfs rw 0 0\n/dev/vdb /var/lib xfs rw 0 0\n";
-        for (folder, expected) in [
-            ("/home/a", "ext4"),
-            ("/var/log", "tmpfs"),
-            ("/var/lib/a", "xfs"),
-            ("/variety", "ext4"),
-        ] {
-            assert_eq!(file_system(mounts, Path::new(folder)), Some(expected), "{folder}");
-        }
-    }
-
-    #[test]
-    fn the_disk_is_tried() {
-        let folder = tempfile::tempdir().unwrap();
-        assert!(sync_ms(folder.path()).unwrap() > 0.0);
-    }
-}

@@ -3,6 +3,7 @@
 use std::ffi::OsStr;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Write as _};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -90,6 +91,16 @@ pub struct Usage {
     pub threads: u64,
     /// Open file descriptors.
     pub descriptors: u64,
+}
+
+impl Usage {
+    /// Whether it is at most so much more than before.
+    #[must_use]
+    pub fn exceeds_by_at_most(&self, before: &Self, most: &Self) -> bool {
+        self.resident_kib <= before.resident_kib + most.resident_kib
+            && self.threads <= before.threads + most.threads
+            && self.descriptors <= before.descriptors + most.descriptors
+    }
 }
 
 impl std::fmt::Display for Usage {
@@ -208,16 +219,24 @@ impl Process {
             || self.stderr().into_iter().find(|line| line.starts_with(&start)),
             || self.tail(),
         )?;
-        let address = line
-            .split("admin=")
-            .nth(1)
-            .context("no admin= in the ready line")?
-            .trim()
-            .parse()?;
         Ok(Admin {
-            address,
+            address: address_in(&line, "admin")?,
             namespace: self.namespace.clone(),
         })
+    }
+
+    /// Waits for the line `ready rest=ADDRESS …` on stdout and gives one of the addresses in it.
+    ///
+    /// # Errors
+    /// When the line does not come in time, or has no such address.
+    pub fn ready_at(&self, name: &str, deadline: Duration) -> anyhow::Result<SocketAddr> {
+        let line = wait::until_some(
+            "the ready line",
+            deadline,
+            || self.stdout().into_iter().find(|line| line.starts_with("ready ")),
+            || self.tail(),
+        )?;
+        address_in(&line, name)
     }
 
     /// Kills it at once, as a crash would, and waits for its end.
@@ -315,6 +334,12 @@ impl Process {
         };
         format!("stdout:\n{}\nstderr:\n{}", last(self.stdout()), last(self.stderr()))
     }
+}
+
+fn address_in(line: &str, name: &str) -> anyhow::Result<SocketAddr> {
+    let mut words = line.split_whitespace().filter_map(|word| word.split_once('='));
+    let word = words.find(|(found, _)| *found == name);
+    Ok(word.with_context(|| format!("no {name} in {line:?}"))?.1.parse()?)
 }
 
 impl Drop for Process {

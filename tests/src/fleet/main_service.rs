@@ -10,7 +10,6 @@ use serde_json::json;
 use super::Api;
 use crate::process::Process;
 use crate::servers::free_port;
-use crate::wait;
 
 /// A start on a machine that does much else.
 const START: Duration = Duration::from_secs(60);
@@ -76,12 +75,7 @@ impl MainService {
         self.kill()?;
         let node_file = self.node_file.to_str().context("the folder has a name in UTF-8")?;
         let process = Process::start("blaze-config", &["--dev", "--config", node_file], None)?;
-        wait::until_some(
-            "the ready line of blaze-config",
-            START,
-            || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
-            || process.tail(),
-        )?;
+        process.ready_at("rest", START)?;
         self.process = Some(process);
         Ok(())
     }

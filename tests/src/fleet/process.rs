@@ -1,6 +1,5 @@
 //! A worker as a process of its own.
 
-use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
 
@@ -9,7 +8,6 @@ use serde_json::Value;
 
 use crate::admin::Admin;
 use crate::process::Process;
-use crate::wait;
 
 use super::WorkerSpec;
 
@@ -38,14 +36,7 @@ impl WorkerProcess {
         std::fs::write(&path, file.to_string())?;
         let path = path.to_str().context("the folder has a name in UTF-8")?;
         let process = Process::start("blaze-worker", &["--config", path], None)?;
-        let line = wait::until_some(
-            "the ready line of blaze-worker",
-            START,
-            || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
-            || process.tail(),
-        )?;
-        let address = line.split("admin=").nth(1).context("no admin= in the ready line")?;
-        let address: SocketAddr = address.trim().parse()?;
+        let address = process.ready_at("admin", START)?;
         Ok(Self {
             process,
             admin: Admin {

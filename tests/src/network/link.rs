@@ -37,17 +37,14 @@ impl LinkProcess {
     /// # Errors
     /// When it is not built, or the machine does not let it make TUN devices.
     pub(super) fn start(link: &WanLink, a: (&str, &str), b: (&str, &str)) -> anyhow::Result<Self> {
-        let set = |ways, shape: &crate::wan::Shape| Command::Set {
-            ways,
-            changes: shape.changes(),
-        };
+        let set = |ways, shape: &crate::wan::Shape| serde_json::to_string(&Command::Set(ways, shape.changes()));
         let mut child = std::process::Command::new(binary("blaze-testbed")?)
             .arg("wan")
             .args(["--a", a.0, "--a-device", a.1, "--a-mtu", &link.forward.mtu.to_string()])
             .args(["--b", b.0, "--b-device", b.1, "--b-mtu", &link.back.mtu.to_string()])
             .args(["--seed", &link.seed.to_string()])
-            .args(["--run", &set(Ways::Forward, &link.forward).to_string()])
-            .args(["--run", &set(Ways::Back, &link.back).to_string()])
+            .args(["--run", &set(Ways::Forward, &link.forward)?])
+            .args(["--run", &set(Ways::Back, &link.back)?])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
@@ -79,6 +76,7 @@ impl LinkProcess {
 
     fn ask(&self, command: &Command) -> anyhow::Result<Value> {
         let mut talk = self.talk.lock();
+        let command = serde_json::to_string(command)?;
         writeln!(talk.commands, "{command}").context("blaze-wan has gone")?;
         let answer = talk.answer().with_context(|| format!("`{command}` to blaze-wan"))?;
         anyhow::ensure!(answer["ok"] == true, "`{command}`: blaze-wan says {answer}");
@@ -113,9 +111,8 @@ impl Link<'_> {
     /// # Errors
     /// When `blaze-wan` has gone; so with the other calls.
     pub fn set(&self, ways: Ways, changes: &[Change]) -> anyhow::Result<()> {
-        let changes = changes.to_vec();
-        let ways = self.ways(ways);
-        self.process.ask(&Command::Set { ways, changes }).map(|_| ())
+        let command = Command::Set(self.ways(ways), changes.to_vec());
+        self.process.ask(&command).map(|_| ())
     }
 
     /// Cuts it: what is on the way is lost, and all that comes until [`Link::heal`].

@@ -153,7 +153,7 @@ impl Drop for Namespace {
 ///
 /// # Errors
 /// When this is not root, or iproute2 or nftables is missing.
-pub fn check_rights() -> anyhow::Result<()> {
+pub(super) fn check_rights() -> anyhow::Result<()> {
     let user = run("id -u")?;
     anyhow::ensure!(
         user.trim() == "0",

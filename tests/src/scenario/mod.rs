@@ -59,8 +59,6 @@ pub struct Broker {
 pub enum BrokerKind {
     /// Redis, for a node scope.
     Redis,
-    /// Valkey, for a node scope.
-    Valkey,
     /// Kafka, for a layer scope.
     Kafka,
 }
@@ -70,13 +68,11 @@ pub enum BrokerKind {
 pub struct Flow {
     /// Layer.
     pub layer: &'static str,
-    /// Its kind: edge, fog or cloud; empty = as the layer is named.
-    pub kind: &'static str,
     /// Node, unique; names the flow in the rows below.
     pub node: &'static str,
     /// Host that it runs on.
     pub host: &'static str,
-    /// Names of servers: Redis or Valkey is its node scope, Kafka its layer scope.
+    /// Names of servers: Redis is its node scope, Kafka its layer scope.
     pub brokers: Vec<&'static str>,
     /// DDS domain of its layer scope, on its host's network.
     pub layer_domain: Option<u16>,
@@ -88,8 +84,6 @@ pub struct Flow {
     pub bandwidth: &'static str,
     /// More keys of `flow`.
     pub keys: &'static str,
-    /// Further lines of the node file.
-    pub extra: &'static str,
 }
 
 /// A `blaze-probe` process, on the host of its flow.
@@ -154,8 +148,6 @@ pub enum Expect {
     Received(&'static str, &'static str, u64),
     /// The last message published came: the route is whole in the end, whatever happened on the way.
     Alive(&'static str, &'static str),
-    /// 99 of 100 take at most this long.
-    P99(&'static str, &'static str, Duration),
     /// In every flow every bridge has, in the end, `in = out + dropped + queued`.
     Balanced,
     /// No flow holds more in the end than a fifth of the time after the begin, but for this.

@@ -1,6 +1,6 @@
 //! Plays a scenario with real processes.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
@@ -65,7 +65,6 @@ impl Running {
     /// # Errors
     /// As [`run`].
     pub fn start(scenario: &Scenario) -> anyhow::Result<Self> {
-        check(scenario)?;
         let topology = Topology::build(&scenario.network)?;
         let mut running = Self {
             publishers: Vec::new(),
@@ -103,9 +102,7 @@ impl Running {
         let mut spec = FlowSpec::new(flow.layer, flow.node)
             .joined(DOMAIN)
             .inside(self.topology.host(flow.host)?, &peers);
-        spec.kind = flow.kind.to_owned();
         spec.limit_mbps = flow.limit_mbps;
-        spec.extra = flow.extra.to_owned();
         spec.bandwidth = flow.bandwidth.to_owned();
         spec.flow = flow.keys.to_owned();
         spec.layer_domain = flow.layer_domain;
@@ -177,17 +174,6 @@ impl Running {
     /// When there is none.
     pub fn link(&self, a: &str, b: &str) -> anyhow::Result<Link<'_>> {
         self.topology.link(a, b)
-    }
-
-    /// A server with Redis' or Valkey's protocol.
-    ///
-    /// # Errors
-    /// When there is none of that name.
-    pub fn redis(&self, name: &str) -> anyhow::Result<&RedisServer> {
-        match self.broker(name)? {
-            Server::Redis(redis) => Ok(redis),
-            Server::Kafka(_) => anyhow::bail!("{name} is a Kafka"),
-        }
     }
 
     /// What a consumer measured of a topic from a moment on.
@@ -399,27 +385,8 @@ impl Probe {
             duplicated: self.last(topic, "duplicated"),
             reordered: self.last(topic, "reordered"),
             latencies_ms,
-            heard_s: steps(&lines, topic, "received").last().map_or(0, |step| step.0),
-            reordered_s: steps(&lines, topic, "reordered"),
         }
     }
-}
-
-/// In which rows a number of a topic grew, and by how much; there is a row a second.
-fn steps(lines: &[String], topic: &str, field: &str) -> Vec<(usize, u64)> {
-    let mut before = 0;
-    let mut steps = Vec::new();
-    for (row, line) in lines.iter().enumerate() {
-        let Ok(value) = serde_json::from_str::<Value>(line) else {
-            continue;
-        };
-        let now = of_topic(&value, topic)[field].as_u64().unwrap_or(before);
-        if now > before {
-            steps.push((row, now - before));
-        }
-        before = now;
-    }
-    steps
 }
 
 /// Bridges that do not say where every message went.
@@ -455,33 +422,17 @@ fn dropped(flow: &FlowProcess) -> BTreeMap<String, u64> {
     all
 }
 
-/// Mistakes in the rows, before anything is started.
-fn check(scenario: &Scenario) -> anyhow::Result<()> {
-    let published = scenario.publishers.iter().flat_map(|service| &service.streams);
-    let mut topics = BTreeSet::new();
-    for stream in published {
-        anyhow::ensure!(topics.insert(stream.topic), "{} is published twice", stream.topic);
-    }
-    for stream in scenario.consumers.iter().flat_map(|service| &service.streams) {
-        anyhow::ensure!(topics.contains(stream.topic), "{} is published by nobody", stream.topic);
-    }
-    let late = scenario.faults.iter().find(|(at, _)| *at > scenario.duration);
-    anyhow::ensure!(late.is_none(), "{late:?} is after the end");
-    Ok(())
-}
-
 fn start_broker(broker: &Broker, host: &Host) -> anyhow::Result<Server> {
     let host = Some(host.clone());
-    let redis = |kind| {
-        let options = RedisOptions {
-            host: host.clone(),
-            ..RedisOptions::default()
-        };
-        RedisServer::start(kind, options).map(Server::Redis)
-    };
     let server = match broker.kind {
-        BrokerKind::Redis => redis(RedisKind::Redis),
-        BrokerKind::Valkey => redis(RedisKind::Valkey),
+        BrokerKind::Redis => RedisServer::start(
+            RedisKind::Redis,
+            RedisOptions {
+                host,
+                ..RedisOptions::default()
+            },
+        )
+        .map(Server::Redis),
         BrokerKind::Kafka => KafkaServer::start(KafkaOptions {
             host,
             ..KafkaOptions::default()

@@ -38,6 +38,14 @@ impl Endpoint {
         network::program(self.namespace(), program)
     }
 
+    /// Does something where the server is.
+    pub(super) fn inside<T: Send>(&self, act: impl FnOnce() -> anyhow::Result<T> + Send) -> anyhow::Result<T> {
+        match self.namespace() {
+            None => act(),
+            Some(namespace) => network::inside(namespace, act),
+        }
+    }
+
     fn namespace(&self) -> Option<&str> {
         self.host.as_ref().map(|host| host.namespace.as_str())
     }

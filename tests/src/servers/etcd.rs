@@ -1,6 +1,5 @@
 //! An etcd of one test or measurement: a cluster of one member, which syncs every write to the disk, as it does by default.
 
-use std::io::{Read as _, Write as _};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::process::Command;
@@ -11,11 +10,10 @@ use anyhow::Context as _;
 use super::endpoint::Endpoint;
 use super::process::{ServerProcess, output_within};
 use super::{installed, ports};
+use crate::admin::Admin;
 
 /// Measured: 0.9 s. The rest is for a machine that does much else.
 const START: Duration = Duration::from_secs(60);
-/// One look whether it answers.
-const LOOK: Duration = Duration::from_millis(500);
 /// Another process may take a port between our choice and the server's start.
 const PORT_ATTEMPTS: usize = 3;
 /// What etcd says when it has its ports.
@@ -83,7 +81,12 @@ impl EtcdServer {
             .args(&self.options.extra);
         self.process.spawn(command)?;
         // The log tells that it has the port: another server there would answer as well.
-        let ready = || self.process.has_logged(LISTENS) && self.is_healthy();
+        let admin = Admin {
+            address: self.address(),
+            namespace: None,
+        };
+        let is_healthy = || admin.json("/health").is_ok_and(|answer| answer["health"] == "true");
+        let ready = || self.process.has_logged(LISTENS) && is_healthy();
         self.process.wait_ready(START, ready)?;
         Ok(())
     }
@@ -92,25 +95,6 @@ impl EtcdServer {
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         SocketAddr::from((self.endpoint.ip(), self.endpoint.port))
-    }
-
-    /// Whether it takes writes now.
-    #[must_use]
-    pub fn is_healthy(&self) -> bool {
-        self.health().is_ok_and(|answer| answer.contains("\"health\":\"true\""))
-    }
-
-    fn health(&self) -> anyhow::Result<String> {
-        let mut stream = self.endpoint.connect(LOOK)?;
-        stream.set_read_timeout(Some(LOOK))?;
-        write!(
-            stream,
-            "GET /health HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n",
-            self.address()
-        )?;
-        let mut answer = String::new();
-        stream.take(64 * 1024).read_to_string(&mut answer)?;
-        Ok(answer)
     }
 
     /// What it calls itself: `etcd Version: 3.4.23`.
@@ -123,23 +107,6 @@ impl EtcdServer {
         let output = output_within(command, START)?;
         let text = String::from_utf8_lossy(&output.stdout);
         Ok(text.lines().next().context("etcd says no version")?.to_owned())
-    }
-
-    /// SIGKILL, and its end. What was acknowledged stays for [`EtcdServer::restart`].
-    ///
-    /// # Errors
-    /// When the system refuses.
-    pub fn kill(&self) -> anyhow::Result<()> {
-        self.process.kill()
-    }
-
-    /// Kills it if it runs, starts it with the same ports and data, and waits until it answers.
-    ///
-    /// # Errors
-    /// As [`EtcdServer::start`].
-    pub fn restart(&self) -> anyhow::Result<()> {
-        self.kill()?;
-        self.spawn()
     }
 
     /// Process id of the server while it runs, for measuring it.

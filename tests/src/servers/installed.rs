@@ -27,29 +27,8 @@ pub(super) fn path(relative: &str) -> anyhow::Result<PathBuf> {
 /// The lines `NAME=VALUE` of the file that `scripts/services start` writes; none when there is no such file.
 pub(super) fn environment(name: &str) -> Option<String> {
     let text = std::fs::read_to_string(folder().join("env")).ok()?;
-    value_of(&text, name)
-}
-
-fn value_of(text: &str, name: &str) -> Option<String> {
     text.lines()
         .filter_map(|line| line.trim().split_once('='))
         .find(|(key, value)| key.trim() == name && !value.trim().is_empty())
         .map(|(_, value)| value.trim().to_owned())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn values_are_found_by_whole_name() {
-        let text =
-            "# own servers\nBLAZE_TEST_REDIS_URL_OLD=x\nBLAZE_TEST_REDIS_URL = redis://127.0.0.1:1?a=b \nEMPTY=\n";
-        assert_eq!(
-            value_of(text, "BLAZE_TEST_REDIS_URL").as_deref(),
-            Some("redis://127.0.0.1:1?a=b")
-        );
-        assert_eq!(value_of(text, "EMPTY"), None);
-        assert_eq!(value_of(text, "MISSING"), None);
-    }
 }

@@ -4,14 +4,19 @@ use std::path::Path;
 use std::time::Duration;
 
 use anyhow::Context as _;
+use rdkafka::ClientConfig;
+use rdkafka::consumer::{BaseConsumer, Consumer as _};
+use rdkafka::metadata::{MetadataPartition, MetadataTopic};
 
 use super::endpoint::Endpoint;
 use super::process::ServerProcess;
-use super::{installed, kafka_wire, ports};
+use super::{installed, ports};
 use crate::network::Host;
 
 /// Measured: 3 s, some seconds more after a kill. The rest is for a machine that does much else.
 const START: Duration = Duration::from_secs(60);
+/// One look whether it can be used.
+const LOOK: Duration = Duration::from_secs(1);
 /// Another process may take a port between our choice and the broker's start.
 const PORT_ATTEMPTS: usize = 3;
 
@@ -135,14 +140,11 @@ impl KafkaServer {
     }
 
     /// Waits until the broker lists itself and every partition has a leader.
-    ///
-    /// # Errors
-    /// When it ends, or is not ready within a minute; with the last lines of its log.
-    pub fn wait_ready(&self) -> anyhow::Result<()> {
+    fn wait_ready(&self) -> anyhow::Result<()> {
         // The cluster tells that it has the port: another broker there would answer as well.
         let ready = || {
-            kafka_wire::metadata(&self.endpoint)
-                .is_ok_and(|metadata| metadata.cluster == self.cluster && metadata.is_ready())
+            let leaders = leaders(&self.endpoint, LOOK);
+            leaders.is_ok_and(|(cluster, leaders)| cluster == self.cluster && leaders.iter().all(|leader| *leader >= 0))
         };
         self.process.wait_ready(START, ready)?;
         Ok(())
@@ -173,8 +175,7 @@ impl KafkaServer {
         self.process.freeze()
     }
 
-    /// SIGCONT after [`KafkaServer::freeze`]. The broker may need seconds to take itself for alive again: then
-    /// [`KafkaServer::wait_ready`].
+    /// SIGCONT after [`KafkaServer::freeze`]. The broker may need seconds to take itself for alive again.
     ///
     /// # Errors
     /// When it does not run.
@@ -201,14 +202,6 @@ impl KafkaServer {
             }
         }
         Ok(bytes)
-    }
-
-    /// Resident memory in KiB.
-    ///
-    /// # Errors
-    /// When it does not run.
-    pub fn rss_kib(&self) -> anyhow::Result<u64> {
-        self.process.rss_kib()
     }
 }
 
@@ -241,25 +234,19 @@ fn new_cluster_id() -> String {
     format!("{:0>22}", &name[start..])
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn cluster_identities_differ_and_have_the_length_of_kafkas() {
-        let (one, other) = (new_cluster_id(), new_cluster_id());
-        assert_ne!(one, other);
-        assert_eq!((one.len(), other.len()), (22, 22));
-        assert_eq!(
-            with_cluster_id("version=1\ncluster.id=x\nnode.id=1\n", "y"),
-            "version=1\ncluster.id=y\nnode.id=1\n"
-        );
-    }
-
-    #[test]
-    fn the_template_has_a_place_for_all_that_is_filled_in() {
-        for word in ["PLAINTEXT://127.0.0.1:", "@PORT@", "@CONTROLLER_PORT@", "@DATA@"] {
-            assert!(PROPERTIES.contains(word), "{word}");
-        }
-    }
+/// The cluster that a broker belongs to, and the leaders of all partitions; −1 where there is none, and writing fails for now.
+///
+/// # Errors
+/// When no broker answers in time.
+pub(super) fn leaders(broker: &Endpoint, within: Duration) -> anyhow::Result<(String, Vec<i32>)> {
+    broker.inside(|| {
+        let mut settings = ClientConfig::new();
+        let settings = settings.set("bootstrap.servers", format!("{}:{}", broker.ip(), broker.port));
+        let client: BaseConsumer = settings.set("log_level", "2").create()?;
+        let metadata = client.fetch_metadata(None, within)?;
+        anyhow::ensure!(!metadata.brokers().is_empty(), "no broker takes part");
+        let partitions = metadata.topics().iter().flat_map(MetadataTopic::partitions);
+        let cluster = client.client().fetch_cluster_id(within).context("no cluster")?;
+        Ok((cluster, partitions.map(MetadataPartition::leader).collect()))
+    })
 }

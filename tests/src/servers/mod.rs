@@ -12,7 +12,6 @@ mod endpoint;
 mod etcd;
 mod installed;
 mod kafka;
-mod kafka_wire;
 mod mongo;
 mod mongo_wire;
 mod ports;

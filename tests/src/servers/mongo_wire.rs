@@ -120,20 +120,3 @@ fn number(stream: &mut TcpStream) -> anyhow::Result<i32> {
     stream.read_exact(&mut bytes)?;
     Ok(i32::from_le_bytes(bytes))
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_request_has_its_length_and_one_section() {
-        let request = request(&doc! { "hello": 1, "$db": "admin" }).unwrap();
-        assert_eq!(request[..4], i32::try_from(request.len()).unwrap().to_le_bytes());
-        assert_eq!(request[12..16], OP_MSG.to_le_bytes());
-        assert_eq!(request[16..21], [0; 5]);
-        assert_eq!(
-            Document::from_reader(&request[21..]).unwrap().get_str("$db").unwrap(),
-            "admin"
-        );
-    }
-}

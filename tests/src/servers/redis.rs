@@ -227,14 +227,6 @@ impl RedisServer {
         command.args(arguments);
         command
     }
-
-    /// Resident memory in KiB.
-    ///
-    /// # Errors
-    /// When it does not run.
-    pub fn rss_kib(&self) -> anyhow::Result<u64> {
-        self.process.rss_kib()
-    }
 }
 
 fn configuration(

@@ -4,12 +4,16 @@
 //! this process starts for itself. An address that is named but does not answer is an error, never passed over.
 
 use std::sync::OnceLock;
+use std::time::Duration;
 
 use super::endpoint::Endpoint;
 use super::{
-    KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer, installed, kafka_wire,
+    KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer, installed, kafka,
     mongo, mongo_wire, redis,
 };
+
+/// How long a server may take to answer on a busy machine.
+const BUSY: Duration = Duration::from_secs(10);
 
 type Once<T> = OnceLock<Result<T, String>>;
 
@@ -85,7 +89,7 @@ fn kafka_at(name: &str, own: &'static Once<KafkaServer>) -> anyhow::Result<Strin
         return Ok(started(own, || KafkaServer::start(KafkaOptions::default()))?.bootstrap());
     };
     let port = address.strip_prefix("127.0.0.1:").and_then(|port| port.parse().ok());
-    let answers = port.is_none_or(|port| kafka_wire::metadata(&Endpoint::loopback(port)).is_ok());
+    let answers = port.is_none_or(|port| kafka::leaders(&Endpoint::loopback(port), BUSY).is_ok());
     anyhow::ensure!(answers, "{}", silent(name, &address));
     Ok(address)
 }

@@ -1,7 +1,6 @@
 //! One direction of a link: what happens to a packet, and when. Sans-io.
 
-use std::cmp::Ordering;
-use std::collections::{BinaryHeap, VecDeque};
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use rand::rngs::StdRng;
@@ -27,10 +26,9 @@ pub struct Direction<P> {
     /// When the last packet that has begun to leave has left.
     free_at: Option<Instant>,
     waiting: VecDeque<Waiting<P>>,
-    flying: BinaryHeap<Flying<P>>,
+    flying: VecDeque<Flying<P>>,
     /// The latest moment at which a packet arrives at the other end.
     last_due: Option<Instant>,
-    begun: u64,
     losses: StdRng,
     wander: Wander,
     counts: DirectionStats,
@@ -46,7 +44,6 @@ struct Waiting<P> {
 #[derive(Debug)]
 struct Flying<P> {
     due: Instant,
-    number: u64,
     bytes: u64,
     packet: P,
 }
@@ -60,9 +57,8 @@ impl<P> Direction<P> {
             cut: false,
             free_at: None,
             waiting: VecDeque::new(),
-            flying: BinaryHeap::new(),
+            flying: VecDeque::new(),
             last_due: None,
-            begun: 0,
             losses: StdRng::seed_from_u64(seed),
             // Other numbers than those of the losses: jitter must not follow loss.
             wander: Wander::new(seed ^ 0x9e37_79b9_7f4a_7c15),
@@ -83,7 +79,7 @@ impl<P> Direction<P> {
     pub fn cut(&mut self) {
         self.cut = true;
         let waiting = self.waiting.drain(..).map(|packet| packet.bytes);
-        for bytes in waiting.chain(self.flying.drain().map(|packet| packet.bytes)) {
+        for bytes in waiting.chain(self.flying.drain(..).map(|packet| packet.bytes)) {
             self.counts.dropped.cut.add(bytes);
         }
         self.counts.queue = Tally::default();
@@ -126,10 +122,10 @@ impl<P> Direction<P> {
     /// The next packet that has arrived at the other end.
     pub fn pop(&mut self, now: Instant) -> Option<P> {
         self.advance(now);
-        if self.flying.peek()?.due > now {
+        if self.flying.front()?.due > now {
             return None;
         }
-        let arrived = self.flying.pop()?;
+        let arrived = self.flying.pop_front()?;
         self.counts.flying.subtract(arrived.bytes);
         self.counts.out.add(arrived.bytes);
         Some(arrived.packet)
@@ -138,7 +134,7 @@ impl<P> Direction<P> {
     /// When to call [`Direction::pop`] again; `None` while nothing is on the way.
     #[must_use]
     pub fn next_due(&self) -> Option<Instant> {
-        let flying = self.flying.peek().map(|packet| packet.due);
+        let flying = self.flying.front().map(|packet| packet.due);
         // The delay of a packet that waits is not drawn yet: this is the least it can be.
         let waiting = self.waiting.front().map(|packet| {
             let begin = self.free_at.map_or(packet.came, |free_at| free_at.max(packet.came));
@@ -176,33 +172,24 @@ impl<P> Direction<P> {
             self.counts.dropped.loss.add(packet.bytes);
             return;
         }
-        let mut due = left + self.delay(left);
-        if !self.shape.reorder {
-            due = self.last_due.map_or(due, |last| due.max(last));
-        }
-        self.last_due = self.last_due.max(Some(due));
-        self.begun += 1;
+        let due = left + self.delay(left);
+        // The order is kept, also where the delay gets shorter.
+        let due = self.last_due.map_or(due, |last| due.max(last));
+        self.last_due = Some(due);
         self.counts.flying.add(packet.bytes);
-        self.flying.push(Flying {
+        self.flying.push_back(Flying {
             due,
-            number: self.begun,
             bytes: packet.bytes,
             packet: packet.packet,
         });
     }
 
     fn delay(&mut self, at: Instant) -> Duration {
-        let Shape {
-            delay, jitter, reorder, ..
-        } = self.shape;
+        let Shape { delay, jitter, .. } = self.shape;
         if jitter.is_zero() {
             return delay;
         }
-        let value = if reorder {
-            self.wander.jump()
-        } else {
-            self.wander.at(at, jitter)
-        };
+        let value = self.wander.at(at, jitter);
         let offset = jitter.mul_f64(value.abs());
         if value < 0.0 {
             delay.saturating_sub(offset)
@@ -220,27 +207,6 @@ impl<P> Direction<P> {
         Duration::from_nanos(u64::try_from(nanos).unwrap_or(u64::MAX))
     }
 }
-
-/// The earliest is the greatest, as the heap wants it; then the first that began.
-impl<P> Ord for Flying<P> {
-    fn cmp(&self, other: &Self) -> Ordering {
-        (other.due, other.number).cmp(&(self.due, self.number))
-    }
-}
-
-impl<P> PartialOrd for Flying<P> {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl<P> PartialEq for Flying<P> {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other) == Ordering::Equal
-    }
-}
-
-impl<P> Eq for Flying<P> {}
 
 #[cfg(test)]
 #[path = "direction_tests.rs"]

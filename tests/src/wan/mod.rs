@@ -13,7 +13,7 @@ mod shape;
 mod stats;
 mod wander;
 
-pub use command::{Command, CommandError, Ways};
+pub use command::{Command, Ways};
 pub use direction::{Direction, MAX_HELD_BYTES};
 pub use shape::{Change, Shape};
 pub use stats::{DirectionStats, Dropped, LinkStats, Tally};

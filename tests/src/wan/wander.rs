@@ -35,7 +35,7 @@ impl Wander {
     }
 
     /// A value that does not depend on those before.
-    pub(super) fn jump(&mut self) -> f64 {
+    fn jump(&mut self) -> f64 {
         self.random.random_range(-1.0..=1.0)
     }
 

@@ -4,14 +4,19 @@
 
 use std::process::{Child, Output, Stdio};
 
-use blaze_tests::network::{Lan, program};
+use blaze_tests::network::{Host, Plan, Topology, program};
 use blaze_tests::process::binary;
 
+/// Hosts on one switch, without multicast.
+fn lan(hosts: &[&str]) -> Topology {
+    Topology::build(&Plan::new().with_hosts(hosts).with_unicast_lan(hosts)).unwrap()
+}
+
 /// One end of the link on a host of the network; its name is that of a flow.
-fn start(lan: &Lan, host: usize, arguments: &str) -> Child {
-    program(Some(&lan.names[host]), binary("blaze-testbed").unwrap())
+fn start(host: &Host, arguments: &str) -> Child {
+    program(Some(&host.namespace), binary("blaze-testbed").unwrap())
         .arg("link-peer")
-        .arg(format!("listen={}", lan.addresses[host]))
+        .arg(format!("listen={}", host.address))
         .args(arguments.split_whitespace())
         .stdout(Stdio::piped())
         .spawn()
@@ -45,12 +50,13 @@ fn number(log: &str, word: &str) -> f64 {
 
 #[test]
 fn three_flows_meet_with_one_seed() {
-    let lan = Lan::new(3).unwrap();
-    let seed = &lan.addresses[1];
+    let network = lan(&["robot", "fog", "cloud"]);
+    let host = |name| network.host(name).unwrap();
+    let seed = host("fog").address;
     // Two know the third; they must learn of each other from it.
-    let fog = start(&lan, 1, "name=fog/b seconds=5");
-    let robot = start(&lan, 0, &format!("name=edge/a seconds=5 peers={seed}"));
-    let cloud = start(&lan, 2, &format!("name=cloud/c seconds=5 peers={seed}"));
+    let fog = start(host("fog"), "name=fog/b seconds=5");
+    let robot = start(host("robot"), &format!("name=edge/a seconds=5 peers={seed}"));
+    let cloud = start(host("cloud"), &format!("name=cloud/c seconds=5 peers={seed}"));
     let logs = [robot, fog, cloud].map(|child| text(child.wait_with_output().unwrap()));
     let names = ["edge/a/1", "fog/b/1", "cloud/c/1"];
     for (place, log) in logs.iter().enumerate() {
@@ -68,12 +74,12 @@ fn three_flows_meet_with_one_seed() {
 
 #[test]
 fn computed_bytes_are_those_of_the_interface_and_nothing_fragments() {
-    let lan = Lan::new(2).unwrap();
-    let seed = &lan.addresses[1];
-    let fog = start(&lan, 1, "name=fog/b seconds=7");
+    let network = lan(&["robot", "fog"]);
+    let host = |name| network.host(name).unwrap();
+    let seed = host("fog").address;
+    let fog = start(host("fog"), "name=fog/b seconds=7");
     let robot = start(
-        &lan,
-        0,
+        host("robot"),
         &format!("name=edge/a seconds=6 peers={seed} interface=v0 send=1296x2000@1000"),
     );
     let (robot, fog) = (

@@ -47,7 +47,6 @@ pub(super) fn flow(
 ) -> Flow {
     Flow {
         layer,
-        kind: "",
         node,
         host: node,
         brokers: vec![broker],
@@ -56,7 +55,6 @@ pub(super) fn flow(
         limit_mbps: 100.0,
         bandwidth: "",
         keys: "",
-        extra: "",
     }
 }
 
@@ -71,6 +69,33 @@ pub(super) fn service(name: &'static str, flow: &'static str, broker: &'static s
 
 pub(super) fn broker(name: &'static str, host: &'static str, kind: BrokerKind) -> Broker {
     Broker { name, host, kind }
+}
+
+/// A robot with a Redis, a cloud with some broker, one link between them, and streams from the one to the other; without faults
+/// or an end.
+pub(super) fn one_link(shape: Shape, cloud: BrokerKind, limit_mbps: f64, streams: Vec<Stream>) -> Scenario {
+    let flow = |layer, node, broker, peers: &[&'static str]| Flow {
+        limit_mbps,
+        ..flow(layer, node, broker, None, peers)
+    };
+    Scenario {
+        name: "a robot and a cloud",
+        network: Plan::two_hosts("robot-1", "cloud-1", shape),
+        brokers: vec![
+            broker("redis", "robot-1", BrokerKind::Redis),
+            broker("cloud-broker", "cloud-1", cloud),
+        ],
+        flows: vec![
+            flow("edge", "robot-1", "redis", &["cloud-1"]),
+            flow("cloud", "cloud-1", "cloud-broker", &[]),
+        ],
+        publishers: vec![service("driver", "robot-1", "redis", streams.clone())],
+        consumers: vec![service("recorder", "cloud-1", "cloud-broker", streams)],
+        faults: vec![],
+        duration: Duration::ZERO,
+        settle: Duration::ZERO,
+        expect: vec![],
+    }
 }
 
 /// Robots with a Redis each meet over DDS in the edge; fog and cloud have a Kafka each, the fog two flows over it.
@@ -125,7 +150,7 @@ pub(super) fn three_layers(image_hz: f64) -> Scenario {
             service("pilot", "robot-1", "redis-1", vec![commands, map]),
         ],
         faults: vec![],
-        duration: Duration::from_secs(if long() { 120 } else { 10 }),
+        duration: Duration::from_secs(if long() { 120 } else { 6 }),
         settle: Duration::from_secs(10),
         expect: whole(),
     }

@@ -13,5 +13,6 @@ mod cuts;
 mod dds_namespaces;
 mod layers;
 mod long;
+mod loss;
 mod scenario;
 mod support;

@@ -8,7 +8,6 @@ use std::time::{Duration, Instant};
 
 use blaze_tests::network::{Host, Link, inside};
 use blaze_tests::process::hurry;
-use parking_lot::Mutex;
 
 /// How long a reader waits before it looks whether it shall end.
 const READ: Duration = Duration::from_millis(50);
@@ -28,89 +27,42 @@ pub(crate) fn socket(host: &Host) -> anyhow::Result<UdpSocket> {
     })
 }
 
-/// Payload of a packet: its number, and when it was sent in ns after `base`.
-fn payload(base: Instant, number: u64, bytes: usize) -> Vec<u8> {
-    let nanos = base.elapsed().as_nanos() as u64;
-    let mut payload = [number.to_le_bytes(), nanos.to_le_bytes()].concat();
-    payload.resize(bytes.max(16), 0);
-    payload
-}
-
-/// A packet that came.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Arrival {
-    pub(crate) number: u64,
-    pub(crate) took: Duration,
-}
-
 /// Takes packets on a host until it is dropped.
 pub(crate) struct Sink {
     pub(crate) address: SocketAddr,
-    base: Instant,
     stop: Arc<AtomicBool>,
-    arrivals: Arc<Mutex<Vec<Arrival>>>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Sink {
-    pub(crate) fn start(host: &Host) -> anyhow::Result<Self> {
-        Self::with(host, false)
-    }
-
-    /// Sends each packet back.
-    pub(crate) fn echo(host: &Host) -> anyhow::Result<Self> {
-        Self::with(host, true)
-    }
-
-    fn with(host: &Host, echo: bool) -> anyhow::Result<Self> {
+    /// Sends each packet back, if wanted.
+    pub(crate) fn start(host: &Host, echo: bool) -> anyhow::Result<Self> {
         let socket = socket(host)?;
         let address = socket.local_addr()?;
-        let (base, stop) = (Instant::now(), Arc::new(AtomicBool::new(false)));
-        let arrivals = Arc::<Mutex<Vec<Arrival>>>::default();
-        let (stopped, kept) = (Arc::clone(&stop), Arc::clone(&arrivals));
+        let stop = Arc::new(AtomicBool::new(false));
+        let stopped = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
             hurry();
             let mut buffer = [0; 2_000];
             while !stopped.load(Ordering::Relaxed) {
-                let Ok((length, from)) = socket.recv_from(&mut buffer) else {
-                    continue;
-                };
-                let now = base.elapsed();
-                if echo {
+                if let Ok((length, from)) = socket.recv_from(&mut buffer)
+                    && echo
+                {
                     let _ = socket.send_to(&buffer[..length], from);
                 }
-                let word = |at: usize| u64::from_le_bytes(buffer[at..at + 8].try_into().unwrap_or_default());
-                kept.lock().push(Arrival {
-                    number: word(0),
-                    took: now.saturating_sub(Duration::from_nanos(word(8))),
-                });
             }
         });
         Ok(Self {
             address,
-            base,
             stop,
-            arrivals,
             thread: Some(thread),
         })
-    }
-
-    pub(crate) fn arrivals(&self) -> Vec<Arrival> {
-        self.arrivals.lock().clone()
-    }
-
-    pub(crate) fn count(&self) -> usize {
-        self.arrivals.lock().len()
-    }
-
-    pub(crate) fn clear(&self) {
-        self.arrivals.lock().clear();
     }
 
     /// Sends packets of so many payload bytes from a socket, at a pace.
     pub(crate) fn send(&self, from: &UdpSocket, count: u64, bytes: usize, gap: Duration) -> anyhow::Result<()> {
         hurry();
-        let begin = Instant::now();
+        let (begin, payload) = (Instant::now(), vec![0; bytes]);
         for number in 0..count {
             let due = begin + gap.mul_f64(number as f64);
             // Shorter waits than the system keeps are made up for by several packets at once.
@@ -118,7 +70,7 @@ impl Sink {
             if left > Duration::from_micros(500) {
                 std::thread::sleep(left);
             }
-            from.send_to(&payload(self.base, number, bytes), self.address)?;
+            from.send_to(&payload, self.address)?;
         }
         Ok(())
     }
@@ -133,34 +85,21 @@ impl Drop for Sink {
     }
 }
 
-/// Round trips of small packets to a host that echoes, one after another; those that do not come back are left out.
+/// Sorted round trips of small packets to a host that echoes, one after another; those that do not come back are left out.
 pub(crate) fn ping(from: &UdpSocket, to: &Sink, count: usize) -> anyhow::Result<Vec<Duration>> {
     let mut trips = Vec::new();
     hurry();
     from.set_read_timeout(Some(Duration::from_millis(500)))?;
-    for number in 0..count {
+    for _ in 0..count {
         let mut buffer = [0; 100];
         let begin = Instant::now();
-        from.send_to(&payload(to.base, number as u64, 64), to.address)?;
+        from.send_to(&[0; 64], to.address)?;
         if from.recv(&mut buffer).is_ok() {
             trips.push(begin.elapsed());
         }
     }
     trips.sort_unstable();
     Ok(trips)
-}
-
-/// The value that a share (0 to 1) of sorted ones does not exceed, in ms; 0 without any.
-pub(crate) fn percentile_ms(sorted: &[Duration], share: f64) -> f64 {
-    let rank = ((share * sorted.len() as f64).ceil() as usize).max(1);
-    sorted.get(rank - 1).map_or(0.0, |value| value.as_secs_f64() * 1e3)
-}
-
-/// Sorted times of flight.
-pub(crate) fn flights(sink: &Sink) -> Vec<Duration> {
-    let mut all: Vec<Duration> = sink.arrivals().iter().map(|arrival| arrival.took).collect();
-    all.sort_unstable();
-    all
 }
 
 /// Bytes that an interface has received, as the kernel of that host counts.

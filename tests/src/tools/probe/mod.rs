@@ -1,30 +1,31 @@
-//! A service which publishes or listens, and counts: what `blaze demo` does not play. Either it brings a flow of its own
-//! in the same process (`--listen`), or it is an ordinary service on a broker that has one (`--redis`, `--kafka`). Tests run
-//! several of them on one machine in network namespaces; since they share a clock, the latencies are true.
+//! A service which publishes or listens, and counts. Tests run several of them on one machine, also in network namespaces;
+//! since they share a clock, the latencies are true.
 
 mod ear;
-mod site;
 mod source;
 
-use std::net::Ipv4Addr;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::str::FromStr;
+use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::{LayerName, NodeName, Reliability, ServiceName, TopicName};
+use anyhow::Context as _;
+use blaze_brokers::{Broker, Health, open_layer, open_node};
+use blaze_domain::node_file::{KafkaBroker, LayerBroker, NodeBroker, RedisBroker};
+use blaze_domain::{LayerName, NodeName, Reliability, Scope, ServiceName, TopicName};
 use blaze_runtime::logs::{self, LogFormat};
+use blaze_sdk::{ServiceManager, ServiceOptions};
 use clap::{Parser, ValueEnum};
 
-use self::site::Site;
-
+/// How long a server may take to answer.
+const START: Duration = Duration::from_secs(30);
 /// From this size on a topic is large.
 pub(crate) const LARGE_BYTES: usize = 65_536;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Role {
-    /// With a flow of its own: edge/probe-1
     Publish,
-    /// With a flow of its own: cloud/probe-2
     Listen,
 }
 
@@ -32,31 +33,19 @@ pub(crate) enum Role {
 #[derive(Debug, Clone, Parser)]
 pub(crate) struct Options {
     pub(crate) role: Role,
-    /// With a flow of its own: address of the one interface that is used
-    #[arg(long, required_unless_present_any = ["redis", "kafka"])]
-    pub(crate) listen: Option<Ipv4Addr>,
-    /// The other host
-    #[arg(long)]
-    pub(crate) peer: Option<Ipv4Addr>,
-    #[arg(long, default_value_t = 0)]
-    pub(crate) domain: u16,
-    #[arg(long, default_value_t = 160.0)]
-    pub(crate) limit_mbps: f64,
-    /// On the Redis of a node scope instead: its URL
-    #[arg(long, conflicts_with_all = ["listen", "kafka"], requires = "layer", requires = "node")]
+    /// URL of the Redis of a node scope
+    #[arg(long, required_unless_present = "kafka")]
     pub(crate) redis: Option<String>,
-    /// On the Kafka of a layer scope instead: HOST:PORT
-    #[arg(long, conflicts_with = "listen", requires = "layer", requires = "node")]
+    /// HOST:PORT of the Kafka of a layer scope
+    #[arg(long, conflicts_with = "redis")]
     pub(crate) kafka: Option<String>,
     /// Before all names on that server
-    #[arg(long, default_value = "", conflicts_with = "listen")]
+    #[arg(long, default_value = "")]
     pub(crate) prefix: String,
-    /// Layer of the flow
     #[arg(long)]
-    pub(crate) layer: Option<LayerName>,
-    /// Node of the service
+    pub(crate) layer: LayerName,
     #[arg(long)]
-    pub(crate) node: Option<NodeName>,
+    pub(crate) node: NodeName,
     #[arg(long, default_value = "probe")]
     pub(crate) service: ServiceName,
     /// `NAME,reliable|best_effort,HZ,BYTES,LIFESPAN_MS[,@FILE]`; without a file of payloads they are noise
@@ -116,12 +105,56 @@ impl FromStr for Topic {
 #[tokio::main]
 pub(crate) async fn run(options: &Options) -> anyhow::Result<()> {
     let _logs = logs::init("warn", LogFormat::Text)?;
-    let site = Site::start(options).await?;
-    eprintln!("ready node={} admin={}", site.node, site.admin);
+    let broker = open(options)?;
+    let mut status = broker.status();
+    tokio::time::timeout(START, status.wait_for(|status| status.health == Health::Up))
+        .await
+        .context("the broker does not answer")??;
+    let scope = if options.redis.is_some() {
+        Scope::Node
+    } else {
+        Scope::Layer
+    };
+    let service = ServiceOptions::new(
+        options.layer.clone(),
+        options.service.clone(),
+        Arc::clone(&broker),
+        scope,
+    );
+    let service = ServiceManager::start(service.on_node(options.node.clone())).await?;
+    eprintln!("ready node={} ", options.node);
     match options.role {
-        Role::Publish => source::publish(&site.service, options).await?,
-        Role::Listen => ear::listen(&site.service, options).await?,
+        Role::Publish => source::publish(&service, options).await?,
+        Role::Listen => ear::listen(&service, options).await?,
     }
-    site.end().await;
+    // Withdraws what was leased, and delivers what was taken.
+    service.shutdown().await;
+    broker.close().await;
     Ok(())
+}
+
+fn open(options: &Options) -> anyhow::Result<Arc<dyn Broker>> {
+    let (role, prefix) = (blaze_brokers::Role::Service, options.prefix.clone());
+    let broker = match (&options.redis, &options.kafka) {
+        (Some(url), _) => {
+            let section = RedisBroker {
+                url: url.clone().into(),
+                prefix,
+                user: None,
+                password_file: None,
+                tls: None,
+            };
+            open_node(&NodeBroker::Redis(section), &role)?
+        }
+        (None, Some(bootstrap)) => {
+            let section = KafkaBroker {
+                bootstrap: vec![bootstrap.clone()],
+                prefix,
+                properties: BTreeMap::new(),
+            };
+            open_layer(&LayerBroker::Kafka(section), &role)?
+        }
+        (None, None) => anyhow::bail!("no broker is named"),
+    };
+    Ok(broker)
 }

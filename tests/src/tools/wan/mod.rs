@@ -25,8 +25,8 @@ use self::forward::Line;
 
 /// One emulated IP link between two network namespaces.
 ///
-/// Commands on stdin: `set WAY NAME VALUE …`, `cut WAY`, `heal WAY`, `stats`. WAY is a>b, b>a or both. Names: delay and
-/// jitter in ms, reorder on|off, loss 0 to 1, rate in bit/s or none, queue and mtu in bytes; k, M and G are powers of 1000.
+/// Commands on stdin, each a line of JSON: `{"set":["both",[{"loss":0.01},{"rate":5000000}]]}`, `{"cut":"forward"}`,
+/// `{"heal":"forward"}`, `"stats"`.
 #[derive(Debug, Parser)]
 pub(crate) struct Options {
     /// Namespace at one end, as `ip netns list` names it
@@ -110,7 +110,7 @@ impl Link {
 
     fn obey(&self, command: &Command) -> anyhow::Result<serde_json::Value> {
         match command {
-            Command::Set { ways, changes } => self.lines(*ways).iter().for_each(|line| line.change(changes)),
+            Command::Set(ways, changes) => self.lines(*ways).iter().for_each(|line| line.change(changes)),
             Command::Cut(ways) => self.lines(*ways).iter().for_each(|line| line.cut()),
             Command::Heal(ways) => self.lines(*ways).iter().for_each(|line| line.heal()),
             Command::Stats => {

@@ -3,12 +3,14 @@
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use blaze_tests::process::Process;
-use blaze_tests::within;
+use blaze_tests::flow::free_domain;
+use blaze_tests::process::{Process, Signal};
+use blaze_tests::{wait, within};
 use serde_json::Value;
 
+const DEADLINE: Duration = Duration::from_secs(30);
 const TOPICS: [&str; 3] = ["imu/data", "jackal_velocity_controller/odom", "camera/image_raw"];
 
 struct Run {
@@ -49,7 +51,7 @@ fn milliseconds(value: &Value) -> Duration {
 #[test]
 fn recorded_data_finds_its_way_from_the_edge_to_the_cloud() {
     // Ten seconds are the shortest with changes of the configuration.
-    let seconds = if blaze_tests::long() { "30s" } else { "12s" };
+    let seconds = if blaze_tests::long() { "30s" } else { "10s" };
     let run = demo(&["--duration", seconds]);
     assert_eq!(run.code, Some(0), "{}", run.tail);
     assert_eq!(run.summary["ok"], true, "{}", run.summary);
@@ -122,7 +124,7 @@ fn recorded_data_finds_its_way_from_the_edge_to_the_cloud() {
 #[test]
 fn a_part_of_the_nodes_and_a_short_run_change_nothing_and_say_so() {
     // A part of the nodes looks for the others, and those of another demo on this host have the same names.
-    let domain = format!("brokers.inter.dds.domain={}", blaze_tests::flow::free_domain().unwrap());
+    let domain = format!("brokers.inter.dds.domain={}", free_domain().unwrap());
     for (arguments, why) in [
         (
             &["--only", "robot-1", "--duration", "1s", "--set", &domain][..],
@@ -174,7 +176,7 @@ fn another_recording_works_alike() {
     let path = folder.path().join("other.mcap");
     write_recording(&path);
     let path: Cow<'_, str> = path.to_string_lossy();
-    let run = demo(&["--duration", "8s", "--record", &path]);
+    let run = demo(&["--duration", "6s", "--record", &path]);
     assert_eq!(run.code, Some(0), "{}", run.tail);
     let topics = run.summary["topics"].as_array().unwrap();
     for topic in ["chatter", "scan"] {
@@ -188,5 +190,56 @@ fn another_recording_works_alike() {
             (&Value::from(0), &Value::from(0)),
             "{row}"
         );
+    }
+}
+
+#[test]
+fn what_cannot_be_played_ends_with_its_code_and_reason() {
+    for (arguments, code, why) in [
+        (&["--listen", "192.0.2.1"][..], 2, "--listen 192.0.2.1"),
+        (
+            &["--only", "robot-1", "--record", "/no/such/file"],
+            1,
+            "/no/such/file: ",
+        ),
+    ] {
+        let mut process = Process::start("blaze", &[&["demo"][..], arguments].concat(), None).unwrap();
+        assert_eq!(process.exit(DEADLINE).unwrap(), Some(code), "{}", process.tail());
+        assert!(process.tail().contains(why), "{}", process.tail());
+    }
+}
+
+#[test]
+fn signals_end_a_run_at_once_with_its_summary() {
+    for signal in [Signal::INT, Signal::TERM] {
+        let set = format!("brokers.inter.dds.domain={}", free_domain().unwrap());
+        let arguments = [
+            "demo",
+            "--only",
+            "robot-1,fog-1",
+            "--duration",
+            "10m",
+            "-o",
+            "json",
+            "--set",
+            &set,
+        ];
+        let mut demo = Process::start("blaze", &arguments, None).unwrap();
+        // The first row comes when it has begun: before that there is nothing to sum up.
+        let begun = || demo.stdout().first().is_some_and(|line| line.contains("\"row\""));
+        wait::until("the first row", DEADLINE, begun, || demo.tail()).unwrap();
+        let begin = Instant::now();
+        demo.signal(signal).unwrap();
+        let code = demo.exit(DEADLINE).unwrap();
+        assert!(
+            begin.elapsed() < within(Duration::from_secs(4)),
+            "{signal:?}: {:?}",
+            begin.elapsed()
+        );
+        // The last line is the summary, and the code is what it says.
+        let lines = demo.stdout();
+        let summary: Value = serde_json::from_str(lines.last().unwrap()).unwrap();
+        assert_eq!(summary["kind"], "summary", "{}", demo.tail());
+        assert_eq!(code, Some(i32::from(summary["ok"] != true)), "{}", demo.tail());
     }
 }

@@ -14,10 +14,9 @@ use blaze_flow::world::LayerScopeId;
 use blaze_runtime::Supervisor;
 use blaze_sdk::{Advertise, PublishOptions, Request, ServiceManager, ServiceOptions, SubscribeOptions};
 use blaze_tests::admin::Admin;
+use blaze_tests::flow::free_domain;
 use blaze_tests::wait;
 use bytes::Bytes;
-
-use super::support::free_domain;
 
 /// At 8 Mbit/s (1 MiB/s) these take 0.3 s, half of what a flow has to drain.
 const MESSAGES: usize = 30;

@@ -3,14 +3,12 @@
 use std::cell::RefCell;
 use std::time::Duration;
 
-use blaze_tests::flow::{FlowProcess, FlowSpec};
-use blaze_tests::plain::RedisReader;
+use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
+use blaze_tests::plain::{RedisReader, connect, tell_redis};
 use blaze_tests::process::Process;
 use blaze_tests::servers::{shared_redis, unique_name};
 use blaze_tests::wait;
 use serde_json::{Value, json};
-
-use crate::e2e::support::{count, free_domain, text};
 
 const TOPIC: &str = "imu/data";
 const SOON: Duration = Duration::from_secs(20);
@@ -54,18 +52,6 @@ impl Robots {
         format!("{}-robot-{}:{name}", self.run, robot + 1)
     }
 
-    fn connect(&self) -> anyhow::Result<redis::Connection> {
-        Ok(redis::Client::open(&*self.redis)?.get_connection_with_timeout(Duration::from_secs(2))?)
-    }
-
-    fn tell(&self, robot: usize, message: &Value) -> anyhow::Result<()> {
-        publish(
-            &mut self.connect()?,
-            &self.channel(robot, "blaze/flow/control"),
-            message.to_string().as_bytes(),
-        )
-    }
-
     /// Published on the first robot, asked for on the second, and bridged.
     fn bridge(&self, terms: &Value) -> anyhow::Result<()> {
         let mut advertise = json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","ttl_s":0});
@@ -74,8 +60,8 @@ impl Robots {
             let more = terms.as_object().into_iter().flatten();
             more.for_each(|(key, value)| message[key] = value.clone());
         }
-        self.tell(0, &advertise)?;
-        self.tell(1, &request)?;
+        tell_redis(&self.redis, &self.channel(0, ""), &advertise)?;
+        tell_redis(&self.redis, &self.channel(1, ""), &request)?;
         for robot in &self.robots {
             robot.wait_bridge(TOPIC, SOON)?;
         }
@@ -99,7 +85,7 @@ fn a_plain_dds_program_reads_what_a_robot_publishes() -> anyhow::Result<()> {
     robots.bridge(&json!({}))?;
     let domain = robots.layer_domain.to_string();
     let plain = Process::tool("dds-peer", &["plain", "--domain", &domain, "--topic", TOPIC], None)?;
-    let mut connection = robots.connect()?;
+    let mut connection = connect(&robots.redis)?;
     let channel = robots.channel(0, TOPIC);
     wait::until(
         "the plain program reads frames",
@@ -108,15 +94,15 @@ fn a_plain_dds_program_reads_what_a_robot_publishes() -> anyhow::Result<()> {
             let _ = publish(&mut connection, &channel, b"{}");
             let lines = plain.stdout();
             let newest: Option<Value> = lines.last().and_then(|line| serde_json::from_str(line).ok());
-            newest.is_some_and(|report| count(&report, "received") >= 20)
+            newest.is_some_and(|report| report["received"].as_u64() >= Some(20))
         },
         || format!("{}\n{}", plain.tail(), robots.last_words()),
     )?;
     let lines = plain.stdout();
     let report: Value = serde_json::from_str(lines.last().map_or("{}", String::as_str))?;
     assert_eq!(
-        (count(&report, "malformed"), count(&report, "reordered")),
-        (0, 0),
+        (&report["malformed"], &report["reordered"]),
+        (&json!(0), &json!(0)),
         "{report}"
     );
     Ok(())
@@ -129,7 +115,7 @@ fn what_a_robot_kills_comes_back_over_the_layer() -> anyhow::Result<()> {
     let channel = robots.channel(0, TOPIC);
     let arrives = |robots: &Robots| -> anyhow::Result<Duration> {
         let mut reader = RedisReader::new(&robots.redis, &robots.channel(1, "blaze/bare/imu/data"))?;
-        let mut connection = robots.connect()?;
+        let mut connection = connect(&robots.redis)?;
         wait::until(
             "messages arrive",
             SOON,
@@ -189,7 +175,7 @@ mod quick {
         let robots = Robots::start()?;
         let mut reader = RedisReader::new(&robots.redis, &robots.channel(1, "blaze/bare/imu/data"))?;
         robots.bridge(&json!({"reliability":"reliable"}))?;
-        let mut connection = robots.connect()?;
+        let mut connection = connect(&robots.redis)?;
         let channel = robots.channel(0, TOPIC);
         // Until both ends have met: what is published before is gone.
         let met = RefCell::new(Vec::new());
@@ -227,11 +213,9 @@ mod quick {
         assert_eq!(ids(&robots.robots[0]), [format!("{TOPIC}|node>layer|edge")]);
         assert_eq!(ids(&robots.robots[1]), [format!("{TOPIC}|layer>node|edge|bare")]);
         let bridge = &robots.robots[1].bridges()[0];
-        assert_eq!(
-            (text(&bridge["from"]["broker"]), text(&bridge["to"]["broker"])),
-            ("dds".into(), "redis".into())
-        );
-        assert!(count(&bridge["out"], "messages") >= MESSAGES, "{bridge}");
+        let brokers = (&bridge["from"]["broker"], &bridge["to"]["broker"]);
+        assert_eq!(brokers, (&json!("dds"), &json!("redis")), "{bridge}");
+        assert!(bridge["out"]["messages"].as_u64() >= Some(MESSAGES), "{bridge}");
         for (robot, to) in [(&robots.robots[0], "edge/robot-2"), (&robots.robots[1], "edge/robot-2")] {
             let why = robot.why(TOPIC, Some(to))?;
             assert!(

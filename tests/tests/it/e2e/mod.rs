@@ -1,12 +1,4 @@
-//! End-to-end tests: real `blaze demo --only …` processes over loopback and between network namespaces.
-//!
-//! They measure time and rates on a machine of two cores, so they run one after another. Each has DDS domains of its
-//! own. `BLAZE_LONG` selects the full counts.
+//! What leaves a flow that is stopped, and robots that meet over the DDS domain of their layer.
 
 mod drain;
 mod edge_to_edge;
-mod lossy_link;
-mod meeting;
-mod pace;
-mod restarts;
-mod support;

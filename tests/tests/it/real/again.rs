@@ -1,8 +1,7 @@
-//! A service, a flow and a whole node go and come back under their names, again and again: nothing comes twice, and nothing of
-//! those who live on grows.
+//! A service, a flow, a whole node and the flow of one of two consumers are killed and come back under their names, again and
+//! again: nothing comes twice, the other consumer misses nothing, and nothing of those who live on grows.
 
 use std::collections::BTreeSet;
-
 use std::time::Duration;
 
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
@@ -14,8 +13,7 @@ use serde_json::Value;
 
 use crate::real::support::SOON;
 
-const TOPIC: &str = "imu/data";
-const STREAM: &str = "imu/data,reliable,50,320,2000";
+const STREAM: &str = "imu/data,reliable,50,320,10000";
 /// After so many rounds everything that is made once has been made.
 const WARM: u32 = 2;
 /// After RustDDS has lost a participant without a good-bye.
@@ -27,176 +25,161 @@ const MOST: Usage = Usage {
     descriptors: 4,
 };
 
-/// A robot on a Redis of its own, a cloud on Kafka, and a service on each.
+/// A robot on a Redis of its own, a fog and a cloud on Kafka, and a service on each.
 struct System {
     redis: RedisServer,
     robot: FlowProcess,
+    fog: FlowProcess,
     cloud: FlowProcess,
     driver: Process,
-    recorder: Process,
+    /// Services in fog and cloud.
+    ears: [Process; 2],
+}
+
+/// A service on a node, on a broker named by its option, URL and prefix.
+fn probe(role: &str, (option, url, prefix): (&str, &str, &str), layer: &str, node: &str) -> anyhow::Result<Process> {
+    let mut arguments = vec![role, option, url, "--prefix", prefix, "--layer", layer, "--node", node];
+    arguments.extend(["--duration", "36000", "--topic", STREAM]);
+    Process::tool("probe", &arguments, None)
 }
 
 fn driver(redis: &RedisServer) -> anyhow::Result<Process> {
-    let url = redis.url();
-    let arguments = [
-        "publish",
-        "--redis",
-        &url,
-        "--layer",
-        "edge",
-        "--node",
-        "robot-1",
-        "--service",
-        "driver",
-        "--duration",
-        "36000",
-        "--topic",
-        STREAM,
-    ];
-    Process::tool("probe", &arguments, None)
+    probe("publish", ("--redis", &redis.url(), ""), "edge", "robot-1")
+}
+
+/// A number in the last row of a service that listens.
+fn count(ear: &Process, field: &str) -> u64 {
+    let lines = ear.stdout();
+    let row = lines.last().and_then(|line| serde_json::from_str::<Value>(line).ok());
+    row.and_then(|row| row["topics"][0][field].as_u64()).unwrap_or(0)
 }
 
 impl System {
     fn start() -> anyhow::Result<Self> {
-        let (redis, kafka) = (
-            RedisServer::start(RedisKind::Redis, RedisOptions::default())?,
-            shared_kafka()?,
-        );
-        let domain = free_domain()?;
-        let prefix = format!("{}.", unique_name("again"));
-        let mut robot = FlowProcess::launch(
-            FlowSpec::new("edge", "robot-1")
-                .on_redis(&redis.url(), "")
-                .joined(domain),
-        )?;
-        let mut cloud = FlowProcess::launch(
-            FlowSpec::new("cloud", "cloud-1")
-                .on_kafka(&kafka, &prefix)
-                .joined(domain),
-        )?;
-        robot.wait_ready()?;
-        cloud.wait_ready()?;
-        let arguments = [
-            "listen",
-            "--kafka",
-            &kafka,
-            "--prefix",
-            &prefix,
-            "--layer",
-            "cloud",
-            "--node",
-            "cloud-1",
-            "--service",
-            "recorder",
-            "--duration",
-            "36000",
-            "--topic",
-            STREAM,
-        ];
-        let recorder = Process::tool("probe", &arguments, None)?;
-        let driver = driver(&redis)?;
-        let system = Self {
-            redis,
-            robot,
-            cloud,
-            driver,
-            recorder,
+        let redis = RedisServer::start(RedisKind::Redis, RedisOptions::default())?;
+        let (kafka, run, domain) = (shared_kafka()?, unique_name("again"), free_domain()?);
+        let prefixes = ["fog", "cloud"].map(|layer| format!("{run}.{layer}."));
+        let of_layer = |at: usize, layer: &str, node: &str| {
+            FlowProcess::launch(
+                FlowSpec::new(layer, node)
+                    .on_kafka(&kafka, &prefixes[at])
+                    .joined(domain),
+            )
         };
-        system.wait_more(0)?;
+        let robot = FlowSpec::new("edge", "robot-1")
+            .on_redis(&redis.url(), "")
+            .joined(domain);
+        let mut flows = [
+            FlowProcess::launch(robot)?,
+            of_layer(0, "fog", "fog-1")?,
+            of_layer(1, "cloud", "cloud-1")?,
+        ];
+        for flow in &mut flows {
+            flow.wait_ready()?;
+        }
+        let [robot, fog, cloud] = flows;
+        let system = Self {
+            robot,
+            fog,
+            cloud,
+            driver: driver(&redis)?,
+            ears: [
+                probe("listen", ("--kafka", &kafka, &prefixes[0]), "fog", "fog-1")?,
+                probe("listen", ("--kafka", &kafka, &prefixes[1]), "cloud", "cloud-1")?,
+            ],
+            redis,
+        };
+        system.wait_heard()?;
         Ok(system)
     }
 
-    fn count(&self, field: &str) -> u64 {
-        let row: Option<Value> = self
-            .recorder
-            .stdout()
-            .last()
-            .and_then(|line| serde_json::from_str(line).ok());
-        row.map_or(0, |row| row["topics"][0][field].as_u64().unwrap_or(0))
+    fn tails(&self) -> String {
+        let flows = [&self.robot, &self.fog, &self.cloud];
+        let tails = flows.map(|flow| format!("{:?}\n{}", flow.bridges(), flow.tail()));
+        format!("{}\n{}", tails.join("\n"), self.driver.tail())
     }
 
-    /// Waits until more than so many messages have come.
-    fn wait_more(&self, than: u64) -> anyhow::Result<()> {
-        wait::until(
-            "messages come again",
-            SOON,
-            || self.count("received") > than,
-            || format!("{}\n{}\n{}", self.robot.tail(), self.cloud.tail(), self.driver.tail()),
-        )?;
+    /// Waits until both services have heard more than now; rows come each second.
+    fn wait_heard(&self) -> anyhow::Result<()> {
+        let heard = || self.ears.each_ref().map(|ear| count(ear, "received"));
+        let before = heard();
+        let more = || heard().iter().zip(before).all(|(now, before)| *now > before);
+        wait::until("both services hear more", SOON, more, || self.tails())?;
         Ok(())
     }
 
     /// Waits until messages are bridged that come from now on.
     fn wait_flowing(&self) -> anyhow::Result<()> {
-        let out = || -> u64 {
-            let bridges = self.cloud.bridges();
-            let out = bridges.iter().filter_map(|bridge| bridge["out"]["messages"].as_u64());
-            out.sum()
-        };
+        let out = || [self.fog.delivered(), self.cloud.delivered()];
         let before = out();
-        wait::until(
-            "messages flow again",
-            SOON,
-            || out() > before + 5,
-            || {
-                format!(
-                    "{:?}\n{}\n{}",
-                    self.cloud.bridges(),
-                    self.robot.tail(),
-                    self.driver.tail()
-                )
-            },
-        )?;
+        let more = || out().iter().zip(before).all(|(now, before)| *now > before + 5);
+        wait::until("messages flow again", SOON, more, || self.tails())?;
         Ok(())
     }
 
     fn bridges(&self) -> BTreeSet<String> {
-        let all = [&self.robot, &self.cloud].map(FlowProcess::bridges_up);
+        let all = [&self.robot, &self.fog, &self.cloud].map(FlowProcess::bridges_up);
         all.into_iter().flatten().collect()
     }
 
+    /// DDS participants of others that the fog's flow knows.
     fn endpoints(&self) -> anyhow::Result<u64> {
-        let peers = self.cloud.admin().json("/v1/peers")?;
+        let peers = self.fog.admin().json("/v1/peers")?;
         Ok(peers["link"]["endpoints"].as_u64().unwrap_or_default())
     }
-}
 
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Victim {
-    Service,
-    Flow,
-    Node,
-}
+    fn kill_the_service(&mut self) -> anyhow::Result<()> {
+        self.driver.kill()?;
+        self.driver = driver(&self.redis)?;
+        Ok(())
+    }
 
-fn round(system: &mut System, victim: Victim) -> anyhow::Result<()> {
-    if victim != Victim::Flow {
-        system.driver.kill()?;
+    fn kill_the_flow(&mut self) -> anyhow::Result<()> {
+        self.robot.restart()
     }
-    if victim != Victim::Service {
-        system.robot.kill()?;
+
+    fn kill_the_node(&mut self) -> anyhow::Result<()> {
+        self.driver.kill()?;
+        self.robot.kill()?;
+        self.redis.restart()?;
+        self.robot.relaunch()?;
+        self.robot.wait_ready()?;
+        self.driver = driver(&self.redis)?;
+        Ok(())
     }
-    if victim == Victim::Node {
-        system.redis.restart()?;
+
+    /// The service beside the other flow misses nothing.
+    fn kill_a_consumers_flow(&mut self) -> anyhow::Result<()> {
+        self.wait_heard()?;
+        let lost = count(&self.ears[0], "lost");
+        self.cloud.restart()?;
+        self.wait_flowing()?;
+        self.wait_heard()?;
+        anyhow::ensure!(
+            count(&self.ears[0], "lost") == lost,
+            "lost at the other one: {}",
+            self.tails()
+        );
+        Ok(())
     }
-    if victim != Victim::Service {
-        system.robot.relaunch()?;
-        system.robot.wait_ready()?;
-    }
-    if victim != Victim::Flow {
-        system.driver = driver(&system.redis)?;
-    }
-    system.wait_flowing()
 }
 
 #[test]
 fn whatever_comes_back_under_its_name_leaves_nothing_behind() -> anyhow::Result<()> {
     let mut system = System::start()?;
     let rounds = if long() { 50 } else { 3 };
+    let kills: [fn(&mut System) -> anyhow::Result<()>; 4] = [
+        System::kill_the_service,
+        System::kill_the_flow,
+        System::kill_the_node,
+        System::kill_a_consumers_flow,
+    ];
     let bridges = system.bridges();
-    let mut warm = (Usage::default(), 0);
+    let (mut warm, mut known) = (Usage::default(), 0);
     for number in 1..=rounds {
-        for victim in [Victim::Service, Victim::Flow, Victim::Node] {
-            round(&mut system, victim)?;
+        for kill in kills {
+            kill(&mut system)?;
+            system.wait_flowing()?;
         }
         wait::until(
             "the bridges are as before",
@@ -205,38 +188,28 @@ fn whatever_comes_back_under_its_name_leaves_nothing_behind() -> anyhow::Result<
             || format!("before {bridges:?}, now {:?}", system.bridges()),
         )?;
         if number == WARM {
-            warm = (system.cloud.usage()?, system.endpoints()?);
+            (warm, known) = (system.fog.usage()?, system.endpoints()?);
         }
     }
-    let last = (system.cloud.usage()?, system.endpoints()?);
+    let (last, endpoints) = (system.fog.usage()?, system.endpoints()?);
     println!(
-        "{rounds} restarts of a service, a flow and a node each: the cloud's flow holds {}, {} endpoints; after {WARM} it held {}, {}",
-        last.0, last.1, warm.0, warm.1
+        "{rounds} rounds: the fog's flow holds {last}, {endpoints} endpoints; after {WARM} it held {warm}, {known}"
     );
-    // Rows come each second; the last one tells of all that came.
-    system.wait_more(system.count("received"))?;
-    let told = ["received", "lost", "duplicated", "reordered"].map(|field| system.count(field));
-    println!(
-        "received {}, lost {}, twice {}, out of order {}",
-        told[0], told[1], told[2], told[3]
-    );
-    anyhow::ensure!(told[2] == 0 && told[3] == 0, "{told:?} of {TOPIC}");
-    // One of the robot's lives, and those that were killed within the time that RustDDS remembers them.
-    anyhow::ensure!(last.1 <= 1 + 2 * u64::from(rounds), "endpoints: {last:?}");
+    system.wait_heard()?;
+    for ear in &system.ears {
+        let faults = ["duplicated", "reordered"].map(|field| count(ear, field));
+        anyhow::ensure!(faults == [0, 0], "twice and out of order: {faults:?}");
+    }
+    // The lives of robot and cloud, and those that were killed within the time that RustDDS remembers them.
+    anyhow::ensure!(endpoints <= 2 + 3 * u64::from(rounds), "{endpoints} endpoints");
     if long() {
         wait::until(
             "killed participants are forgotten",
             FORGOTTEN,
-            || system.endpoints().is_ok_and(|now| now == 1),
+            || system.endpoints().is_ok_and(|now| now == 2),
             || format!("{:?}", system.endpoints()),
         )?;
     }
-    let (last, warm) = (last.0, warm.0);
-    anyhow::ensure!(
-        last.threads <= warm.threads + MOST.threads
-            && last.descriptors <= warm.descriptors + MOST.descriptors
-            && last.resident_kib <= warm.resident_kib + MOST.resident_kib,
-        "it grew from {warm} to {last}"
-    );
+    anyhow::ensure!(last.exceeds_by_at_most(&warm, &MOST), "it grew from {warm} to {last}");
     Ok(())
 }

@@ -8,9 +8,9 @@ use blaze_tests::servers::{shared_kafka, shared_redis};
 use blaze_tests::wait;
 use rand::rngs::StdRng;
 use rand::{Rng as _, RngExt as _, SeedableRng as _};
-use serde_json::json;
+use serde_json::{Value, json};
 
-use crate::real::support::{RobotAndCloud, SOON, connect};
+use crate::real::support::{RedisReader, RobotAndCloud, SOON};
 
 const TOPIC: &str = "imu/data";
 /// What a flow may hold beside what it had before.
@@ -95,98 +95,134 @@ fn flowing(system: &RobotAndCloud, reader: &KafkaReader) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Messages that a flow dropped for a reason.
+fn dropped(flow: &FlowProcess, reason: &str) -> f64 {
+    metric_sum(flow, "blaze_flow_dropped_total", &format!("reason=\"{reason}\""))
+}
+
+/// Control messages that a flow refused.
+fn refused(flow: &FlowProcess) -> f64 {
+    metric_sum(
+        flow,
+        "blaze_flow_link_events_total",
+        "event=\"control_message_refused\"",
+    )
+}
+
+fn wait_count(what: &str, flow: &FlowProcess, count: impl Fn() -> f64, expected: f64) -> anyhow::Result<()> {
+    let state = || format!("{} of {expected}\n{}", count(), flow.tail());
+    wait::until(what, SOON, || count() >= expected, state)?;
+    Ok(())
+}
+
+/// Frames on a Redis channel.
+fn frames(robot: &FlowProcess, system: &RobotAndCloud) -> anyhow::Result<()> {
+    let (before, frames) = (dropped(robot, "decode_error"), broken_frames());
+    for frame in &frames {
+        system.publish(TOPIC, frame)?;
+    }
+    let count = || dropped(robot, "decode_error");
+    wait_count(
+        "every broken frame is counted",
+        robot,
+        count,
+        before + frames.len() as f64,
+    )
+}
+
+/// One byte too many.
+fn large_payloads(robot: &FlowProcess, system: &RobotAndCloud) -> anyhow::Result<()> {
+    let (before, large) = (dropped(robot, "too_large"), vec![b'x'; 16 * 1024 * 1024 + 1]);
+    system.publish(TOPIC, &large)?;
+    let count = || dropped(robot, "too_large");
+    wait_count("a payload of 16 MiB + 1 is counted", robot, count, before + 1.0)?;
+    let why = || robot.why(TOPIC, None).unwrap_or_default();
+    wait::until(
+        "why names what is too large for any bridge",
+        SOON,
+        || {
+            let _ = system.publish(TOPIC, &large);
+            why()["code"] == "too_large" && why()["verdict"] == "not_flowing"
+        },
+        || why().to_string(),
+    )?;
+    Ok(())
+}
+
+/// Control messages on both brokers.
+fn control_messages(robot: &FlowProcess, system: &RobotAndCloud, writer: &KafkaWriter) -> anyhow::Result<()> {
+    const CONTROL: &str = "blaze/flow/control";
+    let mut events = RedisReader::new(&system.redis, &system.channel("blaze/flow/events"))?;
+    let (before, hostile) = (refused(robot), hostile_control());
+    for payload in &hostile {
+        system.publish(CONTROL, payload)?;
+        writer.produce_later(&system.topic(CONTROL), payload)?;
+    }
+    writer.produce(&system.topic(CONTROL), b"{}")?;
+    // An empty array alone has no fault.
+    let expected = before + (hostile.len() - 1) as f64;
+    wait_count("every refusal is counted", robot, || refused(robot), expected)?;
+    let is_told = |event: Value| event["event"] == "lease_refused" && event["code"] == "invalid_json";
+    let told = || events.next_json(SOON).is_ok_and(is_told);
+    wait::until("an event says so", SOON, told, || robot.tail())?;
+    Ok(())
+}
+
+/// Kafka records with headers that lie.
+fn headers(cloud: &FlowProcess, topic: &str, writer: &KafkaWriter) -> anyhow::Result<()> {
+    let before = dropped(cloud, "decode_error");
+    let id = [b'a'; 32];
+    let hostile: [&[(&str, &[u8])]; 6] = [
+        &[("blaze-writer", b"no hex")],
+        &[("blaze-writer", &[0xff; 40]), ("blaze-sequence", b"1")],
+        &[("blaze-writer", &id), ("blaze-sequence", b"0")],
+        &[("blaze-writer", &id), ("blaze-sequence", b"-1")],
+        &[("blaze-writer", &id)],
+        &[
+            ("blaze-writer", &id),
+            ("blaze-sequence", b"1"),
+            ("blaze-origin", &[b'/'; 9_000]),
+        ],
+    ];
+    for headers in hostile {
+        writer.produce_with(topic, b"payload", headers)?;
+    }
+    let count = || dropped(cloud, "decode_error");
+    wait_count(
+        "every hostile record is counted",
+        cloud,
+        count,
+        before + hostile.len() as f64,
+    )
+}
+
 #[test]
 fn garbage_is_counted_and_does_no_harm() -> anyhow::Result<()> {
     const BACK: &str = "fleet/commands";
     let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
-    system.tell_robot(&json!({"op":"advertise","topic":TOPIC,"service":"imu-driver","ttl_s":0}))?;
+    system.route(TOPIC, &json!({}))?;
     system.tell_robot(&json!({"op":"request","topic":BACK,"service":"driver","ttl_s":0}))?;
-    system.tell_cloud(&json!([{"op":"request","topic":TOPIC,"service":"logger","ttl_s":0},
-        {"op":"advertise","topic":BACK,"service":"planner","ttl_s":0}]))?;
-    for flow in [&system.robot, &system.cloud] {
-        flow.wait_bridge(TOPIC, SOON)?;
+    system.tell_cloud(&json!({"op":"advertise","topic":BACK,"service":"planner","ttl_s":0}))?;
+    let (robot, cloud) = (&system.robot, &system.cloud);
+    for flow in [robot, cloud] {
         flow.wait_bridge(BACK, SOON)?;
     }
     let reader = KafkaReader::from_end(&system.kafka, &system.topic(TOPIC))?;
-    flowing(&system, &reader)?;
-    let memory = [system.robot.rss_kib()?, system.cloud.rss_kib()?];
-
-    // Frames on a Redis channel.
-    let frames = broken_frames();
-    let before = metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"decode_error\"");
-    for frame in &frames {
-        system.publish(TOPIC, frame)?;
-    }
-    let counted = || metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"decode_error\"") - before;
-    wait::until(
-        "every broken frame is counted",
-        SOON,
-        || counted() >= frames.len() as f64,
-        || format!("{} of {}", counted(), frames.len()),
-    )?;
-    flowing(&system, &reader)?;
-
-    // One byte too many.
-    let before = metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"too_large\"");
-    system.publish(TOPIC, &vec![b'x'; 16 * 1024 * 1024 + 1])?;
-    wait::until(
-        "a payload of 16 MiB + 1 is counted",
-        SOON,
-        || metric_sum(&system.robot, "blaze_flow_dropped_total", "reason=\"too_large\"") > before,
-        || system.robot.tail(),
-    )?;
-    flowing(&system, &reader)?;
-
-    // Control topic of both brokers.
-    let mut connection = connect(&system.redis)?;
     let writer = KafkaWriter::new(&system.kafka)?;
-    for payload in hostile_control() {
-        redis::cmd("PUBLISH")
-            .arg(system.channel("blaze/flow/control"))
-            .arg(&payload)
-            .exec(&mut connection)?;
-        writer.produce_later(&system.topic("blaze/flow/control"), &payload)?;
-    }
-    writer.produce(&system.topic("blaze/flow/control"), b"{}")?;
     flowing(&system, &reader)?;
-
-    // Kafka records with headers that lie.
-    let before = metric_sum(&system.cloud, "blaze_flow_dropped_total", "reason=\"decode_error\"");
-    let hostile: Vec<Vec<(&str, Vec<u8>)>> = vec![
-        vec![("blaze-writer", b"no hex".to_vec())],
-        vec![("blaze-writer", vec![0xff; 40]), ("blaze-sequence", b"1".to_vec())],
-        vec![("blaze-writer", vec![b'a'; 32]), ("blaze-sequence", b"0".to_vec())],
-        vec![("blaze-writer", vec![b'a'; 32]), ("blaze-sequence", b"-1".to_vec())],
-        vec![("blaze-writer", vec![b'a'; 32])],
-        vec![
-            ("blaze-writer", vec![b'a'; 32]),
-            ("blaze-sequence", b"1".to_vec()),
-            ("blaze-origin", vec![b'/'; 9_000]),
-        ],
-    ];
-    for headers in &hostile {
-        let headers: Vec<(&str, &[u8])> = headers.iter().map(|(key, value)| (*key, value.as_slice())).collect();
-        writer.produce_with(&system.topic(BACK), b"payload", &headers)?;
-    }
-    wait::until(
-        "every hostile record is counted",
-        SOON,
-        || {
-            metric_sum(&system.cloud, "blaze_flow_dropped_total", "reason=\"decode_error\"") - before
-                >= hostile.len() as f64
-        },
-        || system.cloud.tail(),
-    )?;
+    let memory = [robot.rss_kib()?, cloud.rss_kib()?];
+    frames(robot, &system)?;
     flowing(&system, &reader)?;
-
-    for (flow, memory) in [&system.robot, &system.cloud].into_iter().zip(memory) {
+    large_payloads(robot, &system)?;
+    flowing(&system, &reader)?;
+    control_messages(robot, &system, &writer)?;
+    flowing(&system, &reader)?;
+    headers(cloud, &system.topic(BACK), &writer)?;
+    flowing(&system, &reader)?;
+    for (flow, memory) in [robot, cloud].into_iter().zip(memory) {
         let now = flow.rss_kib()?;
-        println!("{}: {memory} KiB before, {now} KiB after", flow.spec.node);
-        assert!(
-            now <= memory + MAX_GROWTH_KIB,
-            "{}: {memory} → {now} KiB",
-            flow.spec.node
-        );
+        let node = &flow.spec.node;
+        assert!(now <= memory + MAX_GROWTH_KIB, "{node}: {memory} → {now} KiB");
     }
     Ok(())
 }

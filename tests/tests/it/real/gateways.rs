@@ -174,68 +174,72 @@ fn a_member_on_dds_reaches_a_robot_over_a_gateway_and_is_reached() -> anyhow::Re
     over_a_gateway(|spec| spec.on_dds(domain))
 }
 
-#[test]
-fn of_seventeen_flows_four_are_gateways_and_one_that_is_killed_is_replaced() -> anyhow::Result<()> {
-    let (redis, kafka) = (shared_redis()?, shared_kafka()?);
-    let run = unique_name("gateways");
-    let domain = free_domain()?;
-    let prefix = |node: &str| format!("{run}:{node}:");
-    let cloud = |number: usize| {
-        let node = format!("cloud-{number}");
-        let spec = FlowSpec::new("cloud", &node).on_kafka(&kafka, &format!("{run}."));
-        spec.on_redis(&redis, &prefix(&node)).joined(domain)
-    };
-    let robot = FlowSpec::new("edge", "robot")
-        .on_redis(&redis, &prefix("robot"))
-        .joined(domain);
-    let mut robot = FlowProcess::launch(robot)?;
-    let mut clouds: Vec<FlowProcess> = (1..=17)
-        .map(|number| FlowProcess::launch(cloud(number)))
-        .collect::<Result<_, _>>()?;
-    robot.wait_ready()?;
-    for flow in &mut clouds {
-        flow.wait_ready()?;
+mod long {
+    use super::*;
+
+    #[test]
+    fn of_seventeen_flows_four_are_gateways_and_one_that_is_killed_is_replaced() -> anyhow::Result<()> {
+        let (redis, kafka) = (shared_redis()?, shared_kafka()?);
+        let run = unique_name("gateways");
+        let domain = free_domain()?;
+        let prefix = |node: &str| format!("{run}:{node}:");
+        let cloud = |number: usize| {
+            let node = format!("cloud-{number}");
+            let spec = FlowSpec::new("cloud", &node).on_kafka(&kafka, &format!("{run}."));
+            spec.on_redis(&redis, &prefix(&node)).joined(domain)
+        };
+        let robot = FlowSpec::new("edge", "robot")
+            .on_redis(&redis, &prefix("robot"))
+            .joined(domain);
+        let mut robot = FlowProcess::launch(robot)?;
+        let mut clouds: Vec<FlowProcess> = (1..=17)
+            .map(|number| FlowProcess::launch(cloud(number)))
+            .collect::<Result<_, _>>()?;
+        robot.wait_ready()?;
+        for flow in &mut clouds {
+            flow.wait_ready()?;
+        }
+        let four = |without: &BTreeSet<String>| {
+            let now = heard_by(&robot);
+            now.len() == 4 && now.is_disjoint(without)
+        };
+        // Those that began while others had not been heard yet may have joined, and leave.
+        wait::until(
+            "four gateways",
+            SOON,
+            || four(&names(&[])),
+            || format!("{:?}", heard_by(&robot)),
+        )?;
+        let gateways = heard_by(&robot);
+        let is_member = |flow: &&FlowProcess| !gateways.contains(&format!("cloud/{}", flow.spec.node));
+        let member = clouds.iter().find(is_member).expect("13 of 17").spec.node.clone();
+        let mut ways = [
+            Way::new(&redis, TO_MEMBER, &prefix("robot"), &prefix(&member))?,
+            Way::new(&redis, TO_ROBOT, &prefix(&member), &prefix("robot"))?,
+        ];
+        for way in &mut ways {
+            way.run()?;
+        }
+        let killed: BTreeSet<String> = gateways.iter().take(1).cloned().collect();
+        let victim = clouds
+            .iter_mut()
+            .find(|flow| killed.contains(&format!("cloud/{}", flow.spec.node)));
+        victim.expect("it is one of them").kill()?;
+        let since = Instant::now();
+        wait::until(
+            "another takes its place",
+            SOON,
+            || four(&killed),
+            || format!("{:?}", heard_by(&robot)),
+        )?;
+        println!(
+            "replaced after {:?}: {gateways:?}, then {:?}",
+            since.elapsed(),
+            heard_by(&robot)
+        );
+        for way in &mut ways {
+            way.run()?;
+        }
+        Ok(())
     }
-    let four = |without: &BTreeSet<String>| {
-        let now = heard_by(&robot);
-        now.len() == 4 && now.is_disjoint(without)
-    };
-    // Those that began while others had not been heard yet may have joined, and leave.
-    wait::until(
-        "four gateways",
-        SOON,
-        || four(&names(&[])),
-        || format!("{:?}", heard_by(&robot)),
-    )?;
-    let gateways = heard_by(&robot);
-    let is_member = |flow: &&FlowProcess| !gateways.contains(&format!("cloud/{}", flow.spec.node));
-    let member = clouds.iter().find(is_member).expect("13 of 17").spec.node.clone();
-    let mut ways = [
-        Way::new(&redis, TO_MEMBER, &prefix("robot"), &prefix(&member))?,
-        Way::new(&redis, TO_ROBOT, &prefix(&member), &prefix("robot"))?,
-    ];
-    for way in &mut ways {
-        way.run()?;
-    }
-    let killed: BTreeSet<String> = gateways.iter().take(1).cloned().collect();
-    let victim = clouds
-        .iter_mut()
-        .find(|flow| killed.contains(&format!("cloud/{}", flow.spec.node)));
-    victim.expect("it is one of them").kill()?;
-    let since = Instant::now();
-    wait::until(
-        "another takes its place",
-        SOON,
-        || four(&killed),
-        || format!("{:?}", heard_by(&robot)),
-    )?;
-    println!(
-        "replaced after {:?}: {gateways:?}, then {:?}",
-        since.elapsed(),
-        heard_by(&robot)
-    );
-    for way in &mut ways {
-        way.run()?;
-    }
-    Ok(())
 }

@@ -9,6 +9,7 @@ mod frozen;
 mod garbage;
 mod gateways;
 mod late;
+mod numbered;
 mod plain_clients;
 mod replicas;
 mod restarts;

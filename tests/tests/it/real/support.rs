@@ -6,6 +6,7 @@ use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::plain::{self, KafkaWriter};
 pub(crate) use blaze_tests::plain::{RedisReader, connect};
 use blaze_tests::servers::unique_name;
+use serde_json::{Value, json};
 
 /// Where something must happen, on a busy machine.
 pub(crate) const SOON: Duration = Duration::from_secs(40);
@@ -61,12 +62,27 @@ impl RobotAndCloud {
     }
 
     /// A control message on the robot's Redis.
-    pub(crate) fn tell_robot(&self, message: &serde_json::Value) -> anyhow::Result<()> {
+    pub(crate) fn tell_robot(&self, message: &Value) -> anyhow::Result<()> {
         plain::tell_redis(&self.redis, &self.redis_prefix, message)
     }
 
     /// A control message on the cloud's Kafka.
-    pub(crate) fn tell_cloud(&self, message: &serde_json::Value) -> anyhow::Result<()> {
+    pub(crate) fn tell_cloud(&self, message: &Value) -> anyhow::Result<()> {
         plain::tell_kafka(&KafkaWriter::new(&self.kafka)?, &self.kafka_prefix, message)
+    }
+
+    /// Advertised on the robot and requested in the cloud on these terms, and bridged.
+    pub(crate) fn route(&self, topic: &str, terms: &Value) -> anyhow::Result<()> {
+        let lease = |op: &str| {
+            let mut message = json!({"op": op, "topic": topic, "service": "test", "ttl_s": 0});
+            for (key, value) in terms.as_object().into_iter().flatten() {
+                message[key] = value.clone();
+            }
+            message
+        };
+        self.tell_robot(&lease("advertise"))?;
+        self.tell_cloud(&lease("request"))?;
+        self.robot.wait_bridge(topic, SOON)?;
+        self.cloud.wait_bridge(topic, SOON)
     }
 }

@@ -133,7 +133,7 @@ async fn all_is_killed_and_comes_back(alone: bool) {
     };
 
     // What the main service has from now on does not come through.
-    link.stall().unwrap();
+    link.stall();
     stage.put("/services/slam", rate(8)).await;
     worker.kill();
     robot.redis.kill().unwrap();
@@ -169,7 +169,7 @@ async fn all_is_killed_and_comes_back(alone: bool) {
 
     let listener = robot.service().await;
     let mut notices = listener.listen("slam").await;
-    link.heal().unwrap();
+    link.heal();
     let healed = Instant::now();
     stage.equal(&worker, within(EQUAL)).await;
     println!("equal {:?} after the link was whole", healed.elapsed());

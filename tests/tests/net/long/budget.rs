@@ -11,14 +11,13 @@ use blaze_domain::LayerName;
 use blaze_flow::limit::allocate::{Sharing, Terms};
 use blaze_flow::limit::pacer::allocated;
 use blaze_flow::limit::rates::{Budgets, Demand, LaneDemand, rates};
-use blaze_tests::network::Plan;
 use blaze_tests::scenario::{BrokerKind, Flow, Route, Running, Scenario, Stream};
 use blaze_tests::wan::{Change, Shape, Ways};
 use blaze_tests::{long, wait};
 use serde_json::Value;
 
 use crate::cuts::{DELIVERY, FLOWING, dropped, hold_cut, watch};
-use crate::layers::{CAMERA, IMU, ODOMETRY, broker, flow, service, stream};
+use crate::layers::{CAMERA, IMU, ODOMETRY, flow, one_link, service, stream};
 use crate::support::{Reading, busiest};
 
 const FRONT: &str = "camera/front";
@@ -199,13 +198,6 @@ fn scenario_on(row: &Row, shape: Shape, cloud: BrokerKind) -> anyhow::Result<Sce
     let publishes = |name, streams| service(name, "robot-1", "redis", streams);
     Ok(Scenario {
         name: row.name,
-        network: Plan::new()
-            .with_hosts(&["robot-1", "cloud-1"])
-            .with_link("robot-1", "cloud-1", shape),
-        brokers: vec![
-            broker("redis", "robot-1", BrokerKind::Redis),
-            broker("cloud-broker", "cloud-1", cloud),
-        ],
         flows: vec![edge, flow("cloud", "cloud-1", "cloud-broker", None, &[])],
         publishers: vec![
             publishes("driver", small()),
@@ -216,10 +208,7 @@ fn scenario_on(row: &Row, shape: Shape, cloud: BrokerKind) -> anyhow::Result<Sce
             service("recorder", "cloud-1", "cloud-broker", small()),
             service("viewer", "cloud-1", "cloud-broker", cameras),
         ],
-        faults: vec![],
-        duration: Duration::ZERO,
-        settle: Duration::ZERO,
-        expect: vec![],
+        ..one_link(shape, cloud, row.limit_mbps, Vec::new())
     })
 }
 

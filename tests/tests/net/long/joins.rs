@@ -58,7 +58,6 @@ fn nodes_that_join_at_once_disturb_nobody() -> anyhow::Result<()> {
         host: Some(cloud_host.clone()),
         ..KafkaOptions::default()
     })?;
-    kafka.wait_ready()?;
     let seed = [cloud_host.address];
     let spec = |layer: &str, host: &Host| FlowSpec::new(layer, &host.name).joined(DOMAIN).inside(host, &seed);
     let mut robot = FlowProcess::launch(spec("edge", robot_host).on_redis(&robot_redis.url(), ""))?;

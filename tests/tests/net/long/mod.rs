@@ -3,6 +3,5 @@
 mod budget;
 mod emulator;
 mod joins;
-mod proxy;
 mod soak;
 mod topology;

@@ -1,0 +1,92 @@
+//! A link that loses 1 % both ways: what is reliable is whole, what is not shows its losses, pictures are repaired within
+//! their lifespan, and no topic waits for another's repair.
+
+use std::time::Duration;
+
+use blaze_tests::long;
+use blaze_tests::scenario::{BrokerKind, Route, Running, Stream};
+use blaze_tests::wan::{Change, Shape, Ways};
+
+use super::layers::{one_link, stream};
+
+const BEST_EFFORT: &str = "imu/best_effort";
+const RELIABLE: &str = "imu/reliable";
+const PICTURES: &str = "pictures";
+const PICTURES_HZ: f64 = 4.0;
+/// What a reliable message may take that has to be sent again, on a link with a round trip below 1 ms. Its loss is known
+/// with the next Feedback (50 ms or 64 samples), the repair may be lost again.
+const REPAIRED_MS: f64 = 200.0;
+/// What a message may take that is never repaired itself: below the 50 ms that others' repairs take, above the pauses of a
+/// busy machine.
+const UNTOUCHED_MS: f64 = 30.0;
+
+/// The picture has 154 parts: without repair one of five would be whole.
+fn streams() -> Vec<Stream> {
+    let best_effort = |stream| Stream {
+        reliable: false,
+        ..stream
+    };
+    vec![
+        stream(RELIABLE, 100.0, 320),
+        best_effort(stream(BEST_EFFORT, 100.0, 320)),
+        Stream {
+            lifespan: Duration::from_millis(500),
+            ..best_effort(stream(PICTURES, PICTURES_HZ, 200_000))
+        },
+    ]
+}
+
+/// What came of reliable messages, of best-effort ones and of pictures within a time.
+fn look(running: &Running, seconds: u64) -> anyhow::Result<[Route; 3]> {
+    let since = running.now();
+    // Nothing to wait for: what comes within this time is measured.
+    std::thread::sleep(Duration::from_secs(seconds));
+    let route = |topic| {
+        let route = running.route("recorder", topic, &since)?;
+        println!("{route}");
+        anyhow::ensure!(route.duplicated == 0, "twice: {route}");
+        Ok(route)
+    };
+    Ok([route(RELIABLE)?, route(BEST_EFFORT)?, route(PICTURES)?])
+}
+
+fn p99_ms(route: &Route) -> f64 {
+    route.latency_ms(0.99).unwrap_or(f64::INFINITY)
+}
+
+#[test]
+fn a_link_that_loses_one_percent_is_repaired() -> anyhow::Result<()> {
+    let running = Running::start(&one_link(Shape::default(), BrokerKind::Redis, 100.0, streams()))?;
+    running.wait_flowing()?;
+    let [_, clean, _] = look(&running, if long() { 60 } else { 4 })?;
+    let link = running.link("robot-1", "cloud-1")?;
+    link.set(Ways::Both, &[Change::Loss(0.01)])?;
+    let [reliable, best_effort, pictures] = look(&running, if long() { 60 } else { 8 })?;
+    let check = || {
+        let (lost, received) = (best_effort.gaps() - clean.gaps(), best_effort.latencies_ms.len());
+        let share = lost as f64 / (lost as f64 + received as f64);
+        anyhow::ensure!(lost > 0 && share < 0.05, "best effort: {lost} lost, {share:.3}");
+        anyhow::ensure!(
+            reliable.gaps() == 0 && reliable.rate_hz() >= 95.0,
+            "reliable: {reliable}"
+        );
+        anyhow::ensure!(
+            pictures.rate_hz() >= 0.75 * PICTURES_HZ,
+            "pictures are not repaired: {pictures}"
+        );
+        anyhow::ensure!(
+            p99_ms(&reliable) < REPAIRED_MS,
+            "reliable: p99 {} ms",
+            p99_ms(&reliable)
+        );
+        // What is never repaired itself must not notice the repairs of others.
+        let untouched = UNTOUCHED_MS.max(3.0 * p99_ms(&clean));
+        anyhow::ensure!(
+            p99_ms(&best_effort) < untouched,
+            "best effort: p99 {} ms",
+            p99_ms(&best_effort)
+        );
+        Ok(())
+    };
+    check().map_err(|error: anyhow::Error| error.context(running.tails()))
+}
