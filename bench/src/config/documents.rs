@@ -123,35 +123,3 @@ pub(crate) fn check_spec(number: usize, step: u64, found: &Value) -> anyhow::Res
     anyhow::ensure!(*found == expected, "{}: {found} instead of {expected}", name(number));
     Ok(())
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_spec_has_its_length_and_tells_its_step() {
-        for (number, step) in [(0, 1), (9_999, 12_345_678), (99_999, 9)] {
-            let text = spec(number, step);
-            assert_eq!(text.len(), SPEC_BYTES);
-            assert_eq!(step_of(text.as_bytes()), Some(step));
-            check_spec(number, step, &serde_json::from_str(&text).unwrap()).unwrap();
-        }
-        assert_eq!(step_of(b"{\"revision\":3}"), None);
-        assert_eq!(step_of(b"\"step\":\"x\""), None);
-        assert!(check_spec(1, 2, &serde_json::from_str(&spec(1, 3)).unwrap()).is_err());
-    }
-
-    #[test]
-    fn the_higher_revision_holds_and_none_comes_twice() {
-        let documents = Documents::new(100);
-        let write = |revision, step| documents.written(7, Known { revision, step });
-        write(5, 1).unwrap();
-        write(4, 2).unwrap();
-        assert_eq!(documents.known(7).unwrap(), Known { revision: 5, step: 1 });
-        write(5, 3).unwrap_err();
-        documents.known(100).unwrap_err();
-        let mut some = documents.some(100);
-        some.sort_unstable();
-        assert_eq!(some, (0..100).collect::<Vec<_>>());
-    }
-}

@@ -182,21 +182,3 @@ impl Row {
         self
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn quantiles_are_those_of_the_sorted_latencies() {
-        let figures = Figures::of(
-            100,
-            Duration::from_secs(2),
-            (1..=100).rev().map(|ms| ms * 1_000_000).collect(),
-        );
-        assert_eq!((figures.p50_ms, figures.p99_ms, figures.rate_hz), (51.0, 100.0, 50.0));
-        let none = Figures::of(0, Duration::from_secs(2), Vec::new());
-        assert_eq!((none.p50_ms, none.rate_hz), (0.0, 0.0));
-        assert!(Bar::AtLeast(0.3).holds(0.3) && !Bar::AtMost(2.0).holds(2.1));
-    }
-}

@@ -197,15 +197,3 @@ fn print_row(row: &Row) {
         aborts.unwrap_or_else(|| "-".to_owned())
     );
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_median_of_two_is_their_mean() {
-        assert_eq!(median(vec![3.0, 1.0, 2.0]), 2.0);
-        assert_eq!(median(vec![3.0, 1.0]), 2.0);
-        assert!(median(Vec::new()).is_nan());
-    }
-}

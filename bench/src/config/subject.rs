@@ -10,7 +10,6 @@ use blaze_auth::{Algorithm, NewToken, Realm, generate_key, random_id, sign_local
 use blaze_tests::admin::Admin;
 use blaze_tests::process::{Process, cpu_time};
 use blaze_tests::servers::{EtcdOptions, EtcdServer, MongoOptions, MongoServer, mongo_command};
-use blaze_tests::wait;
 use serde_json::{Value, json};
 use tokio::task::block_in_place;
 use tokio::time::sleep_until;
@@ -298,15 +297,19 @@ impl Blaze {
             "--config",
             node_file.to_str().context("the folder has a name in UTF-8")?,
         ];
-        let (process, line) = ready(&arguments)?;
-        let second = if second { Some(ready(&arguments)?.0) } else { None };
-        let admin = address(&line, "admin")?;
+        let start = || {
+            let process = Process::start("blaze-config", &arguments, None)?;
+            process.ready_at("admin", START)?;
+            anyhow::Ok(process)
+        };
+        let (process, second) = (start()?, second.then(start).transpose()?);
+        let at = |name| process.ready_at(name, START);
         Ok(Self {
             store,
-            rest: address(&line, "rest")?,
-            grpc: address(&line, "grpc")?,
+            rest: at("rest")?,
+            grpc: at("grpc")?,
             admin: Admin {
-                address: admin,
+                address: at("admin")?,
                 namespace: None,
             },
             process,
@@ -328,18 +331,6 @@ impl Blaze {
             metric("blaze_config_commit_duration_seconds_count")?,
         ))
     }
-}
-
-/// A process that is ready, and the line that says so.
-fn ready(arguments: &[&str]) -> anyhow::Result<(Process, String)> {
-    let process = Process::start("blaze-config", arguments, None)?;
-    let line = wait::until_some(
-        "the ready line of blaze-config",
-        START,
-        || process.stdout().into_iter().find(|line| line.starts_with("ready ")),
-        || process.tail(),
-    )?;
-    Ok((process, line))
 }
 
 /// JSON is YAML.
@@ -373,10 +364,4 @@ fn token(key: &[u8]) -> anyhow::Result<String> {
     };
     let signed = sign_locally(&Realm::default(), key, Algorithm::Hs256, Some("k1"), &token);
     signed.map_err(anyhow::Error::msg)
-}
-
-fn address(line: &str, name: &str) -> anyhow::Result<SocketAddr> {
-    let start = format!("{name}=");
-    let word = line.split(' ').find_map(|word| word.strip_prefix(&start));
-    Ok(word.with_context(|| format!("no {name} in {line:?}"))?.parse()?)
 }

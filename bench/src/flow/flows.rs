@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use anyhow::Context;
 use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
-use blaze_tests::plain::KafkaWriter;
+use blaze_tests::plain::{self, KafkaWriter};
+use serde_json::json;
 
 /// From where to where.
 pub(crate) struct Route<'a> {
@@ -64,24 +65,14 @@ impl Flows {
     }
 
     fn connect(&self, route: &Route<'_>) -> anyhow::Result<()> {
-        let rate = route
-            .rate_hz
-            .map_or(String::new(), |rate| format!("\"rate_hz\":{rate},"));
-        let advertise = format!(
-            "{{\"op\":\"advertise\",\"topic\":\"{}\",\"service\":\"bench-source\",{rate}\"max_bytes\":{},\"reliability\":\"reliable\",\"ttl_s\":0}}",
-            route.topic, route.bytes
-        );
-        let mut redis = redis::Client::open(route.redis)?.get_connection()?;
-        redis::cmd("PUBLISH")
-            .arg(format!("{}blaze/flow/control", route.redis_prefix))
-            .arg(advertise)
-            .exec(&mut redis)?;
-        let request = format!(
-            "{{\"op\":\"request\",\"topic\":\"{}\",\"service\":\"bench-sink\",\"reliability\":\"reliable\",\"ttl_s\":0}}",
-            route.topic
-        );
-        let control = format!("{}blaze.flow.control", route.kafka_prefix);
-        KafkaWriter::new(route.kafka)?.produce(&control, request.as_bytes())?;
+        let lease = |op: &str| json!({"op": op, "topic": route.topic, "service": "bench", "reliability": "reliable", "ttl_s": 0});
+        let mut advertise = lease("advertise");
+        advertise["max_bytes"] = json!(route.bytes);
+        if let Some(rate) = route.rate_hz {
+            advertise["rate_hz"] = json!(rate);
+        }
+        plain::tell_redis(route.redis, route.redis_prefix, &advertise)?;
+        plain::tell_kafka(&KafkaWriter::new(route.kafka)?, route.kafka_prefix, &lease("request"))?;
         for flow in &self.running {
             flow.wait_bridge(route.topic, Duration::from_secs(20))?;
         }
