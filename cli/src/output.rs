@@ -100,7 +100,7 @@ pub fn table<T>(items: &[T], width: Option<u16>, columns: &[Column<'_, T>]) -> S
 /// Writes a text to standard output, with a newline at its end.
 ///
 /// # Errors
-/// As [`write_text`].
+/// [`CliError::OutputClosed`] when nobody reads it any more, [`CliError::Failed`] for a full disk and the like.
 pub fn print(text: &str) -> Result<(), CliError> {
     let newline = if text.ends_with('\n') { "" } else { "\n" };
     write_text(&mut std::io::stdout().lock(), &format!("{text}{newline}"))

@@ -64,7 +64,7 @@ pub async fn a_group_is_written_whole(fixture: &dyn Fixture) {
     good.idempotency = Some(answer("first", revision));
     let mut bad = record(samples::commit(revision + 1, &["y"]));
     bad.idempotency = Some(answer("first", revision + 1));
-    conflict("an answer that is there twice", model.store.commit(&[good, bad]).await);
+    conflict("an answer that is there twice", &model.store.commit(&[good, bad]).await);
     model.check_now().await;
     assert_eq!(log(model.store.as_ref(), 0).await, model.commits, "the log");
     let kept = model.store.idempotency("first", now()).await.unwrap();
@@ -88,7 +88,7 @@ pub async fn a_taken_revision_is_a_conflict(fixture: &dyn Fixture) {
             vec![samples::change(Op::Create, "late", revision, None)],
         ));
         late.idempotency = Some(answer("late", revision));
-        conflict(&format!("revision {revision} again"), model.store.commit(&[late]).await);
+        conflict(&format!("revision {revision} again"), &model.store.commit(&[late]).await);
     }
     model.check_now().await;
     assert_eq!(log(model.store.as_ref(), 0).await, model.commits, "the log");
@@ -114,7 +114,7 @@ pub async fn a_taken_answer_is_a_conflict(fixture: &dyn Fixture) {
     commit(model.store.as_ref(), &[first.clone()]).await;
     let mut second = record(samples::commit(2, &["b"]));
     second.idempotency = Some(answer("same", 2));
-    conflict("an answer that is there", model.store.commit(&[second]).await);
+    conflict("an answer that is there", &model.store.commit(&[second]).await);
     model.check_now().await;
     let kept = model.store.idempotency("same", now()).await.unwrap();
     assert_eq!(kept, first.idempotency, "the first answer");

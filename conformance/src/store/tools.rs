@@ -33,7 +33,7 @@ pub(super) async fn within<F: Future>(what: &str, future: F) -> F::Output {
 }
 
 /// Insists on [`CommitError::Conflict`].
-pub(super) fn conflict(what: &str, result: Result<(), CommitError>) {
+pub(super) fn conflict(what: &str, result: &Result<(), CommitError>) {
     assert!(
         matches!(result, Err(CommitError::Conflict)),
         "{what} is a conflict, but was {result:?}"

@@ -139,7 +139,7 @@ pub async fn what_outlives_a_commit_stays(fixture: &dyn Fixture) {
         }
         let mut again = record(samples::commit(7, &["late"]));
         again.idempotency = Some(samples::answer("answer-1", 7));
-        conflict("an answer that is there", model.store.commit(&[again]).await);
+        conflict("an answer that is there", &model.store.commit(&[again]).await);
     }
     model.check_now().await;
 }
@@ -214,7 +214,7 @@ pub async fn a_writer_that_slept_through_a_trim_is_refused(fixture: &dyn Fixture
             let late = record(samples::commit(revision, &["late"]));
             conflict(
                 &format!("revision {revision} below the floor {floor}"),
-                model.store.commit(&[late]).await,
+                &model.store.commit(&[late]).await,
             );
             let gone = record(samples::commit_of(
                 revision,
@@ -225,7 +225,7 @@ pub async fn a_writer_that_slept_through_a_trim_is_refused(fixture: &dyn Fixture
                     Some(10),
                 )],
             ));
-            conflict("a deletion below the floor", model.store.commit(&[gone]).await);
+            conflict("a deletion below the floor", &model.store.commit(&[gone]).await);
         }
         model.check_now().await;
     }

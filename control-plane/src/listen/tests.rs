@@ -655,7 +655,8 @@ fn faulty_files_are_named() {
         .is_none()
     );
     let pem = |name: &str| Some(authority.path(name));
-    let changes: [(&dyn Fn(&mut TlsSection), &str); 5] = [
+    type Change<'a> = &'a dyn Fn(&mut TlsSection);
+    let changes: [(Change, &str); 5] = [
         (&|tls| tls.cert_file = pem("gone.pem"), "gone.pem"),
         (&|tls| tls.cert_file = pem("server.key"), "server.key"),
         (&|tls| tls.key_file = pem("server.pem"), "server.pem"),
