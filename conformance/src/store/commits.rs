@@ -88,7 +88,10 @@ pub async fn a_taken_revision_is_a_conflict(fixture: &dyn Fixture) {
             vec![samples::change(Op::Create, "late", revision, None)],
         ));
         late.idempotency = Some(answer("late", revision));
-        conflict(&format!("revision {revision} again"), &model.store.commit(&[late]).await);
+        conflict(
+            &format!("revision {revision} again"),
+            &model.store.commit(&[late]).await,
+        );
     }
     model.check_now().await;
     assert_eq!(log(model.store.as_ref(), 0).await, model.commits, "the log");

@@ -169,8 +169,9 @@ fn mark(document: &Document) -> Option<Document> {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 #[ignore = "started by the tests of migrations that are killed, which need its death"]
 async fn migrates_and_dies() {
-    let Ok(place) = std::env::var(VICTIM) else { return };
-    let at = std::env::var(VICTIM_DIES).unwrap_or_default();
+    let Some(place) = std::env::var_os(VICTIM) else { return };
+    let place = place.into_string().unwrap();
+    let at = std::env::var_os(VICTIM_DIES).unwrap_or_default().into_string().unwrap();
     println!("\nmigrating");
     if let Ok(documents) = at.parse() {
         LEFT.store(documents, Ordering::Relaxed);

@@ -16,7 +16,7 @@ async fn without_anything_the_mounted_file_serves_until_the_main_service_is_ther
         )
     };
     std::fs::write(&defaults, file(1)).unwrap();
-    let worker = stage.worker_with("robot-1", json!({ "defaults_file": defaults }));
+    let worker = stage.worker_with("robot-1", &json!({ "defaults_file": defaults }));
     let mut service = stage.service().await;
     let asks = json!({ "service": "slam", "instance": "0" });
     let answer = service.ask(asks.clone(), PATIENCE).await;

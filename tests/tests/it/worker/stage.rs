@@ -139,11 +139,11 @@ impl Stage {
 
     /// The worker of a node, ready; after a start on the same copies as before.
     pub(crate) fn worker(&self, node: &str) -> Worker {
-        self.worker_with(node, json!({}))
+        self.worker_with(node, &json!({}))
     }
 
     /// The same with further members of the section `worker`.
-    pub(crate) fn worker_with(&self, node: &str, section: Value) -> Worker {
+    pub(crate) fn worker_with(&self, node: &str, section: &Value) -> Worker {
         self.started(
             node,
             &self.node_file(node, &self.brokers, &json!({ "worker": section })),
