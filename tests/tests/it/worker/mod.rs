@@ -11,7 +11,6 @@
 //! kafka      what is special to Kafka
 //! leases     the suite of leases on real servers
 //! several    two workers of one layer, of which one is killed, stopped, or ended
-//! late       a database that answers only after the start
 //! killed     worker, broker and database killed behind a cut link
 //! rollouts   roll-outs that services judge
 //! secrets    what services are not told is nowhere
@@ -26,7 +25,6 @@ mod flow;
 mod kafka;
 mod killed;
 mod kit;
-mod late;
 mod layer;
 mod leases;
 mod partition;

@@ -137,22 +137,14 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
     let late = first.run("slam", "late", &judge);
     late.until("a new one has the former value", has(FORMER));
 
-    // The main service is back and takes it over; then everybody is killed once more.
-    main = stage.main();
+    // The main service is back and takes it over.
+    let _main = stage.main();
     let canary_status = ends(&stage, "faster", "failed").await;
     assert_eq!(canary_status["node"], "robot-1");
     let status = blaze(&stage, &["rollout", "status", "faster"]).unwrap();
     assert_eq!(status["status"]["phase"], "failed");
     stage.equal(&canary, PATIENCE).await;
-    // Also that the new one asked: else nobody knows in the next life that it is to be told, until it asks again after a minute.
-    canary.has_kept_all(1).await;
-    main.kill().unwrap();
-    canary.kill();
-    let _main = stage.main();
-    let canary = first.worker(&stage);
-    stage.equal(&canary, PATIENCE).await;
     stage.equal(&other, PATIENCE).await;
-    ends(&stage, "faster", "failed").await;
     assert_eq!(plain.ask(asks, PATIENCE).await["config"]["rate_hz"], FORMER);
 
     // A change that everybody hears of: what had been told before has come by then.

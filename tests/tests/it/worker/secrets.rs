@@ -12,7 +12,7 @@ use std::time::Duration;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use blaze_tests::process::Signal;
-use blaze_tests::servers::{MongoOptions, MongoServer, RedisServer, mongo_command};
+use blaze_tests::servers::RedisServer;
 use parking_lot::Mutex;
 use reqwest::Method;
 use rustix::process::{Pid, Resource, Rlimit, prlimit};
@@ -84,30 +84,6 @@ fn keys(redis: &RedisServer) -> String {
                   if redis.call('TYPE', key).ok == 'string' then out[#out + 1] = redis.call('GET', key) \
                   else out[#out + 1] = cjson.encode(redis.call('HGETALL', key)) end end return out";
     redis.cli(&["EVAL", script, "0"]).unwrap()
-}
-
-/// All that a database holds.
-fn dump(mongo: &MongoServer, database: &str) -> String {
-    let ask = |command: &Value| mongo_command(&mongo.uri(), database, command).unwrap();
-    let batch = |answer: &bson::Document| {
-        answer
-            .get_document("cursor")
-            .unwrap()
-            .get_array("firstBatch")
-            .unwrap()
-            .clone()
-    };
-    let tables = batch(&ask(&json!({ "listCollections": 1, "cursor": { "batchSize": 1000 } })));
-    let rows = tables.iter().map(|table| {
-        let name = table.as_document().unwrap().get_str("name").unwrap();
-        let rows = batch(&ask(&json!({ "find": name, "batchSize": 100_000, "limit": 100_000 })));
-        let bytes = rows
-            .iter()
-            .filter_map(|row| row.as_document()?.get_binary_generic("data").ok());
-        let texts: Vec<String> = bytes.map(|bytes| String::from_utf8_lossy(bytes).into_owned()).collect();
-        format!("{name}: {rows:?}\n{}\n", texts.concat())
-    });
-    rows.collect()
 }
 
 /// Secrets in documents of each kind that can have them.
@@ -182,11 +158,6 @@ async fn operator_sees_none(worker: &Worker, logs: &[&Path]) {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_services_are_not_told_is_nowhere() {
     let stage = Stage::new();
-    let mongo = MongoServer::start(MongoOptions {
-        alone: true,
-        ..MongoOptions::default()
-    })
-    .unwrap();
     let (main_log, log, log_again) = (
         stage.path("main.log"),
         stage.path("worker.log"),
@@ -196,18 +167,16 @@ async fn what_services_are_not_told_is_nowhere() {
     documents(&stage).await;
     let robot = Robot::new(&stage, "robot-1").with(&json!({
         "log": { "level": "trace" },
-        "database": { "mongodb": { "uri": mongo.uri(), "database": "copy" } },
         "worker": { "deliver_secrets": false },
     }));
     let monitor = Monitor::start(&robot.redis);
     let worker = robot.worker_logged(&stage, &log);
     stage.equal(&worker, PATIENCE).await;
     everything(&stage, &robot, &worker, false).await;
-    worker.has_kept_all(2).await;
+    worker.has_kept_all(1).await;
     operator_sees_none(&worker, &[&main_log, &log]).await;
     assert!(clean("Redis", &keys(&robot.redis)));
     assert!(clean("what Redis was told", &monitor.seen()));
-    assert!(clean("the database", &dump(&mongo, "copy")));
     assert!(clean("the file", &content(&stage.path("robot-1"))));
     let in_memory = |worker: &Worker, text: &str| worker.process.count_in_memory(text.as_bytes()).unwrap();
     assert!(in_memory(&worker, PLAIN) > 0);
@@ -270,7 +239,7 @@ fn leaves_no_core(mut worker: Worker) {
 }
 
 /// The worker with texts and a key, or without one. What its copies hold, and what a life from the copies alone has.
-async fn copies(with_key: bool, database: Option<&MongoServer>) {
+async fn copies(with_key: bool) {
     let stage = Stage::new();
     let (main_log, log) = (stage.path("main.log"), stage.path("worker.log"));
     let mut main = stage.main_at("trace", Some(&main_log));
@@ -281,14 +250,11 @@ async fn copies(with_key: bool, database: Option<&MongoServer>) {
     if with_key {
         change["worker"]["key_file"] = json!(key);
     }
-    if let Some(mongo) = database {
-        change["database"] = json!({ "mongodb": { "uri": mongo.uri(), "database": "copy" } });
-    }
     let robot = Robot::new(&stage, "robot-1").with(&change);
     let worker = robot.worker_logged(&stage, &log);
     stage.equal(&worker, PATIENCE).await;
     everything(&stage, &robot, &worker, true).await;
-    worker.has_kept_all(1 + usize::from(database.is_some())).await;
+    worker.has_kept_all(1).await;
     operator_sees_none(&worker, &[&main_log, &log]).await;
     assert!(
         keys(&robot.redis).contains(CANARY),
@@ -297,9 +263,6 @@ async fn copies(with_key: bool, database: Option<&MongoServer>) {
     // With a key the copies are encrypted as a whole.
     let is_readable = clean("the copies", &content(&stage.path("robot-1")));
     assert!(is_readable || with_key);
-    if let Some(mongo) = database {
-        assert!(clean("the database", &dump(mongo, "copy")) || with_key);
-    }
     println!(
         "with texts the worker has it {} times in its memory",
         worker.process.count_in_memory(CANARY.as_bytes()).unwrap()
@@ -329,17 +292,8 @@ async fn copies(with_key: bool, database: Option<&MongoServer>) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn with_a_key_the_copies_hold_texts_only_encrypted() {
-    let mongo = MongoServer::start(MongoOptions {
-        alone: true,
-        ..MongoOptions::default()
-    })
-    .unwrap();
-    copies(true, Some(&mongo)).await;
-    copies(true, None).await;
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn without_a_key_the_copies_hold_no_texts() {
-    copies(false, None).await;
+async fn the_copies_hold_texts_encrypted_or_not_at_all() {
+    for with_key in [true, false] {
+        copies(with_key).await;
+    }
 }
