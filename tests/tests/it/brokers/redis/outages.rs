@@ -6,8 +6,8 @@ use blaze_brokers::{Broker, BrokerError, Health, PublishOutcome, PublisherOption
 use blaze_tests::servers::{RedisKind, RedisOptions};
 
 use super::support::{
-    DEADLINE, Server, channel, eventually, frame, next_number, numbers_until_silence, publish, publisher, settled,
-    subscribe, wait_for,
+    DEADLINE, Server, channel, eventually, frame, next_number, numbers_until_silence, publish, publisher, subscribe,
+    wait_for,
 };
 
 /// A frozen server: within some 2 s the client is down and takes nothing; thawed, it is up, and nothing comes twice.
