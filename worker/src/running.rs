@@ -174,7 +174,8 @@ impl RunningWorker {
         let hears = Arc::clone(&hears_requests);
         let listening = listen(Arc::clone(&broker), GET, requests, |payload| payload, hears);
         spawn("requests", Box::pin(listening));
-        let heard: [(&str, &str, fn(Bytes) -> Sign); 2] = [
+        type Into = fn(Bytes) -> Sign;
+        let heard: [(&str, &str, Into); 2] = [
             ("acknowledgements", ACK, Sign::Ack),
             ("watchdogs", WATCHDOG, Sign::Beat),
         ];

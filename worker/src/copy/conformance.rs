@@ -1,5 +1,5 @@
-//! What every copy must do, run on each of them. MongoDB only where `BLAZE_TEST_MONGODB_URI` (or `BLAZE_TEST_MONGODB`) names
-//! a server, standalone or replica set.
+//! What every copy must do, run on each of them. MongoDB is that of `BLAZE_TEST_MONGODB_URI`,
+//! standalone or replica set.
 
 use std::sync::Arc;
 
@@ -62,11 +62,11 @@ impl Subject {
 
 /// A server, and a database that no other test has.
 #[cfg(feature = "mongodb")]
-fn mongo_server() -> Option<Kind> {
-    use blaze_runtime::environment::variable;
-    let uri = variable("BLAZE_TEST_MONGODB_URI").or_else(|| variable("BLAZE_TEST_MONGODB"))?;
+fn mongo_server() -> Kind {
+    let uri = blaze_runtime::environment::variable("BLAZE_TEST_MONGODB_URI");
+    let uri = uri.expect("BLAZE_TEST_MONGODB_URI, which is in .services/env after `scripts/services start`");
     let database = format!("blaze_copy_{:016x}", rand::random::<u64>());
-    Some(Kind::Mongo { uri, database })
+    Kind::Mongo { uri, database }
 }
 
 #[cfg(feature = "mongodb")]
@@ -154,7 +154,7 @@ fn the_file_passes() {
 #[cfg(feature = "mongodb")]
 #[test]
 fn mongodb_passes() {
-    mongo_server().map_or((), suite);
+    suite(mongo_server());
 }
 
 /// A write to MongoDB that ends after each of its steps, and what reaches the server late.
@@ -168,8 +168,7 @@ mod in_mongodb {
 
     #[test]
     fn a_write_that_ended_in_the_middle_leaves_the_old_and_goes_with_the_next() {
-        let Some(kind) = mongo_server() else { return };
-        let subject = Subject::new(kind);
+        let subject = Subject::new(mongo_server());
         let Kind::Mongo { uri, database } = &subject.kind else {
             return;
         };
@@ -202,8 +201,7 @@ mod in_mongodb {
 
     #[test]
     fn a_newer_format_stays_and_a_broken_copy_gives_way() {
-        let Some(kind) = mongo_server() else { return };
-        let subject = Subject::new(kind);
+        let subject = Subject::new(mongo_server());
         let Kind::Mongo { uri, database } = &subject.kind else {
             return;
         };

@@ -20,7 +20,8 @@ fn target(copy: &Arc<Fake>, is_read: bool) -> Target {
 }
 
 struct Fixture {
-    supervisor: Supervisor,
+    /// Ends the tasks at the end.
+    _supervisor: Supervisor,
     fake: Arc<Fake>,
     copies: Copies,
     state: State,
@@ -33,7 +34,7 @@ impl Fixture {
         let fake = Arc::new(fake);
         let copies = Copies::start(&supervisor, vec![target(&fake, is_read)], found);
         Self {
-            supervisor,
+            _supervisor: supervisor,
             fake,
             copies,
             state: State::default(),
