@@ -1,6 +1,5 @@
 //! What the admin port shows of a worker.
 
-use std::fmt::Write as _;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -16,16 +15,16 @@ use parking_lot::Mutex;
 use serde_json::json;
 use tokio::sync::watch;
 
-use crate::engine::Status;
+use crate::copy::Counts as CopyCounts;
+use crate::engine::{Counts, Status};
 use crate::running::RunningWorker;
+use crate::serve::SpeakerCounts;
 
 /// Between two looks at the worker, for readiness and metrics.
 const LOOK: Duration = Duration::from_millis(250);
 const NOTHING: &str = "nothing is loaded yet";
 /// The same until services reach it.
 const FIRST_LOOK: Duration = Duration::from_millis(50);
-/// Where configurations can come from.
-const SOURCES: [&str; 3] = ["main", "copy", "file"];
 
 /// The worker once it runs, and how it was at the last look.
 #[derive(Clone, Default)]
@@ -139,11 +138,9 @@ impl Shown {
             let inner = self.inner.lock();
             (inner.worker.clone(), inner.status.clone())
         };
-        let mut out = String::new();
-        if let (Some(worker), Some(status)) = (worker, status) {
-            write(&mut out, &worker, &status);
-        }
-        out
+        worker
+            .zip(status)
+            .map_or_else(String::new, |(worker, status)| text_of(&worker, &status))
     }
 }
 
@@ -165,141 +162,92 @@ fn tell(readiness: &Readiness, status: &Status) {
 }
 
 /// In the text format of Prometheus.
-fn write(out: &mut String, worker: &RunningWorker, status: &Status) {
-    let mut one = |name: &str, kind: &str, help: &str, lines: &[(String, f64)]| {
-        // Writing to a text cannot fail.
-        let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} {kind}");
-        for (labels, value) in lines {
-            let _ = writeln!(out, "{name}{labels} {value}");
-        }
-    };
-    let plain = |value: f64| vec![(String::new(), value)];
-    let (json, speaker) = (&status.json, worker.speaker());
-    let connected = json["connected"].as_bool().unwrap_or_default();
-    one(
-        "blaze_worker_connected",
-        "gauge",
-        "1 while there is a stream from the main service.",
-        &plain(f64::from(u8::from(connected))),
-    );
-    let leader = json["leader"].as_bool().unwrap_or_default();
-    one(
-        "blaze_worker_leader",
-        "gauge",
-        "1 while this worker answers and notifies for its layer or node.",
-        &plain(f64::from(u8::from(leader))),
-    );
-    one(
-        "blaze_worker_revision",
-        "gauge",
-        "Revision of what services get.",
-        &plain(status.revision as f64),
-    );
+fn text_of(worker: &RunningWorker, status: &Status) -> String {
+    let json = &status.json;
+    let is = |name: &str| u8::from(json[name].as_bool().unwrap_or_default());
+    let (connected, leader) = (is("connected"), is("leader"));
+    let [main, copy, file] = ["main", "copy", "file"].map(|word| u8::from(json["source"] == word));
+    let (revision, unwatched) = (status.revision, status.unwatched);
     let age = json["age_s"].as_f64().unwrap_or(f64::NAN);
-    one(
-        "blaze_worker_age_seconds",
-        "gauge",
-        "Since the worker last knew itself in sync with the main service.",
-        &plain(age),
-    );
-    let source = json["source"].as_str();
-    let sources = SOURCES.map(|word| {
-        let is_it = f64::from(u8::from(source == Some(word)));
-        (format!("{{source=\"{word}\"}}"), is_it)
-    });
-    one(
-        "blaze_worker_source",
-        "gauge",
-        "1 for where configurations come from.",
-        &sources,
-    );
-    one(
-        "blaze_worker_notices_total",
-        "counter",
-        "Notices that the broker has taken.",
-        &plain(speaker.notices as f64),
-    );
-    one(
-        "blaze_worker_notices_replaced_total",
-        "counter",
-        "Notices that gave way to newer ones of the same place before the broker took them.",
-        &plain(speaker.replaced as f64),
-    );
-    one(
-        "blaze_worker_notices_waiting",
-        "gauge",
-        "Places with a notice that the broker has not taken yet.",
-        &plain(speaker.waiting as f64),
-    );
-    let counts = status.counts;
-    let requests = [
-        ("answered", counts.answered),
-        ("refused", counts.refused),
-        ("left_to_others", counts.left_to_others),
-    ]
-    .map(|(result, count)| (format!("{{result=\"{result}\"}}"), count as f64));
-    one(
-        "blaze_worker_requests_total",
-        "counter",
-        "Requests for configurations by result.",
-        &requests,
-    );
-    let signs = [
-        ("understood", counts.signs),
-        ("misunderstood", counts.misunderstood),
-        ("left_out", counts.left_out),
-    ]
-    .map(|(result, count)| (format!("{{result=\"{result}\"}}"), count as f64));
-    one(
-        "blaze_worker_signs_total",
-        "counter",
-        "Acknowledgements and signs of life of services by result.",
-        &signs,
-    );
-    one(
-        "blaze_worker_rollouts_failed_total",
-        "counter",
-        "Roll-outs that failed here and were undone.",
-        &plain(counts.failed_rollouts as f64),
-    );
-    one(
-        "blaze_worker_canaries_unwatched",
-        "gauge",
-        "Canaries that are not judged, because there are too many.",
-        &plain(status.unwatched as f64),
-    );
-    one(
-        "blaze_worker_sync_faults_total",
-        "counter",
-        "Streams that were begun anew because something was missing or different.",
-        &plain(counts.faults as f64),
-    );
+    let SpeakerCounts {
+        notices,
+        replaced,
+        waiting,
+        ..
+    } = worker.speaker();
+    let Counts {
+        answered,
+        refused,
+        left_to_others,
+        faults,
+        signs,
+        misunderstood,
+        left_out,
+        failed_rollouts,
+    } = status.counts;
     let copies = worker.copies();
-    let of = |count: fn(&crate::copy::Counts) -> u64| -> Vec<(String, f64)> {
-        let label = |place: &str| format!("{{copy=\"{}\"}}", place.replace(['"', '\\', '\n'], "_"));
-        copies
-            .iter()
-            .map(|copy| (label(&copy.place), count(copy) as f64))
-            .collect()
+    let of = |name: &str, count: fn(&CopyCounts) -> u64| -> String {
+        let place = |copy: &CopyCounts| copy.place.replace(['"', '\\', '\n'], "_");
+        let line = |copy| format!("{name}{{copy=\"{}\"}} {}\n", place(copy), count(copy));
+        copies.iter().map(line).collect()
     };
-    one(
-        "blaze_worker_copy_writes_total",
-        "counter",
-        "Writes of a copy that were done.",
-        &of(|copy| copy.written),
-    );
-    one(
-        "blaze_worker_copy_failures_total",
-        "counter",
-        "Writes of a copy that failed.",
-        &of(|copy| copy.failed),
-    );
-    one(
-        "blaze_worker_copy_current",
-        "gauge",
-        "1 while a copy holds all that it should.",
-        &of(|copy| u64::from(copy.is_current)),
-    );
+    let writes = of("blaze_worker_copy_writes_total", |copy| copy.written);
+    let failures = of("blaze_worker_copy_failures_total", |copy| copy.failed);
+    let current = of("blaze_worker_copy_current", |copy| u64::from(copy.is_current));
+    format!(
+        r#"# HELP blaze_worker_connected 1 while there is a stream from the main service.
+# TYPE blaze_worker_connected gauge
+blaze_worker_connected {connected}
+# HELP blaze_worker_leader 1 while this worker answers and notifies for its layer or node.
+# TYPE blaze_worker_leader gauge
+blaze_worker_leader {leader}
+# HELP blaze_worker_revision Revision of what services get.
+# TYPE blaze_worker_revision gauge
+blaze_worker_revision {revision}
+# HELP blaze_worker_age_seconds Since the worker last knew itself in sync with the main service.
+# TYPE blaze_worker_age_seconds gauge
+blaze_worker_age_seconds {age}
+# HELP blaze_worker_source 1 for where configurations come from.
+# TYPE blaze_worker_source gauge
+blaze_worker_source{{source="main"}} {main}
+blaze_worker_source{{source="copy"}} {copy}
+blaze_worker_source{{source="file"}} {file}
+# HELP blaze_worker_notices_total Notices that the broker has taken.
+# TYPE blaze_worker_notices_total counter
+blaze_worker_notices_total {notices}
+# HELP blaze_worker_notices_replaced_total Notices that gave way to newer ones of the same place before the broker took them.
+# TYPE blaze_worker_notices_replaced_total counter
+blaze_worker_notices_replaced_total {replaced}
+# HELP blaze_worker_notices_waiting Places with a notice that the broker has not taken yet.
+# TYPE blaze_worker_notices_waiting gauge
+blaze_worker_notices_waiting {waiting}
+# HELP blaze_worker_requests_total Requests for configurations by result.
+# TYPE blaze_worker_requests_total counter
+blaze_worker_requests_total{{result="answered"}} {answered}
+blaze_worker_requests_total{{result="refused"}} {refused}
+blaze_worker_requests_total{{result="left_to_others"}} {left_to_others}
+# HELP blaze_worker_signs_total Acknowledgements and signs of life of services by result.
+# TYPE blaze_worker_signs_total counter
+blaze_worker_signs_total{{result="understood"}} {signs}
+blaze_worker_signs_total{{result="misunderstood"}} {misunderstood}
+blaze_worker_signs_total{{result="left_out"}} {left_out}
+# HELP blaze_worker_rollouts_failed_total Roll-outs that failed here and were undone.
+# TYPE blaze_worker_rollouts_failed_total counter
+blaze_worker_rollouts_failed_total {failed_rollouts}
+# HELP blaze_worker_canaries_unwatched Canaries that are not judged, because there are too many.
+# TYPE blaze_worker_canaries_unwatched gauge
+blaze_worker_canaries_unwatched {unwatched}
+# HELP blaze_worker_sync_faults_total Streams that were begun anew because something was missing or different.
+# TYPE blaze_worker_sync_faults_total counter
+blaze_worker_sync_faults_total {faults}
+# HELP blaze_worker_copy_writes_total Writes of a copy that were done.
+# TYPE blaze_worker_copy_writes_total counter
+{writes}# HELP blaze_worker_copy_failures_total Writes of a copy that failed.
+# TYPE blaze_worker_copy_failures_total counter
+{failures}# HELP blaze_worker_copy_current 1 while a copy holds all that it should.
+# TYPE blaze_worker_copy_current gauge
+{current}"#
+    )
 }
 
 async fn status(State(shown): State<Shown>) -> Response {

@@ -1,56 +1,9 @@
 //! What is handed on to the engine, and what is not.
 
-use blaze_brokers::memory::MemoryHub;
-use blaze_brokers::{Publisher, PublisherOptions};
 use blaze_domain::node_file::{NodeBroker, NodeFile};
 use tokio::task::JoinSet;
 
 use super::*;
-
-async fn publisher(broker: &dyn Broker, channel: &str) -> Arc<dyn Publisher> {
-    broker
-        .publisher(&channel.parse().unwrap(), PublisherOptions::default())
-        .unwrap()
-}
-
-async fn within<T>(work: impl Future<Output = T>) -> T {
-    tokio::time::timeout(Duration::from_secs(20), work)
-        .await
-        .expect("within 20 s")
-}
-
-#[tokio::test]
-async fn what_comes_on_a_channel_is_handed_on_in_its_order() {
-    let hub = MemoryHub::new("edge");
-    let (broker, other): (Arc<dyn Broker>, Arc<dyn Broker>) = (Arc::new(hub.broker()), Arc::new(hub.broker()));
-    let (send, mut heard) = mpsc::channel(4);
-    let mut tasks = JoinSet::new();
-    tasks.spawn(listen(Arc::clone(&broker), ACK, send, Sign::Ack, Arc::default()));
-    let (acks, elsewhere) = (publisher(&*other, ACK).await, publisher(&*other, GET).await);
-    // Until it listens nobody hears.
-    let first = async {
-        loop {
-            acks.publish_bare(&Bytes::from("0"), None);
-            if let Ok(Some(sign)) = tokio::time::timeout(Duration::from_millis(20), heard.recv()).await {
-                return sign;
-            }
-        }
-    };
-    assert!(matches!(within(first).await, Sign::Ack(bytes) if bytes == "0"));
-    elsewhere.publish_bare(&Bytes::from("of another channel"), None);
-    for number in 1..=100 {
-        acks.publish_bare(&Bytes::from(number.to_string()), None);
-    }
-    let mut last = 0;
-    while last < 100 {
-        let Some(Sign::Ack(bytes)) = within(heard.recv()).await else {
-            panic!("something else was handed on");
-        };
-        let number: u32 = std::str::from_utf8(&bytes).unwrap().parse().unwrap();
-        assert!(number == last + 1 || number == 0, "{number} after {last}");
-        last = last.max(number);
-    }
-}
 
 #[tokio::test(start_paused = true)]
 async fn that_the_broker_is_away_is_said_each_second_and_once_more_when_it_is_back() {

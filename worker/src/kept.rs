@@ -1,68 +1,41 @@
-//! Which copies a worker has, and what it begins from.
+//! Which copies a worker has.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
 use blaze_domain::node_file::DatabaseSection;
-use blaze_runtime::Supervisor;
-use tokio::sync::mpsc;
 
-use crate::copy::{Copies, DATABASE_LIMIT, FileCopy, Found, LocalCopy, Start, Target, Vault, choose};
+use crate::copy::{FileCopy, LocalCopy, Vault};
 use crate::settings::WorkerSettings;
 
-/// Where copies are kept.
-pub(crate) struct Kept {
-    file: Option<Arc<dyn LocalCopy>>,
-    database: Option<Arc<dyn LocalCopy>>,
-}
+/// A place that keeps a copy, if there is one.
+type Copy = Option<Arc<dyn LocalCopy>>;
 
-impl Kept {
-    /// Where the settings say.
-    ///
-    /// # Errors
-    /// A folder or database that cannot be worked with.
-    pub(crate) async fn open(
-        settings: &WorkerSettings,
-        folder: Option<PathBuf>,
-        vault: &Vault,
-    ) -> anyhow::Result<Self> {
-        let layer = &settings.site.layer;
-        let folder = match &settings.database {
-            Some(DatabaseSection::Embedded { path }) => Some(path.clone()),
-            Some(DatabaseSection::MongoDb { .. }) | None => folder,
-        };
-        let file = match folder {
-            None => None,
-            Some(folder) => {
-                make_folder(&folder).await?;
-                Some(Arc::new(FileCopy::new(&folder, layer.clone(), vault.clone())) as Arc<dyn LocalCopy>)
-            }
-        };
-        let database = match &settings.database {
-            Some(DatabaseSection::MongoDb { uri, database }) => {
-                Some(mongodb(uri.clone(), database, settings, vault).context("database.mongodb")?)
-            }
-            Some(DatabaseSection::Embedded { .. }) | None => None,
-        };
-        Ok(Self { file, database })
-    }
-
-    /// Reads what is there and keeps it up to date from now on; `find` takes what can be read only later.
-    pub(crate) async fn begin(self, supervisor: &Supervisor, find: &mpsc::Sender<Found>) -> (Option<Copies>, Start) {
-        let start = choose(self.file.as_ref(), self.database.as_ref(), DATABASE_LIMIT).await;
-        let targets = [self.file, self.database].into_iter().flatten();
-        let targets: Vec<Target> = targets
-            .map(|copy| Target {
-                is_read: !start.unread.contains(&copy.describe()),
-                copy,
-            })
-            .collect();
-        if targets.is_empty() {
-            return (None, start);
+/// The file and the database, where the settings say.
+///
+/// # Errors
+/// A folder or database that cannot be worked with.
+pub(crate) async fn open(
+    settings: &WorkerSettings,
+    folder: Option<PathBuf>,
+    vault: &Vault,
+) -> anyhow::Result<(Copy, Copy)> {
+    let layer = &settings.site.layer;
+    let (folder, database) = match &settings.database {
+        Some(DatabaseSection::Embedded { path }) => (Some(path.clone()), None),
+        Some(DatabaseSection::MongoDb { uri, database }) => {
+            let copy = mongodb(uri.clone(), database, settings, vault).context("database.mongodb")?;
+            (folder, Some(copy))
         }
-        (Some(Copies::start(supervisor, targets, find)), start)
-    }
+        None => (folder, None),
+    };
+    let Some(folder) = folder else {
+        return Ok((None, database));
+    };
+    make_folder(&folder).await?;
+    let file: Arc<dyn LocalCopy> = Arc::new(FileCopy::new(&folder, layer.clone(), vault.clone()));
+    Ok((Some(file), database))
 }
 
 #[cfg(feature = "mongodb")]

@@ -161,22 +161,15 @@ async fn start(
     );
     let follow = follow_node_file(Arc::clone(&worker), told, log, readiness.clone());
     supervisor.spawn("reload", TaskPolicy::Essential, follow);
-    spawn(supervisor, "ready line", async move {
-        shown.begun().await;
-        // Without a reader of stdout there is nobody to tell.
-        let _ = ready_line(&[("admin", address)]);
-    });
-    Ok((worker, readiness))
-}
-
-fn spawn(supervisor: &Supervisor, name: &str, task: impl Future<Output = ()> + Send + 'static) {
     let stop = supervisor.stopping_token();
-    supervisor.spawn(name, TaskPolicy::MayEnd, async move {
+    supervisor.spawn("ready line", TaskPolicy::MayEnd, async move {
         tokio::select! {
-            () = task => {}
+            // Without a reader of stdout there is nobody to tell.
+            () = shown.begun() => drop(ready_line(&[("admin", address)])),
             () = stop.cancelled() => {}
         }
     });
+    Ok((worker, readiness))
 }
 
 async fn begin(

@@ -20,11 +20,11 @@ use bytes::Bytes;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio_util::sync::CancellationToken;
 
-use crate::copy::{Copies, Counts as CopyCounts, Vault, defaults};
+use crate::copy::{Copies, Counts as CopyCounts, Vault, choose, defaults};
 use crate::core::Site;
-use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Query, Replies, Sign, Status};
+use crate::engine::{Engine, Identity, Inputs, Outputs, QUEUE, Replies, Sign, Status};
 use crate::hearing::{ACK, GET, WATCHDOG, listen, notice_deafness, scan};
-use crate::kept::Kept;
+use crate::kept;
 use crate::lease::{self, Holder, Leadership, Lease};
 use crate::own::{OwnConfig, say_again};
 use crate::serve::{BrokerOutlet, Channels, Speaker, SpeakerCounts};
@@ -60,7 +60,7 @@ pub struct WorkerOptions {
 
 /// A worker that runs until its supervisor ends.
 pub struct RunningWorker {
-    queries: mpsc::Sender<Query>,
+    queries: mpsc::Sender<oneshot::Sender<Status>>,
     speaker: Speaker,
     copies: Option<Copies>,
     lease: Option<LeaseEnd>,
@@ -93,9 +93,11 @@ impl RunningWorker {
             instance,
         } = options;
         let vault = Vault::load(settings.key_file.as_deref()).context("worker.key_file")?;
-        let kept = Kept::open(&settings, folder, &vault).await?;
+        let (file, database) = kept::open(&settings, folder, &vault).await?;
         let (find, found) = mpsc::channel(COPIES);
-        let (copies, start) = kept.begin(supervisor, &find).await;
+        let start = choose(file, database).await;
+        let has_copies = !start.targets.is_empty();
+        let copies = has_copies.then(|| Copies::start(supervisor, start.targets, &find));
         if let Some(from) = &start.from {
             tracing::info!(from, "services get their last configuration");
         }
@@ -113,9 +115,7 @@ impl RunningWorker {
             let site = settings.site.clone();
             let is_own = move |value: &[u8]| is_own(&site, value);
             let lock = lease.as_ref().and_then(|lease| lease.lock().cloned());
-            outlet = outlet
-                .with_keys(keys, settings.keys_on_broker(), is_own)
-                .while_held(lock);
+            outlet = outlet.with_keys(keys, settings.keys_on_broker(), lock, is_own);
         }
         let outlet = Arc::new(outlet);
         let (acks, acked) = watch::channel(None);
@@ -127,20 +127,22 @@ impl RunningWorker {
             Some(path) => defaults::watch_file(supervisor, path.clone(), settings.site.layer.clone(), LOOK_AT_FILE),
             None => watch::channel(defaults::Status::default()).1,
         };
+        let (own, said_of_own, own_acks) = OwnConfig::new(&settings.node, instance)?;
         let identity = Identity {
             site: settings.site.clone(),
-            node: Some(settings.node.clone()),
+            node: settings.node.clone(),
             worker_id,
             delivery: settings.delivery,
         };
         let outputs = Outputs {
-            replies: Arc::new(BrokerReplies::new(Arc::clone(&outlet), broker.kind())),
+            replies: Arc::clone(&outlet) as Arc<dyn Replies>,
             speaker: speaker.clone(),
             channels: outlet
                 .makes_channels()
                 .then(|| Arc::clone(&outlet) as Arc<dyn Channels>),
             copies: copies.clone(),
             acks,
+            own: Some(said_of_own),
             term: leadership.term,
             told: leadership.told,
         };
@@ -165,41 +167,21 @@ impl RunningWorker {
             });
         };
         let hears_requests = Arc::new(AtomicBool::new(false));
-        let (own, said_of_own, own_acks) = OwnConfig::new(&settings.node, instance)?;
         spawn("own state", Box::pin(say_again(own_acks, said.clone())));
-        let engine = Engine::new(identity, outputs, start.loaded).with_own(said_of_own);
+        let engine = Engine::new(identity, outputs, start.loaded);
         spawn("engine", Box::pin(engine.run(inputs, stop.clone())));
         spawn("notices", Box::pin(speaker.clone().run(outlet)));
-        spawn(
-            "requests",
-            Box::pin(listen(
-                Arc::clone(&broker),
-                GET,
-                requests,
-                |payload| payload,
-                Arc::clone(&hears_requests),
-            )),
-        );
-        spawn(
-            "acknowledgements",
-            Box::pin(listen(
-                Arc::clone(&broker),
-                ACK,
-                said.clone(),
-                Sign::Ack,
-                Arc::default(),
-            )),
-        );
-        spawn(
-            "watchdogs",
-            Box::pin(listen(
-                Arc::clone(&broker),
-                WATCHDOG,
-                said.clone(),
-                Sign::Beat,
-                Arc::default(),
-            )),
-        );
+        let hears = Arc::clone(&hears_requests);
+        let listening = listen(Arc::clone(&broker), GET, requests, |payload| payload, hears);
+        spawn("requests", Box::pin(listening));
+        let heard: [(&str, &str, fn(Bytes) -> Sign); 2] = [
+            ("acknowledgements", ACK, Sign::Ack),
+            ("watchdogs", WATCHDOG, Sign::Beat),
+        ];
+        for (name, channel, into) in heard {
+            let listening = listen(Arc::clone(&broker), channel, said.clone(), into, Arc::default());
+            spawn(name, Box::pin(listening));
+        }
         spawn("outages", Box::pin(notice_deafness(broker.status(), said.clone())));
         if let Some(records) = records {
             spawn("records of watchdogs", Box::pin(scan(records, said)));
@@ -242,7 +224,7 @@ impl RunningWorker {
     /// How it is; `None` if it has ended.
     pub async fn status(&self) -> Option<Status> {
         let (send, answer) = oneshot::channel();
-        self.queries.send(Query::Status(send)).await.ok()?;
+        self.queries.send(send).await.ok()?;
         answer.await.ok()
     }
 
@@ -329,28 +311,15 @@ fn is_own(site: &Site, value: &[u8]) -> bool {
     is_node && value["layer"] == site.layer.as_str() && value["hash"].is_string()
 }
 
-/// Answers over the broker.
-struct BrokerReplies {
-    outlet: Arc<BrokerOutlet>,
-    shared: Option<ChannelName>,
-}
-
-impl BrokerReplies {
-    fn new(outlet: Arc<BrokerOutlet>, kind: BrokerKind) -> Self {
-        let shared = match kind {
-            BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => Some(ChannelName::shared_reply()),
-            BrokerKind::Memory | BrokerKind::Redis => None,
-        };
-        Self { outlet, shared }
-    }
-}
-
-impl Replies for BrokerReplies {
+impl Replies for BrokerOutlet {
     fn reply(&self, to: &ChannelName, payload: Bytes) -> Result<(), String> {
-        self.outlet.publish(to, &payload).map_err(|error| error.to_string())
+        self.publish(to, &payload).map_err(|error| error.to_string())
     }
 
     fn shared(&self) -> Option<ChannelName> {
-        self.shared.clone()
+        match self.kind() {
+            BrokerKind::Kafka | BrokerKind::Dds | BrokerKind::Ros2 => Some(ChannelName::shared_reply()),
+            BrokerKind::Memory | BrokerKind::Redis => None,
+        }
     }
 }

@@ -153,9 +153,14 @@ fn reads_nobody_else(redis: &RedisBroker) -> bool {
     if redis.tls.is_some() || url.starts_with("rediss://") {
         return true;
     }
-    let Some(rest) = url.strip_prefix("redis://") else {
-        return url.starts_with("redis+unix://") || url.starts_with("unix://");
-    };
+    match url.strip_prefix("redis://") {
+        Some(rest) => is_this_machine(rest),
+        None => url.starts_with("redis+unix://") || url.starts_with("unix://"),
+    }
+}
+
+/// Whether what follows `scheme://` in an address is on this machine.
+pub(crate) fn is_this_machine(rest: &str) -> bool {
     let authority = rest.split(['/', '?', '#']).next().unwrap_or_default();
     let host = authority.rsplit_once('@').map_or(authority, |(_, host)| host);
     let host = match host.strip_prefix('[') {

@@ -6,10 +6,9 @@
 //! could not be read at the start ─▶ task: load until it can be ──▶ Found ──▶ engine
 //! ```
 //!
-//! A slot holds one update; a newer update replaces it and is counted. So a caller never waits, a copy that is slow or away
+//! A slot holds one update; a newer update replaces it. So a caller never waits, a copy that is slow or away
 //! costs one state, and the newest state is written.
 
-use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
@@ -75,12 +74,8 @@ pub struct Counts {
     pub written: u64,
     /// Writes that failed; each is tried again, then with the newest state.
     pub failed: u64,
-    /// Updates that were merged into one that waited.
-    pub coalesced: u64,
     /// Whether the copy holds all that it should: what was stored, and nothing is owed.
     pub is_current: bool,
-    /// Why the last write failed; none once one was done again.
-    pub error: Option<String>,
 }
 
 /// Keeps the copies up to date. Clones share them.
@@ -94,6 +89,7 @@ pub struct Copies {
 }
 
 /// What waits for one copy, and what became of it.
+#[derive(Default)]
 struct Slot {
     place: String,
     next: Mutex<Option<Update>>,
@@ -106,33 +102,13 @@ struct Slot {
     done: watch::Sender<u64>,
     written: AtomicU64,
     failed: AtomicU64,
-    coalesced: AtomicU64,
-    error: Mutex<Option<String>>,
 }
 
 impl Slot {
-    fn new(place: String) -> Self {
-        Self {
-            place,
-            next: Mutex::new(None),
-            wake: Notify::new(),
-            hurry: Notify::new(),
-            stored: AtomicU64::new(0),
-            done: watch::Sender::new(0),
-            written: AtomicU64::new(0),
-            failed: AtomicU64::new(0),
-            coalesced: AtomicU64::new(0),
-            error: Mutex::new(None),
-        }
-    }
-
     fn put(&self, update: &Update) {
         let mut update = update.clone();
         let mut next = self.next.lock();
-        if let Some(before) = next.take() {
-            self.coalesced.fetch_add(1, Ordering::Relaxed);
-            update.has_changed |= before.has_changed;
-        }
+        update.has_changed |= next.take().is_some_and(|before| before.has_changed);
         *next = Some(update);
         self.stored.fetch_add(1, Ordering::AcqRel);
         drop(next);
@@ -149,10 +125,7 @@ impl Slot {
     fn put_back(&self, update: Update) {
         let mut next = self.next.lock();
         match &mut *next {
-            Some(newer) => {
-                newer.has_changed = true;
-                self.coalesced.fetch_add(1, Ordering::Relaxed);
-            }
+            Some(newer) => newer.has_changed = true,
             None => *next = Some(update),
         }
     }
@@ -168,9 +141,7 @@ impl Slot {
             place: self.place.clone(),
             written: number(&self.written),
             failed: number(&self.failed),
-            coalesced: number(&self.coalesced),
             is_current: self.is_current(),
-            error: self.error.lock().clone(),
         }
     }
 }
@@ -181,7 +152,11 @@ impl Copies {
     pub fn start(supervisor: &Supervisor, targets: Vec<Target>, found: &mpsc::Sender<Found>) -> Self {
         let answers = watch::Sender::new(false);
         let start = |target: Target| {
-            let slot = Arc::new(Slot::new(target.copy.describe()));
+            let place = target.copy.describe();
+            let slot = Arc::new(Slot {
+                place,
+                ..Slot::default()
+            });
             let writer = Writer {
                 copy: target.copy,
                 slot: Arc::clone(&slot),
@@ -255,12 +230,6 @@ impl Copies {
                 ..counts
             })
             .collect()
-    }
-}
-
-impl fmt::Debug for Copies {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_list().entries(self.counts()).finish()
     }
 }
 
@@ -392,23 +361,15 @@ impl Writer {
 
     /// It can be used, whatever was the matter before.
     fn recovered(&mut self) {
-        let slot = &self.slot;
-        if slot.error.lock().take().is_some() {
-            tracing::info!(copy = slot.place, failures = self.failures, "the copy is there again");
+        if std::mem::take(&mut self.failures) > 0 {
+            tracing::info!(copy = self.slot.place, "the copy is there again");
         }
-        self.failures = 0;
     }
 
     fn failed(&mut self, error: &CopyError) -> Duration {
-        let slot = &self.slot;
-        slot.failed.fetch_add(1, Ordering::Relaxed);
-        let text = error.to_string();
-        let told = slot.error.lock().replace(text.clone());
-        if told.is_none() {
-            tracing::warn!(
-                error = text,
-                "a copy of the configuration is not written; it is tried again"
-            );
+        self.slot.failed.fetch_add(1, Ordering::Relaxed);
+        if self.failures == 0 {
+            tracing::warn!(%error, "a copy of the configuration is not written; it is tried again");
         }
         let bound = PAUSE.0.saturating_mul(1 << self.failures.min(16)).min(PAUSE.1);
         self.failures = self.failures.saturating_add(1);

@@ -10,7 +10,7 @@ use tokio::sync::Semaphore;
 
 use super::*;
 use crate::copy::fake::Fake;
-use crate::copy::samples::{loaded, notes, position, service};
+use crate::copy::samples::{loaded, position, service};
 
 const LONG: Duration = Duration::from_secs(300);
 
@@ -20,7 +20,7 @@ fn target(copy: &Arc<Fake>, is_read: bool) -> Target {
 }
 
 struct Fixture {
-    supervisor: Supervisor,
+    _supervisor: Supervisor,
     fake: Arc<Fake>,
     copies: Copies,
     state: State,
@@ -33,7 +33,7 @@ impl Fixture {
         let fake = Arc::new(fake);
         let copies = Copies::start(&supervisor, vec![target(&fake, is_read)], found);
         Self {
-            supervisor,
+            _supervisor: supervisor,
             fake,
             copies,
             state: State::default(),
@@ -76,23 +76,7 @@ impl Fixture {
 }
 
 #[tokio::test(start_paused = true)]
-async fn each_write_is_everything() {
-    let mut fixture = Fixture::read(Fake::new("fake"));
-    fixture.put("a", 1);
-    fixture.put("b", 2);
-    assert!(fixture.copies.flush(LONG).await);
-    fixture.state.remove(&"Service/a".parse().unwrap());
-    fixture.notes = Arc::new(notes("uid", 3));
-    fixture.store(position(3), true);
-    assert!(fixture.copies.flush(LONG).await);
-    let held = fixture.held();
-    assert_eq!((held.documents, held.position), (fixture.expected(), position(3)));
-    assert!(held.notes.failed.contains(&"uid".to_owned()));
-    assert!(fixture.supervisor.shutdown(LONG).await.is_clean());
-}
-
-#[tokio::test(start_paused = true)]
-async fn a_slow_copy_gets_the_newest_state_and_the_rest_is_counted() {
+async fn a_slow_copy_gets_the_newest_state() {
     let slow = Fake {
         permits: Semaphore::new(0),
         ..Fake::new("slow")
@@ -109,7 +93,7 @@ async fn a_slow_copy_gets_the_newest_state_and_the_rest_is_counted() {
     assert!(fixture.copies.flush(LONG).await);
     assert_eq!(fixture.held().documents, fixture.expected());
     let counts = &fixture.copies.counts()[0];
-    assert_eq!((counts.written, counts.coalesced, counts.is_current), (2, 99, true));
+    assert_eq!((counts.written, counts.is_current), (2, true));
 }
 
 #[tokio::test(start_paused = true)]
@@ -124,11 +108,9 @@ async fn a_copy_that_comes_back_gets_everything() {
     let counts = fixture.copies.counts();
     assert!(counts[0].failed >= 8, "it is tried again and again: {counts:?}");
     assert!(counts[0].failed < 100, "with pauses: {counts:?}");
-    assert!(counts[0].error.as_ref().unwrap().contains("told so"));
     fixture.fake.is_away.store(false, Ordering::Relaxed);
     assert!(fixture.copies.flush(LONG).await);
     assert_eq!((fixture.writes(), fixture.held().documents), (2, fixture.expected()));
-    assert_eq!(fixture.copies.counts()[0].error, None);
 }
 
 #[tokio::test(start_paused = true)]

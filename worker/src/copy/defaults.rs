@@ -31,8 +31,6 @@ use tokio::time::MissedTickBehavior;
 
 /// Largest file, in bytes (64 MiB).
 const MAX_BYTES: u64 = 64 * 1024 * 1024;
-/// Between two looks at the file.
-pub const PERIOD: Duration = Duration::from_millis(500);
 /// Quiet time after a change: who writes a file needs several steps.
 const QUIET: Duration = Duration::from_millis(100);
 /// Looks until a file that never rests is read all the same.
@@ -47,12 +45,8 @@ const SOURCE: &str = "file";
 pub struct Defaults {
     /// The documents of the layer's view, in the order of their keys, all of revision 0.
     pub documents: Vec<Arc<Document>>,
-    /// When the file was last changed.
-    pub as_of: Timestamp,
     /// Documents of other layers' views, which do not count here.
     pub left_out: usize,
-    /// Roll-outs, which never count.
-    pub rollouts: usize,
 }
 
 /// Without the documents, for they may hold texts of secrets.
@@ -60,9 +54,7 @@ impl fmt::Debug for Defaults {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Defaults")
             .field("documents", &self.documents.len())
-            .field("as_of", &self.as_of)
             .field("left_out", &self.left_out)
-            .field("rollouts", &self.rollouts)
             .finish()
     }
 }
@@ -80,10 +72,6 @@ pub fn read(path: &Path, layer: &LayerName) -> Result<Defaults, DefaultsError> {
     let name = path.display();
     let one = |detail: String| DefaultsError(vec![format!("{name}: {detail}")]);
     let file = File::open(path).map_err(|error| one(format!("cannot be read: {error}")))?;
-    let changed = file.metadata().map(|metadata| {
-        let millis = metadata.mtime().saturating_mul(1_000);
-        Timestamp::from_millis(millis.saturating_add(metadata.mtime_nsec() / 1_000_000))
-    });
     let mut bytes = Vec::new();
     file.take(MAX_BYTES + 1)
         .read_to_end(&mut bytes)
@@ -100,7 +88,7 @@ pub fn read(path: &Path, layer: &LayerName) -> Result<Defaults, DefaultsError> {
         DefaultsError(vec![format!("{name}:{line}: is not UTF-8")])
     })?;
     let documents = parse(&text, &name.to_string())?;
-    Ok(in_view(documents, layer, changed.unwrap_or_default()))
+    Ok(in_view(documents, layer))
 }
 
 /// All documents of a text, by key.
@@ -207,10 +195,9 @@ fn fault(pointer: &str, detail: &str) -> FieldFault {
     }
 }
 
-fn in_view(mut documents: BTreeMap<Key, Document>, layer: &LayerName, as_of: Timestamp) -> Defaults {
-    let all = documents.len();
+fn in_view(mut documents: BTreeMap<Key, Document>, layer: &LayerName) -> Defaults {
     documents.retain(|key, _| key.kind() != Kind::Rollout);
-    let (rollouts, all) = (all - documents.len(), documents.len());
+    let all = documents.len();
     let state = State::new(0, documents.into_values());
     let documents: Vec<Arc<Document>> = state
         .all()
@@ -220,9 +207,7 @@ fn in_view(mut documents: BTreeMap<Key, Document>, layer: &LayerName, as_of: Tim
         .collect();
     Defaults {
         left_out: all - documents.len(),
-        rollouts,
         documents,
-        as_of,
     }
 }
 

@@ -94,22 +94,3 @@ impl CopyError {
 fn held(own: Option<&str>) -> String {
     own.map_or_else(|| "is not given".to_owned(), |own| format!("holds {own}"))
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_error_says_which_key_is_missing() {
-        let error = |own: Option<&str>| CopyError::OtherKey {
-            place: "file x".to_owned(),
-            found: "ab".to_owned(),
-            own: own.map(str::to_owned),
-        };
-        assert_eq!(
-            error(None).to_string(),
-            "file x is encrypted with key ab, and worker.key_file is not given"
-        );
-        assert!(error(Some("cd")).to_string().ends_with("holds cd"));
-    }
-}

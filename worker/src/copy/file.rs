@@ -3,7 +3,7 @@
 //! ```text
 //! replace ─▶ last-known-good.new (mode 0600) ─[fsync]─▶ [rename] last-known-good ─▶ [fsync of the folder]
 //!                                                              │ content that cannot be read
-//!                                                              └─▶ last-known-good.broken-<milliseconds>, the newest three
+//!                                                              └─▶ last-known-good.broken, the newest one
 //! ```
 //!
 //! Reading changes nothing: a worker that was started with the wrong key finds its file when it is started with the right
@@ -14,7 +14,6 @@ use std::io::{self, Read as _, Write as _};
 use std::os::unix::fs::{OpenOptionsExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use async_trait::async_trait;
 use blaze_domain::LayerName;
@@ -26,8 +25,6 @@ use super::{CopyError, Loaded, LocalCopy, Position, Vault, format};
 pub const FILE_NAME: &str = "last-known-good";
 /// Largest file that is written and read (1 GiB).
 const MAX_BYTES: u64 = 1024 * 1024 * 1024;
-/// Files that were moved aside and are kept.
-const KEPT_ASIDE: usize = 3;
 
 /// The file. Two processes must not have the same folder.
 pub struct FileCopy {
@@ -159,7 +156,8 @@ impl Inner {
         file.write_all(content)?;
         file.sync_all()?;
         if is_unreadable {
-            let aside = set_aside(&self.path)?;
+            let aside = beside(&self.path, "broken");
+            fs::rename(&self.path, &aside)?;
             tracing::warn!(
                 file = %self.path.display(), aside = %aside.display(),
                 "the copy cannot be read; it was moved aside and a new one is written"
@@ -167,12 +165,8 @@ impl Inner {
         }
         fs::rename(&temporary, &self.path)?;
         // The rename itself is in the folder.
-        File::open(folder_of(&self.path))?.sync_all()
+        File::open(self.path.parent().unwrap_or(Path::new(".")))?.sync_all()
     }
-}
-
-fn folder_of(path: &Path) -> &Path {
-    path.parent().unwrap_or(Path::new("."))
 }
 
 /// A file beside another one: its name and `.ending`.
@@ -180,29 +174,6 @@ fn beside(path: &Path, ending: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(format!(".{ending}"));
     PathBuf::from(name)
-}
-
-/// Gives a file the name `<name>.broken-<milliseconds>`, and removes all but the newest of these.
-fn set_aside(path: &Path) -> io::Result<PathBuf> {
-    let now = SystemTime::now().duration_since(UNIX_EPOCH);
-    let aside = beside(path, &format!("broken-{:013}", now.map_or(0, |now| now.as_millis())));
-    fs::rename(path, &aside)?;
-    let start = beside(path, "broken-");
-    let is_one = |found: &PathBuf| {
-        let rest = found.as_os_str().as_encoded_bytes();
-        let rest = rest.strip_prefix(start.as_os_str().as_encoded_bytes());
-        rest.is_some_and(|rest| rest.iter().all(u8::is_ascii_digit))
-    };
-    let entries = fs::read_dir(folder_of(path))?;
-    let mut all: Vec<PathBuf> = entries
-        .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(is_one)
-        .collect();
-    all.sort();
-    for old in all.iter().rev().skip(KEPT_ASIDE) {
-        fs::remove_file(old)?;
-    }
-    Ok(aside)
 }
 
 #[cfg(test)]

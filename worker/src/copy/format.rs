@@ -17,11 +17,10 @@ use aws_lc_rs::digest::{Context, SHA256};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use blaze_domain::LayerName;
-use serde_json::{Value, json};
+use serde::{Deserialize, Serialize};
 
-use super::json::{self, FormError};
 use super::vault::{SALT_BYTES, new_salt};
-use super::{CopyError, Loaded, Position, Vault};
+use super::{CopyError, Loaded, Notes, Position, Vault, json};
 
 /// Begins every copy.
 const MAGIC: &str = "blaze-copy";
@@ -30,31 +29,53 @@ pub(super) const FORMAT: u64 = 2;
 /// Longest first line.
 const MAX_HEADER_BYTES: usize = 4 * 1024;
 
+/// The first line, behind its hash.
+#[derive(Serialize, Deserialize)]
+struct Header {
+    position: Position,
+    documents: usize,
+    encryption: Option<Encryption>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Encryption {
+    /// By what the key is known.
+    key: String,
+    /// In base64.
+    salt: String,
+}
+
 /// The whole copy.
 ///
 /// # Errors
 /// [`CopyError::Sealing`].
 pub(super) fn encode(whole: &Loaded, vault: &Vault) -> Result<Vec<u8>, CopyError> {
-    let mut body = format!("{}\n", json::notes_to_json(&whole.notes)).into_bytes();
+    let mut body = as_line(&*whole.notes);
     for document in &whole.documents {
         // A vector takes whatever is written to it.
         let _ = writeln!(body, "{}", vault.writable(document).to_json());
     }
     let salt = new_salt()?;
-    let encryption = match vault.key_id() {
-        Some(id) => json!({ "key": id, "salt": STANDARD.encode(salt) }),
-        None => Value::Null,
-    };
-    let header = json!({
-        "position": json::position_to_json(&whole.position), "documents": whole.documents.len(),
-        "encryption": encryption,
+    let header = as_line(&Header {
+        position: whole.position.clone(),
+        documents: whole.documents.len(),
+        encryption: vault.key_id().map(|id| Encryption {
+            key: id.to_owned(),
+            salt: STANDARD.encode(salt),
+        }),
     });
-    let header = format!("{header}\n");
-    vault.encrypt(&salt, header.as_bytes(), &mut body)?;
-    let hash = hash(header.as_bytes(), &body);
-    let mut out = format!("{MAGIC} {FORMAT} {hash} {header}").into_bytes();
+    vault.encrypt(&salt, &header, &mut body)?;
+    let mut out = format!("{MAGIC} {FORMAT} {} ", hash(&header, &body)).into_bytes();
+    out.extend(header);
     out.append(&mut body);
     Ok(out)
+}
+
+/// Nothing that is written here can fail: names of members are texts, and a vector takes everything.
+fn as_line(value: &impl Serialize) -> Vec<u8> {
+    let mut line = serde_json::to_vec(value).unwrap_or_default();
+    line.push(b'\n');
+    line
 }
 
 /// Of the first line from its JSON on, and of what follows.
@@ -75,38 +96,31 @@ pub(super) fn decode(content: &[u8], place: &str, layer: &LayerName, vault: &Vau
         place: place.to_owned(),
         detail: detail.to_owned(),
     };
-    let form = |error: FormError| broken(&error.to_string());
-    let (header, body) = open_envelope(content, place)?;
-    let read = json::value_from_text(header).map_err(form)?;
-    let position = json::position_from_json(read["position"].clone()).map_err(form)?;
-    if position.layer != *layer {
+    let (first, body) = open_envelope(content, place)?;
+    let header: Header = json::read(first).map_err(|detail| broken(&format!("its first line {detail}")))?;
+    if header.position.layer != *layer {
         return Err(CopyError::OtherLayer {
             place: place.to_owned(),
-            found: position.layer,
+            found: header.position.layer,
             wanted: layer.clone(),
         });
     }
-    let count = read["documents"]
-        .as_u64()
-        .ok_or_else(|| broken("it does not say how many documents it has"))?;
     let mut body = body.to_vec();
-    if !read["encryption"].is_null() {
-        let text = |name: &str| read["encryption"][name].as_str().unwrap_or_default();
-        let salt = STANDARD.decode(text("salt")).ok();
-        let salt: Option<[u8; SALT_BYTES]> = salt.and_then(|salt| salt.try_into().ok());
+    if let Some(Encryption { key, salt }) = header.encryption {
+        let salt: Option<[u8; SALT_BYTES]> = STANDARD.decode(salt).ok().and_then(|salt| salt.try_into().ok());
         let salt = salt.ok_or_else(|| broken("its encryption has another form"))?;
-        if vault.key_id() != Some(text("key")) {
+        if vault.key_id() != Some(key.as_str()) {
             return Err(CopyError::OtherKey {
                 place: place.to_owned(),
-                found: text("key").chars().take(16).collect(),
+                found: key.chars().take(16).collect(),
                 own: vault.key_id().map(str::to_owned),
             });
         }
         vault
-            .decrypt(&salt, header, &mut body)
+            .decrypt(&salt, first, &mut body)
             .map_err(|_| broken("it does not open: it was cut off or changed"))?;
     }
-    read_body(&body, position, count).map_err(|detail| broken(&detail))
+    read_body(&body, header.position, header.documents).map_err(|detail| broken(&detail))
 }
 
 /// The first line from its JSON on, with its end, and what follows; the hash is right.
@@ -142,17 +156,16 @@ fn open_envelope<'c>(content: &'c [u8], place: &str) -> Result<(&'c [u8], &'c [u
     Ok((header, body))
 }
 
-fn read_body(body: &[u8], position: Position, count: u64) -> Result<Loaded, String> {
+fn read_body(body: &[u8], position: Position, count: usize) -> Result<Loaded, String> {
     let body = body.strip_suffix(b"\n").ok_or("it does not end with a line")?;
     let mut lines = body.split(|byte| *byte == b'\n');
-    let notes = json::value_from_text(lines.next().unwrap_or_default()).and_then(json::notes_from_json);
-    let notes = notes.map_err(|error| format!("notes: {error}"))?;
+    let notes: Notes = json::read(lines.next().unwrap_or_default()).map_err(|error| format!("notes: {error}"))?;
     let mut documents = Vec::new();
     for (number, line) in (1_usize..).zip(lines) {
-        let document = json::document_from_text(line).map_err(|error| format!("document {number}: {error}"))?;
+        let document = json::document(line).map_err(|error| format!("document {number}: {error}"))?;
         documents.push(Arc::new(document));
     }
-    if u64::try_from(documents.len()) != Ok(count) {
+    if documents.len() != count {
         return Err(format!("it has {} documents of {count}", documents.len()));
     }
     Ok(Loaded {
@@ -165,6 +178,7 @@ fn read_body(body: &[u8], position: Position, count: u64) -> Result<Loaded, Stri
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use serde_json::json;
 
     use super::*;
     use crate::copy::samples::{any_documents, any_notes, loaded, notes, position, service, with_secret};

@@ -1,9 +1,11 @@
 //! What must survive besides documents.
 
+use serde::{Deserialize, Serialize};
+
 use crate::core::Place;
 
 /// What must survive besides documents.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Notes {
     /// Roll-outs that failed here, by `uid`, oldest first.
     pub failed: Vec<String>,
@@ -23,19 +25,5 @@ impl Notes {
         self.places.sort_unstable();
         self.places.dedup();
         self.floor = self.floor.max(other.floor);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use crate::copy::samples::notes;
-
-    #[test]
-    fn merging_keeps_everything_once() {
-        let (mut one, other) = (notes("a", 5), notes("b", 6));
-        one.merge(&other);
-        one.merge(&other);
-        assert_eq!(one.failed, ["a", "b"]);
-        assert_eq!((one.places.len(), one.floor), (1, 6));
     }
 }

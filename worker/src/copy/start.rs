@@ -1,42 +1,41 @@
 //! What the worker starts from: of one store the copy with the higher revision, of two stores the later one; notes of both.
 //!
-//! A copy that could not be read in time is read before it is first written ([`Start::unread`], [`Found`](super::Found)).
+//! A copy that could not be read in time is read before it is first written ([`Target::is_read`], [`Found`](super::Found)).
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::{CopyError, Loaded, LocalCopy};
+use super::{CopyError, Loaded, LocalCopy, Target};
 
 /// How long the database is waited for where the file has something: services get their last configuration within two
 /// seconds, also while the database is away.
-pub const DATABASE_LIMIT: Duration = Duration::from_secs(1);
+const DATABASE_LIMIT: Duration = Duration::from_secs(1);
 /// The same where the file has nothing: then there is nothing to serve meanwhile.
 const PATIENT: u32 = 5;
 
 /// What was found at the start.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub struct Start {
     /// What to serve; none: nothing was ever written, or nothing can be read.
     pub loaded: Option<Loaded>,
     /// Where it is from, for people.
     pub from: Option<String>,
-    /// Copies whose content is unknown: it may be newer than what is served.
-    pub unread: Vec<String>,
+    /// The copies, from now on.
+    pub targets: Vec<Target>,
 }
 
-/// Reads both copies and takes the newer one. `limit` is for the database; see [`DATABASE_LIMIT`].
-pub async fn choose(
-    file: Option<&Arc<dyn LocalCopy>>,
-    database: Option<&Arc<dyn LocalCopy>>,
-    limit: Duration,
-) -> Start {
+/// Reads both copies and takes the newer one.
+pub async fn choose(file: Option<Arc<dyn LocalCopy>>, database: Option<Arc<dyn LocalCopy>>) -> Start {
     let mut start = Start::default();
     if let Some(file) = file {
         let loaded = file.load().await;
-        start.take(&**file, loaded);
+        start.take(file, loaded);
     }
     if let Some(database) = database {
-        let limit = if start.loaded.is_some() { limit } else { limit * PATIENT };
+        let limit = match start.loaded {
+            Some(_) => DATABASE_LIMIT,
+            None => DATABASE_LIMIT * PATIENT,
+        };
         let loaded = tokio::time::timeout(limit, database.load()).await;
         let loaded = loaded.unwrap_or_else(|_| {
             Err(CopyError::Away {
@@ -44,24 +43,23 @@ pub async fn choose(
                 detail: format!("no answer within {} ms", limit.as_millis()),
             })
         });
-        start.take(&**database, loaded);
+        start.take(database, loaded);
     }
     start
 }
 
 impl Start {
-    fn take(&mut self, copy: &dyn LocalCopy, loaded: Result<Option<Loaded>, CopyError>) {
-        let mut found = match loaded {
-            Ok(None) => return,
-            Ok(Some(found)) => found,
+    fn take(&mut self, copy: Arc<dyn LocalCopy>, loaded: Result<Option<Loaded>, CopyError>) {
+        let (found, is_read) = match loaded {
+            Ok(found) => (found, true),
             Err(error) => {
                 tracing::warn!(%error, "a copy of the configuration cannot be read");
-                if !error.is_unreadable() {
-                    self.unread.push(copy.describe());
-                }
-                return;
+                (None, error.is_unreadable())
             }
         };
+        let place = copy.describe();
+        self.targets.push(Target { copy, is_read });
+        let Some(mut found) = found else { return };
         match &mut self.loaded {
             Some(held) if !found.position.is_newer_than(&held.position) => {
                 // A roll-out that failed stays so, whichever copy was written last.
@@ -72,7 +70,7 @@ impl Start {
                     Arc::make_mut(&mut found.notes).merge(&held.notes);
                 }
                 *held = Some(found);
-                self.from = Some(copy.describe());
+                self.from = Some(place);
             }
         }
     }

@@ -46,7 +46,7 @@ struct World {
 
 fn world(node: Option<&str>, rollouts: Vec<Document>) -> World {
     let (mut served, mut gate, start) = (Served::new(site(node)), Gate::default(), Instant::now());
-    served.load(state(10, documents(rollouts)), Source::Copy).unwrap();
+    served.load(state(10, documents(rollouts)), Source::Copy);
     served.flush(start);
     gate.follow(&served);
     gate.open(Some(10), start);
@@ -154,16 +154,6 @@ fn a_window_opens_when_services_were_told_and_before_only_who_names_the_configur
 }
 
 #[test]
-fn that_it_failed_may_become_known_later() {
-    let mut w = world(Some("robot-1"), vec![rollout("slam", 0, "canary")]);
-    w.served.fail_rollout("Rollout/slam-slower");
-    w.served.flush(w.start);
-    assert!(w.gate.follow(&w.served));
-    assert_eq!(w.phases(), named(&[("robot-1", "failed")]));
-    assert!(!w.gate.follow(&w.served), "nothing is new");
-}
-
-#[test]
 fn what_is_said_of_the_configuration_before_does_not_count() {
     let mut w = world(Some("robot-1"), vec![rollout("slam", 0, "canary")]);
     let told = w.served.told_to(&place("slam/0@robot-1")).unwrap().clone();
@@ -213,27 +203,14 @@ fn on_the_broker_of_a_layer_each_node_is_judged_and_one_that_fails_undoes_it_for
 }
 
 #[test]
-fn one_that_has_ended_is_forgotten_and_one_that_failed_before_is_not_tried() {
+fn one_that_has_ended_is_forgotten() {
     let mut w = world(Some("robot-1"), vec![rollout("slam", 0, "canary")]);
     assert!(!w.gate.follow(&w.served), "nothing is new");
     w.served
-        .load(state(11, documents(vec![rollout("slam", 0, "promoted")])), Source::Copy)
-        .unwrap();
+        .load(state(11, documents(vec![rollout("slam", 0, "promoted")])), Source::Copy);
     w.served.flush(w.start);
     assert!(w.gate.follow(&w.served));
     assert_eq!(w.phases(), []);
-
-    let mut served = Served::new(site(Some("robot-1")));
-    served.fail_rollout("Rollout/slam-slower");
-    served
-        .load(state(10, documents(vec![rollout("slam", 0, "canary")])), Source::Copy)
-        .unwrap();
-    served.flush(w.start);
-    let mut gate = Gate::default();
-    gate.follow(&served);
-    w = World { served, gate, ..w };
-    assert_eq!(w.phases(), named(&[("robot-1", "failed")]));
-    assert_eq!(w.hears(&complaint("slam/0@robot-1", Trouble::Rejected), 1), []);
 }
 
 #[test]

@@ -145,26 +145,21 @@ impl Signs {
         if old.is_some_and(|known| known.origin != Origin::Ack) {
             return;
         }
-        let old = old.map(|known| known.row.clone());
-        let row = match (status, old) {
+        let (config_revision, config_hash) = match (status, old) {
             // It goes on with the configuration before.
-            (AckStatus::Rejected, Some(old)) => Row {
-                health: Health::Unhealthy,
-                ..old
+            (AckStatus::Rejected, Some(old)) => (old.row.config_revision, old.row.config_hash.clone()),
+            (AckStatus::Rejected, None) => (0, String::new()),
+            (AckStatus::Applied | AckStatus::Healthy | AckStatus::Unhealthy, _) => {
+                (said.0.unwrap_or(0), said.1.unwrap_or_default().to_owned())
+            }
+        };
+        let row = Row {
+            health: match status {
+                AckStatus::Applied | AckStatus::Healthy => Health::Ready,
+                AckStatus::Rejected | AckStatus::Unhealthy => Health::Unhealthy,
             },
-            (AckStatus::Rejected, None) => Row {
-                health: Health::Unhealthy,
-                config_revision: 0,
-                config_hash: String::new(),
-            },
-            (AckStatus::Applied | AckStatus::Healthy | AckStatus::Unhealthy, _) => Row {
-                health: match status {
-                    AckStatus::Applied | AckStatus::Healthy => Health::Ready,
-                    AckStatus::Rejected | AckStatus::Unhealthy => Health::Unhealthy,
-                },
-                config_revision: said.0.unwrap_or(0),
-                config_hash: said.1.unwrap_or_default().to_owned(),
-            },
+            config_revision,
+            config_hash,
         };
         let known = Known {
             row,

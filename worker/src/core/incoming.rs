@@ -4,7 +4,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::config::{Document, MAX_DOCUMENTS, Timestamp, secret};
+use blaze_domain::config::{Document, Key, MAX_DOCUMENTS, secret};
 
 /// Version of the protocol that is spoken here. Version 2: Hello says whether texts of secrets are wanted.
 pub const PROTOCOL: u32 = 2;
@@ -13,28 +13,13 @@ pub const OLDEST_PROTOCOL: u32 = PROTOCOL - 1;
 /// Specs of a snapshot, in bytes of their compact JSON, at most (512 MiB).
 pub const MAX_SNAPSHOT_BYTES: usize = 512 * 1024 * 1024;
 
-/// What a commit does to a document.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Op {
-    /// It is new.
-    Create,
-    /// It is another one.
-    Update,
-    /// It is gone.
-    Delete,
-    /// It is still there, but the layer does not see it any more.
-    Leave,
-    /// It is again what it was.
-    Rollback,
-}
-
-/// One document of a commit: after it, or for [`Op::Delete`] and [`Op::Leave`] before it.
+/// What a commit does to one document.
 #[derive(Clone)]
-pub struct Edit {
-    /// What is done to it.
-    pub op: Op,
-    /// The document, with secrets in clear.
-    pub document: Document,
+pub enum Edit {
+    /// It is so from now on, with secrets in clear.
+    Put(Document),
+    /// It is gone, or the layer does not see it any more.
+    Remove(Key),
 }
 
 /// What the main service tells.
@@ -66,10 +51,6 @@ pub enum Incoming {
         revision: u64,
         /// The commit that was told before it in this stream, or where the stream began.
         previous: u64,
-        /// When it was made.
-        time: Timestamp,
-        /// By whom.
-        subject: String,
         /// What it did.
         edits: Vec<Edit>,
     },
@@ -90,31 +71,14 @@ pub enum Incoming {
 }
 
 /// Without the documents: they hold secrets in clear.
-impl fmt::Debug for Edit {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:?} {}", self.op, self.document.key)
-    }
-}
-
-/// Without the documents: they hold secrets in clear.
 impl fmt::Debug for Incoming {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.word())?;
         match self {
-            Self::Welcome { revision, resumed, .. } => write!(f, "({revision}, resumed: {resumed})"),
-            Self::Snapshot {
-                revision,
-                documents,
-                last,
-            } => write!(f, "({revision}, {} documents, last: {last})", documents.len()),
-            Self::Commit {
-                revision,
-                previous,
-                edits,
-                ..
-            } => write!(f, "({revision} after {previous}, {edits:?})"),
-            Self::Bookmark { revision, .. } => write!(f, "({revision})"),
-            Self::GoAway { retry_after, reason } => write!(f, "({retry_after:?}, {reason:?})"),
+            Self::Welcome { revision, .. } => write!(f, "Welcome({revision})"),
+            Self::Snapshot { revision, .. } => write!(f, "Snapshot({revision})"),
+            Self::Commit { revision, previous, .. } => write!(f, "Commit({revision} after {previous})"),
+            Self::Bookmark { revision, .. } => write!(f, "Bookmark({revision})"),
+            Self::GoAway { reason, .. } => write!(f, "GoAway({reason:?})"),
         }
     }
 }
@@ -125,20 +89,16 @@ impl Incoming {
     pub fn redacted(mut self) -> Self {
         match &mut self {
             Self::Snapshot { documents, .. } => documents.iter_mut().for_each(redact),
-            Self::Commit { edits, .. } => edits.iter_mut().for_each(|edit| redact(&mut edit.document)),
+            Self::Commit { edits, .. } => {
+                for edit in edits {
+                    if let Edit::Put(document) = edit {
+                        redact(document);
+                    }
+                }
+            }
             Self::Welcome { .. } | Self::Bookmark { .. } | Self::GoAway { .. } => {}
         }
         self
-    }
-
-    pub(super) fn word(&self) -> &'static str {
-        match self {
-            Self::Welcome { .. } => "Welcome",
-            Self::Snapshot { .. } => "Snapshot",
-            Self::Commit { .. } => "Commit",
-            Self::Bookmark { .. } => "Bookmark",
-            Self::GoAway { .. } => "GoAway",
-        }
     }
 }
 
@@ -213,19 +173,11 @@ pub enum SyncFault {
         got: u64,
     },
     /// There are more documents than any store may have.
-    #[error(transparent)]
-    TooLarge(#[from] TooLarge),
-}
-
-/// More than is taken.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum TooLarge {
-    /// Too many documents.
     #[error("there are more than {MAX_DOCUMENTS} documents")]
-    Documents,
-    /// Too many bytes.
+    TooMany,
+    /// They have more bytes than are taken.
     #[error("the documents of the snapshot have more than {MAX_SNAPSHOT_BYTES} bytes")]
-    Bytes,
+    TooLarge,
 }
 
 impl SyncFault {
@@ -234,7 +186,9 @@ impl SyncFault {
     pub fn needs_snapshot(&self) -> bool {
         match self {
             Self::Gap { .. } | Self::Digest { .. } | Self::OtherStore { .. } => true,
-            Self::Unexpected { .. } | Self::Protocol { .. } | Self::Mixed { .. } | Self::TooLarge(_) => false,
+            Self::Unexpected { .. } | Self::Protocol { .. } | Self::Mixed { .. } | Self::TooMany | Self::TooLarge => {
+                false
+            }
         }
     }
 }

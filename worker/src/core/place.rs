@@ -6,6 +6,7 @@ use blaze_domain::config::effective::At;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Key, Kind};
 use blaze_domain::{DocumentName, InstanceName, LayerName, NodeName, ServiceName};
+use serde::{Deserialize, Serialize};
 
 /// What a worker serves: a whole layer, or one node of it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -19,7 +20,7 @@ pub struct Site {
 /// Who has a configuration of its own: an instance, or a service without one, at a node or at the layer alone.
 ///
 /// Ordered by service first, then instance (none before all others), so that the places of a service are a range.
-#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Place {
     /// Which service.
     pub service: ServiceName,
@@ -85,12 +86,6 @@ impl Source {
             Self::Copy => "copy",
             Self::Main => "main",
         }
-    }
-}
-
-impl fmt::Display for Source {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
     }
 }
 

@@ -178,7 +178,6 @@ impl Run {
 
     fn commit(&mut self, writes: &[Write]) {
         let revision = self.truth.revision() + 1;
-        let old = self.truth.clone();
         let mut keys = BTreeSet::new();
         for write in writes {
             let key: Key = KEYS[write.key].parse().unwrap();
@@ -196,7 +195,6 @@ impl Run {
         }
         self.served.apply(&Change {
             keys: keys.into_iter().collect(),
-            old,
             new: self.truth.clone(),
         });
         if self.way == Way::OneByOne {
@@ -228,7 +226,6 @@ impl Run {
             let old = self.served.next.state.clone();
             self.served.apply(&Change {
                 keys: difference(&old, &self.truth),
-                old,
                 new: self.truth.clone(),
             });
         }

@@ -24,7 +24,6 @@ use super::told::Told;
 #[derive(Default)]
 pub(super) struct Places {
     told: BTreeMap<Place, Told>,
-    on_node: BTreeSet<(NodeName, Place)>,
     /// How often a place came or went.
     version: u64,
 }
@@ -35,9 +34,6 @@ impl Places {
     }
 
     pub(super) fn insert(&mut self, place: Place, told: Told) {
-        if let Some(node) = &place.node {
-            self.on_node.insert((node.clone(), place.clone()));
-        }
         self.version += u64::from(self.told.insert(place, told).is_none());
     }
 
@@ -48,9 +44,6 @@ impl Places {
 
     /// Whether it was there.
     pub(super) fn remove(&mut self, place: &Place) -> bool {
-        if let Some(node) = &place.node {
-            self.on_node.remove(&(node.clone(), place.clone()));
-        }
         let was_there = self.told.remove(place).is_some();
         self.version += u64::from(was_there);
         was_there
@@ -79,14 +72,7 @@ impl Places {
     }
 
     pub(super) fn on_node<'p>(&'p self, node: &'p NodeName) -> impl Iterator<Item = &'p Place> {
-        // No place of the node comes before the first of all places.
-        let first = self.told.first_key_value().map(|(place, _)| place.clone());
-        let range = first.map(|first| self.on_node.range((node.clone(), first)..));
-        range
-            .into_iter()
-            .flatten()
-            .take_while(move |(found, _)| found == node)
-            .map(|(_, place)| place)
+        self.told.keys().filter(move |place| place.node.as_ref() == Some(node))
     }
 }
 

@@ -27,24 +27,6 @@ fn found<const N: usize>(old: &State, new: &State, changed: [&str; N]) -> Vec<St
 }
 
 #[test]
-fn the_places_of_a_node_and_of_a_service_are_found() {
-    let places = places();
-    let on = |node: &str| places.on_node(&node.parse().unwrap()).cloned().collect::<Vec<_>>();
-    assert_eq!(on("a"), [place("blur/0@a"), place("slam@a"), place("slam/0@a")]);
-    assert_eq!(on("b"), [place("slam/1@b")]);
-    assert!(on("c").is_empty() && on("0").is_empty());
-    let slam = "slam".parse().unwrap();
-    assert_eq!(places.of_service(&slam).count(), 5);
-    assert_eq!(places.of_instance(&slam, &"1".parse().unwrap()).count(), 1);
-    let mut places = places;
-    for text in TRACKED {
-        assert!(places.remove(&place(text)));
-    }
-    assert!(!places.remove(&place("slam")) && places.on_node.is_empty());
-    assert_eq!(places.on_node(&"a".parse().unwrap()).count(), 0);
-}
-
-#[test]
 fn a_service_concerns_its_places_and_new_ones() {
     let old = State::default();
     let new = state(

@@ -8,18 +8,16 @@
 //!
 //! Whatever goes wrong, the documents stay as they were: those that have been served go on being served.
 
-use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::LayerName;
 use blaze_domain::config::placement::whole_digest;
+use blaze_domain::config::spec::json_size;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Key, MAX_DOCUMENTS, Timestamp};
 
 use super::change::{Change, difference};
-use super::incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, OLDEST_PROTOCOL, Op, PROTOCOL, SyncFault, TooLarge};
-use super::stream::{Phase, Stream, spec_bytes};
+use super::incoming::{Edit, Incoming, MAX_SNAPSHOT_BYTES, OLDEST_PROTOCOL, PROTOCOL, SyncFault};
 
 /// What a message did.
 #[derive(Debug)]
@@ -48,9 +46,35 @@ pub struct ResumePoint {
     pub digest: String,
 }
 
+/// Where a stream stands.
+#[derive(Default)]
+enum Stream {
+    /// There is none, or it has not begun.
+    #[default]
+    Closed,
+    /// The parts of a snapshot come.
+    Snapshot {
+        store_id: String,
+        /// Of the first part, once it is there.
+        revision: Option<u64>,
+        documents: Vec<Document>,
+        /// Of their specs, as compact JSON.
+        bytes: usize,
+    },
+    /// Commits come.
+    Live {
+        /// The commit that was told last, or where the stream began.
+        told: u64,
+        /// Until the first commit that is new, older ones may come again; the revision from which the stream was resumed.
+        resumed: Option<u64>,
+    },
+    /// Nothing sensible comes any more.
+    Over,
+}
+
 /// The layer's view at a revision.
+#[derive(Default)]
 pub struct Replica {
-    layer: LayerName,
     store_id: Option<String>,
     state: State,
     /// When it last knew itself in sync.
@@ -65,46 +89,16 @@ pub struct Replica {
     is_stale: bool,
 }
 
-/// Without the documents: they hold secrets in clear.
-impl fmt::Debug for Replica {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Replica")
-            .field("layer", &self.layer)
-            .field("store_id", &self.store_id)
-            .field("revision", &self.state.revision())
-            .field("documents", &self.state.len())
-            .field("in_sync", &self.in_sync)
-            .finish_non_exhaustive()
-    }
-}
-
 impl Replica {
-    /// Nothing yet.
+    /// From a copy of a store.
     #[must_use]
-    pub fn new(layer: LayerName) -> Self {
-        Self::from_copy(layer, None, State::default(), None)
-    }
-
-    /// From a copy; `store_id` is `None` for a mounted file, which is of no store and cannot be gone on from.
-    #[must_use]
-    pub fn from_copy(layer: LayerName, store_id: Option<String>, state: State, as_of: Option<Timestamp>) -> Self {
+    pub fn from_copy(store_id: String, state: State, as_of: Timestamp) -> Self {
         Self {
-            layer,
-            store_id,
+            store_id: Some(store_id),
             state,
-            as_of,
-            digest: None,
-            stream: Stream::Closed,
-            in_sync: false,
-            goal: 0,
-            is_stale: false,
+            as_of: Some(as_of),
+            ..Self::default()
         }
-    }
-
-    /// Its layer.
-    #[must_use]
-    pub fn layer(&self) -> &LayerName {
-        &self.layer
     }
 
     /// The store that it is a copy of.
@@ -186,53 +180,44 @@ impl Replica {
     }
 
     fn take(&mut self, incoming: Incoming) -> Result<Applied, SyncFault> {
-        let message = incoming.word();
-        match (self.stream.phase(), incoming) {
-            (_, Incoming::GoAway { retry_after, reason }) => Ok(Applied::GoAway { retry_after, reason }),
-            (
-                Phase::Closed,
-                Incoming::Welcome {
-                    protocol,
-                    store_id,
-                    revision,
-                    resumed,
-                },
-            ) => self
+        match incoming {
+            Incoming::GoAway { retry_after, reason } => Ok(Applied::GoAway { retry_after, reason }),
+            Incoming::Welcome {
+                protocol,
+                store_id,
+                revision,
+                resumed,
+            } => self
                 .welcome(protocol, store_id, revision, resumed)
                 .map(|()| Applied::Nothing),
-            (
-                Phase::Snapshot,
-                Incoming::Snapshot {
-                    revision,
-                    documents,
-                    last,
-                },
-            ) => self.snapshot(revision, documents, last),
-            (
-                Phase::Live,
-                Incoming::Commit {
-                    revision,
-                    previous,
-                    edits,
-                    ..
-                },
-            ) => self.commit(revision, previous, edits),
-            (Phase::Live, Incoming::Bookmark { revision, digest }) => {
-                self.bookmark(revision, digest).map(|()| Applied::Nothing)
-            }
-            (phase, _) => Err(SyncFault::Unexpected {
-                message,
-                waited_for: match phase {
-                    Phase::Closed => "a Welcome",
-                    Phase::Snapshot => "a Snapshot",
-                    Phase::Live => "a Commit or a Bookmark",
-                    Phase::Over => "nothing after a fault",
-                },
-            }),
+            Incoming::Snapshot {
+                revision,
+                documents,
+                last,
+            } => self.snapshot(revision, documents, last),
+            Incoming::Commit {
+                revision,
+                previous,
+                edits,
+            } => self.commit(revision, previous, edits),
+            Incoming::Bookmark { revision, digest } => self.bookmark(revision, digest).map(|()| Applied::Nothing),
         }
     }
 
+    fn unexpected(&self, message: &'static str) -> SyncFault {
+        let waited_for = match self.stream {
+            Stream::Closed => "a Welcome",
+            Stream::Snapshot { .. } => "a Snapshot",
+            Stream::Live { .. } => "a Commit or a Bookmark",
+            Stream::Over => "nothing after a fault",
+        };
+        SyncFault::Unexpected { message, waited_for }
+    }
+
     fn welcome(&mut self, protocol: u32, store_id: String, revision: u64, resumed: bool) -> Result<(), SyncFault> {
+        if !matches!(self.stream, Stream::Closed) {
+            return Err(self.unexpected("Welcome"));
+        }
         if !(OLDEST_PROTOCOL..=PROTOCOL).contains(&protocol) {
             return Err(SyncFault::Protocol { theirs: protocol });
         }
@@ -271,7 +256,7 @@ impl Replica {
             bytes,
         } = &mut self.stream
         else {
-            return Ok(Applied::Nothing);
+            return Err(self.unexpected("Snapshot"));
         };
         let expected = *first.get_or_insert(revision);
         if expected != revision {
@@ -281,11 +266,11 @@ impl Replica {
             });
         }
         if documents.len() + part.len() > MAX_DOCUMENTS {
-            return Err(TooLarge::Documents.into());
+            return Err(SyncFault::TooMany);
         }
-        *bytes += part.iter().map(spec_bytes).sum::<usize>();
+        *bytes += part.iter().map(|document| json_size(&*document.spec)).sum::<usize>();
         if *bytes > MAX_SNAPSHOT_BYTES {
-            return Err(TooLarge::Bytes.into());
+            return Err(SyncFault::TooLarge);
         }
         documents.extend(part);
         if !last {
@@ -305,7 +290,7 @@ impl Replica {
 
     fn commit(&mut self, revision: u64, previous: u64, edits: Vec<Edit>) -> Result<Applied, SyncFault> {
         let Stream::Live { told, resumed } = &mut self.stream else {
-            return Ok(Applied::Nothing);
+            return Err(self.unexpected("Commit"));
         };
         if let Some(start) = *resumed {
             if revision <= start {
@@ -334,16 +319,19 @@ impl Replica {
         let mut new = self.state.clone();
         let mut keys: Vec<Key> = Vec::with_capacity(edits.len());
         for edit in edits {
-            keys.push(edit.document.key.clone());
-            match edit.op {
-                Op::Create | Op::Update | Op::Rollback => new.put(Arc::new(edit.document)),
-                Op::Delete | Op::Leave => {
-                    new.remove(&edit.document.key);
+            match edit {
+                Edit::Put(document) => {
+                    keys.push(document.key.clone());
+                    new.put(Arc::new(document));
+                }
+                Edit::Remove(key) => {
+                    new.remove(&key);
+                    keys.push(key);
                 }
             }
         }
         if new.len() > MAX_DOCUMENTS {
-            return Err(TooLarge::Documents.into());
+            return Err(SyncFault::TooMany);
         }
         new.advance(revision, []);
         *told = revision;
@@ -354,16 +342,15 @@ impl Replica {
     }
 
     fn changed(&mut self, keys: Vec<Key>, new: State) -> Applied {
-        let old = std::mem::replace(&mut self.state, new);
+        self.state = new.clone();
         self.digest = None;
-        Applied::Changed(Box::new(Change {
-            keys,
-            old,
-            new: self.state.clone(),
-        }))
+        Applied::Changed(Box::new(Change { keys, new }))
     }
 
     fn bookmark(&mut self, revision: u64, theirs: String) -> Result<(), SyncFault> {
+        if !matches!(self.stream, Stream::Live { .. }) {
+            return Err(self.unexpected("Bookmark"));
+        }
         if revision < self.state.revision() {
             // Nothing is to be learnt of what lies behind.
             return Ok(());

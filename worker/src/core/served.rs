@@ -17,7 +17,6 @@
 mod trial;
 
 use std::collections::BTreeSet;
-use std::fmt;
 use std::time::Instant;
 
 use blaze_domain::config::Key;
@@ -31,7 +30,7 @@ use super::change::{Change, difference};
 use super::notice::{Config, Notice, Standing, paths, scopes};
 use super::place::{Place, Site, Source};
 use super::reach::{Places, concerned};
-use super::told::{Flushed, Told, WeakerSource};
+use super::told::{Flushed, Told};
 use super::world::World;
 
 pub use trial::Trial;
@@ -60,18 +59,6 @@ pub struct Served {
     untracked: Vec<Place>,
     /// Places of another life that were not looked at yet: nobody knows what they were told.
     restored: BTreeSet<Place>,
-}
-
-/// Without the documents: they hold secrets in clear.
-impl fmt::Debug for Served {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Served")
-            .field("site", &self.site)
-            .field("source", &self.source())
-            .field("revision", &self.shown.state.revision())
-            .field("pending", &self.pending.len())
-            .finish_non_exhaustive()
-    }
 }
 
 impl Served {
@@ -129,15 +116,8 @@ impl Served {
     /// Whether an instance of a service, or the service without one, is told of changes anywhere.
     #[must_use]
     pub fn tells(&self, service: &ServiceName, instance: Option<&InstanceName>) -> bool {
-        match instance {
-            Some(instance) => self.places.of_instance(service, instance).next().is_some(),
-            // Those without come before all others.
-            None => self
-                .places
-                .of_service(service)
-                .next()
-                .is_some_and(|place| place.instance.is_none()),
-        }
+        let mut places = self.places.of_service(service);
+        places.any(|place| place.instance.as_ref() == instance)
     }
 
     /// Uids of the roll-outs that failed here, the oldest first.
@@ -146,24 +126,14 @@ impl Served {
         &self.next.failed
     }
 
-    /// Places that asked and had to go before their time, because too many ask.
-    #[must_use]
-    pub fn evicted(&self) -> u64 {
-        self.asked.evicted()
-    }
-
-    /// Takes documents from a copy or a file.
-    ///
-    /// # Errors
-    /// What is served comes from a stronger source, and stays.
-    pub fn load(&mut self, state: State, source: Source) -> Result<(), WeakerSource> {
-        match self.rank {
-            Some(held) if held > source => return Err(WeakerSource { held, offered: source }),
-            Some(_) | None => {}
+    /// Takes documents from a copy or a file, unless what is served comes from a stronger source. Gives whether it did.
+    pub fn load(&mut self, state: State, source: Source) -> bool {
+        let is_taken = self.rank.is_none_or(|held| held <= source);
+        if is_taken {
+            self.pending.extend(difference(&self.next.state, &state));
+            self.replace(state, source);
         }
-        self.pending.extend(difference(&self.next.state, &state));
-        self.replace(state, source);
-        Ok(())
+        is_taken
     }
 
     /// Takes a change that the main service told.

@@ -54,15 +54,8 @@ impl Served {
         failed.push(uid.to_owned());
     }
 
-    /// Places on whose configuration a roll-out that is on its canaries has an effect, in the shown documents: those whose
-    /// health tells whether it goes well.
-    #[must_use]
-    pub fn changed_by(&self, uid: &str) -> Vec<Place> {
-        let places = self.places.all().map(|(place, _)| place);
-        places.filter(|place| self.is_changed_by(uid, place)).cloned().collect()
-    }
-
-    /// Whether a place is one of [`Served::changed_by`].
+    /// Whether a roll-out that is on its canaries has an effect on the configuration of a place, in the shown documents: the
+    /// health of such places tells whether it goes well.
     #[must_use]
     pub fn is_changed_by(&self, uid: &str, place: &Place) -> bool {
         if place.node.is_none() || self.places.get(place).is_none() {

@@ -1,7 +1,7 @@
 //! What is remembered of the places, and what they are told next.
 
 use super::notice::Notice;
-use super::place::{Place, Source};
+use super::place::Place;
 
 /// What a place was told last.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -10,16 +10,6 @@ pub struct Told {
     pub revision: u64,
     /// Over the configuration; `None`: that its service is deleted.
     pub hash: Option<String>,
-}
-
-/// Documents of a weaker source than those that are served.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("documents from {offered} do not replace those from {held}")]
-pub struct WeakerSource {
-    /// Where those come from that are served.
-    pub held: Source,
-    /// Where those come from that were refused.
-    pub offered: Source,
 }
 
 /// What follows from the changes since the last time.

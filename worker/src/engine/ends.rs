@@ -145,7 +145,6 @@ impl Engine {
                 key: record_key(place),
                 value: None,
             }),
-            revision: self.served.state().revision(),
         }]);
     }
 }

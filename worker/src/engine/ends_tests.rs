@@ -61,12 +61,12 @@ async fn channels_are_there_before_anything_is_said_and_what_is_over_is_taken_aw
     w.rest().await;
     assert_eq!(made.last(), ["nav", "slam"]);
     let late = document("Service/late", 3, json!({}));
-    w.says(commit(3, 2, vec![(Op::Create, late.clone())])).await;
+    w.says(put(3, late.clone())).await;
     w.rest().await;
     assert_eq!(made.last(), ["late", "nav", "slam"]);
 
     w.slam().await;
-    w.says(commit(4, 3, vec![(Op::Delete, late)])).await;
+    w.says(remove(4, late)).await;
     let seen = w.rest().await;
     assert!(
         matches!(&seen[..], [.., Seen::Notice(channel, notice)] if channel.ends_with("/late") && notice["deleted"] == true),
@@ -97,10 +97,10 @@ async fn what_comes_back_meanwhile_is_not_taken_away() {
     let (mut w, made) = world(None);
     w.opens(documents(30), 2).await;
     let nav = document("Service/nav", 3, json!({ "config": { "speed": 1 } }));
-    w.says(commit(3, 2, vec![(Op::Delete, nav.clone())])).await;
+    w.says(remove(3, nav.clone())).await;
     w.rest().await;
     tokio::time::sleep(Duration::from_secs(300)).await;
-    w.says(commit(4, 3, vec![(Op::Create, nav)])).await;
+    w.says(put(4, nav)).await;
     tokio::time::sleep(LONG).await;
     assert!(taken_away(&w.rest().await).is_empty());
     assert_eq!(made.last(), ["nav", "slam"]);
@@ -114,7 +114,7 @@ async fn the_channel_of_a_service_that_came_in_an_outage_is_there_when_it_is_tol
     w.closes().await;
     w.goes_on(PROTOCOL, 40).await;
     let late = document("Service/late", 3, json!({}));
-    w.says(commit(3, 2, vec![(Op::Create, late)])).await;
+    w.says(put(3, late)).await;
     // More is to come, and meanwhile it is looked whether anything has faded.
     tokio::time::sleep(LOOK * 2).await;
     assert_eq!(made.last(), ["nav", "slam"], "it is not shown yet");
@@ -130,7 +130,7 @@ async fn whoever_does_not_tell_takes_nothing_away_until_it_does() {
     let mut w = world_on(None, false, None, Delivery::Text, Some(channels));
     w.opens(documents(30), 2).await;
     let nav = document("Service/nav", 3, json!({}));
-    w.says(commit(3, 2, vec![(Op::Delete, nav)])).await;
+    w.says(remove(3, nav)).await;
     tokio::time::sleep(LONG).await;
     assert!(w.rest().await.is_empty());
     assert_eq!(made.last(), ["nav", "slam"]);

@@ -50,7 +50,6 @@ impl Engine {
                     Ok(Applied::Nothing) if self.replica.is_in_sync() => self.keep(false),
                     Ok(Applied::Nothing) => {}
                     Ok(Applied::Changed(change)) => {
-                        self.counts.changes += 1;
                         self.wants_all = false;
                         self.served.apply(&change);
                         self.note_services(change.keys.iter().map(Key::kind));
@@ -107,11 +106,10 @@ impl Engine {
         self.replica.disconnected();
         let resume = self.replica.resume_point();
         let site = &self.identity.site;
-        let node = site.node.as_ref().or(self.identity.node.as_ref());
         let mut hello = v1::Hello {
             protocol: PROTOCOL,
             layer: site.layer.to_string(),
-            node: node.map(ToString::to_string).unwrap_or_default(),
+            node: self.identity.node.to_string(),
             worker_id: self.identity.worker_id.clone(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             store_id: resume.store_id,

@@ -26,8 +26,7 @@ impl Engine {
                 "services get what this copy holds"
             );
             let state = self.state_of(position.revision, documents);
-            let layer = self.identity.site.layer.clone();
-            self.replica = Replica::from_copy(layer, Some(position.store_id), state.clone(), Some(position.as_of));
+            self.replica = Replica::from_copy(position.store_id, state.clone(), position.as_of);
             self.served.take_later(state);
             self.note_texts_of_all();
             self.note_all_services();

@@ -3,32 +3,6 @@
 use super::hear::{canary_documents, rollout};
 use super::*;
 
-fn at(store_id: &str, revision: u64, documents: Vec<Document>) -> Loaded {
-    Loaded {
-        position: Position {
-            store_id: store_id.to_owned(),
-            layer: "edge".parse().unwrap(),
-            revision,
-            as_of: Timestamp::from_millis(1_000),
-        },
-        documents: documents.into_iter().map(Arc::new).collect(),
-        notes: Arc::default(),
-    }
-}
-
-fn with_place(instance: &str, loaded: Loaded) -> Loaded {
-    let place = Place {
-        service: "slam".parse().unwrap(),
-        instance: Some(instance.parse().unwrap()),
-        node: Some("robot-1".parse().unwrap()),
-    };
-    let notes = Arc::new(Notes {
-        places: vec![place],
-        ..Notes::default()
-    });
-    Loaded { notes, ..loaded }
-}
-
 impl World {
     async fn finds(&self, loaded: Loaded) {
         self.finds_of(false, loaded).await;
@@ -55,10 +29,10 @@ impl World {
 
 #[tokio::test(start_paused = true)]
 async fn what_the_database_has_newer_is_served_before_the_main_service_answers() {
-    let mut w = world_from(Some(at("s", 2, documents(30))), true);
+    let mut w = world_from(Some(copy_of("s", 2, documents(30))), true);
     assert_eq!(w.rate().await, 30);
     w.rest().await;
-    w.finds(at("s", 4, documents(40))).await;
+    w.finds(copy_of("s", 4, documents(40))).await;
     let (_, notice) = w.notice().await;
     assert_eq!(
         (&notice["revision"], &notice["config"]["rate_hz"], &notice["source"]),
@@ -72,59 +46,33 @@ async fn what_the_database_has_newer_is_served_before_the_main_service_answers()
     w.rest().await;
     w.closes().await;
     w.rest().await;
-    w.finds(at("s", 6, documents(60))).await;
+    w.finds(copy_of("s", 6, documents(60))).await;
     w.rest().await;
     assert_eq!(w.rate().await, 60);
 }
 
 #[tokio::test(start_paused = true)]
 async fn an_older_state_another_store_and_a_main_service_that_answers_leave_what_is_served() {
-    let mut w = world_from(Some(at("s", 4, documents(40))), true);
+    let mut w = world_from(Some(copy_of("s", 4, documents(40))), true);
     w.rest().await;
-    w.finds(at("s", 3, documents(30))).await;
-    w.finds(at("other", 9, documents(90))).await;
+    w.finds(copy_of("s", 3, documents(30))).await;
+    w.finds(copy_of("other", 9, documents(90))).await;
     w.rest().await;
     assert_eq!((w.rate().await, w.hello().await.revision), (json!(40), 4));
     w.opens(documents(50), 5).await;
-    w.finds(at("s", 6, documents(60))).await;
+    w.finds(copy_of("s", 6, documents(60))).await;
     w.rest().await;
     assert_eq!(w.rate().await, 50);
 }
 
 #[tokio::test(start_paused = true)]
-async fn who_had_nothing_or_the_mounted_file_serves_what_is_found() {
-    let mut w = world();
-    w.finds(at("s", 4, documents(40))).await;
-    w.rest().await;
-    let answer = w.slam().await;
-    assert_eq!(
-        (&answer["config"]["rate_hz"], &answer["source"], &answer["revision"]),
-        (&json!(40), &json!("copy"), &json!(4))
-    );
-}
-
-#[tokio::test(start_paused = true)]
 async fn what_is_found_is_better_than_the_mounted_file() {
     let mut w = world();
-    let file = documents(1).into_iter().map(|document| {
-        Arc::new(Document {
-            revision: 0,
-            ..document
-        })
-    });
-    w.defaults.send_replace(defaults::Status {
-        current: Some(Arc::new(defaults::Defaults {
-            documents: file.collect(),
-            as_of: Timestamp::default(),
-            left_out: 0,
-            rollouts: 0,
-        })),
-        problem: None,
-    });
+    w.defaults.send_replace(file(1));
     w.rest().await;
     assert_eq!(w.slam().await["source"], "file");
     w.rest().await;
-    w.finds(at("s", 4, documents(40))).await;
+    w.finds(copy_of("s", 4, documents(40))).await;
     let (_, notice) = w.notice().await;
     assert_eq!(
         (&notice["config"]["rate_hz"], &notice["source"]),
@@ -134,13 +82,13 @@ async fn what_is_found_is_better_than_the_mounted_file() {
 
 #[tokio::test(start_paused = true)]
 async fn notes_of_another_worker_count_with_its_documents_alone() {
-    let mut w = world_from(Some(at("s", 2, documents(30))), true);
+    let mut w = world_from(Some(copy_of("s", 2, documents(30))), true);
     w.slam().await;
     w.rest().await;
     // Not newer than what is served: what the other one told of it is its own affair.
-    w.finds_of(true, with_place("1", at("s", 2, documents(30)))).await;
+    w.finds_of(true, with_place("1", copy_of("s", 2, documents(30)))).await;
     assert_eq!(w.rest().await, []);
-    w.finds_of(true, with_place("1", at("s", 6, documents(30)))).await;
+    w.finds_of(true, with_place("1", copy_of("s", 6, documents(30)))).await;
     let (_, notice) = w.notice().await;
     assert_eq!((&notice["instance"], &notice["revision"]), (&json!("1"), &json!(6)));
 }
@@ -154,7 +102,7 @@ async fn texts_of_secrets_that_are_found_are_told() {
             2,
             json!({ "config": { "password": { "$secret": value } } }),
         );
-        at("s", revision, all)
+        copy_of("s", revision, all)
     };
     let mut w = world_from(Some(with(2, json!({ "redacted": true, "version": 2 }))), true);
     let hash = w.slam().await["hash"].clone();
@@ -172,7 +120,7 @@ async fn a_roll_out_that_failed_in_another_life_is_undone() {
     let mut documents = canary_documents();
     documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
     documents.push(rollout(2, "u-1", 500));
-    let mut w = world_from(Some(at("s", 2, documents.clone())), true);
+    let mut w = world_from(Some(copy_of("s", 2, documents.clone())), true);
     w.rest().await;
     assert_eq!(w.rate().await, 500);
     let notes = Arc::new(Notes {
@@ -181,11 +129,9 @@ async fn a_roll_out_that_failed_in_another_life_is_undone() {
     });
     w.finds(Loaded {
         notes,
-        ..at("s", 2, documents)
+        ..copy_of("s", 2, documents)
     })
     .await;
     assert_eq!(w.rates().await, [json!(30)]);
-    let (send, status) = oneshot::channel();
-    w.queries.send(Query::Status(send)).await.unwrap();
-    assert_eq!(status.await.unwrap().json["rollouts"][0]["phase"], "failed");
+    assert_eq!(w.status().await.json["rollouts"][0]["phase"], "failed");
 }

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use blaze_domain::NodeName;
 use blaze_proto::v1;
 use bytes::Bytes;
 use tokio::time::Instant;
@@ -120,8 +119,7 @@ impl Engine {
     fn told_up_to(&self) -> Option<u64> {
         let shown = self.served.state().revision();
         if self.tells {
-            let untold = self.outputs.speaker.untold_where_possible();
-            return Some(untold.map_or(shown, |first| first.saturating_sub(1)));
+            return self.outputs.speaker.is_done().then_some(shown);
         }
         let (noted, shown) = (self.noted.as_ref()?, self.shown.as_ref()?);
         (noted.store_id == shown.store_id).then_some(noted.revision)
@@ -138,9 +136,9 @@ impl Engine {
     /// How roll-outs go on the nodes that are served here. On the broker of a layer these are the nodes that anything was
     /// heard from: the others have brokers and workers of their own.
     pub(super) fn rollouts(&self) -> Vec<RolloutState> {
-        let is_own = |node: &NodeName| self.identity.site.node.as_ref().or(self.identity.node.as_ref()) == Some(node);
+        let own = &self.identity.node;
         self.gate
-            .states(|node| is_own(node) || self.served.is_asked_from(node) || self.signs.is_heard_from(node))
+            .states(|node| node == own || self.served.is_asked_from(node) || self.signs.is_heard_from(node))
     }
 
     pub(super) fn services_of_ack(&self) -> Vec<v1::ServiceState> {
@@ -170,7 +168,7 @@ impl Engine {
 fn read_record(key: &str, members: &BTreeMap<String, String>) -> Result<ServiceState, String> {
     let fields = members.iter().map(|(name, value)| (name.as_str(), value.as_str()));
     let state = ServiceState::of_fields(fields)?;
-    match WatchdogKey::parse("", key) {
+    match WatchdogKey::parse(key) {
         Some(named) if named == state.key => Ok(state),
         Some(_) | None => Err("the record is of another instance than its key".to_owned()),
     }

@@ -83,7 +83,7 @@ impl Engine {
             for notice in self.ends.repeat() {
                 // The service may be there again.
                 if self.served.look_up(&notice.place).is_none() {
-                    told.extend(self.of_notice(&notice).map(|told| Told { revision: 0, ..told }));
+                    told.extend(self.of_notice(&notice));
                 }
             }
             for place in &self.places() {
@@ -122,15 +122,7 @@ impl Engine {
         self.has_announced = true;
         let notices = self.served.announce();
         let notices = notices.iter().filter(|notice| !except.contains(&notice.place));
-        // Nobody knows since when they have not heard: no window of a roll-out opens before they have.
-        let told: Vec<Told> = notices
-            .filter_map(|notice| {
-                Some(Told {
-                    revision: 0,
-                    ..self.of_notice(notice)?
-                })
-            })
-            .collect();
+        let told: Vec<Told> = notices.filter_map(|notice| self.of_notice(notice)).collect();
         self.tell(told);
     }
 
@@ -159,30 +151,18 @@ impl Engine {
         }
         self.open_windows();
         self.keep_notes();
-        if self.tells && self.outputs.speaker.untold().is_some() {
+        if self.tells && !self.outputs.speaker.is_done() {
             self.settle_soon();
         }
     }
 
-    fn leave_mark(&mut self) {
-        let Some(shown) = &self.shown else { return };
-        let told = &self.outputs.told;
-        let mark = match self.outputs.speaker.untold() {
-            None => shown.clone(),
-            Some(first) => {
-                let left = told.borrow().clone();
-                match left {
-                    Some(left) if left.store_id == shown.store_id => Mark {
-                        revision: left.revision.max(first.saturating_sub(1)),
-                        ..left
-                    },
-                    Some(_) | None => return,
-                }
-            }
+    fn leave_mark(&self) {
+        let Some(shown) = self.shown.as_ref().filter(|_| self.outputs.speaker.is_done()) else {
+            return;
         };
-        told.send_if_modified(|left| {
-            let is_new = left.as_ref() != Some(&mark);
-            *left = Some(mark);
+        self.outputs.told.send_if_modified(|left| {
+            let is_new = left.as_ref() != Some(shown);
+            *left = Some(shown.clone());
             is_new
         });
     }

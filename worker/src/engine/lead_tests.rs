@@ -1,6 +1,5 @@
 //! Who tells, and what a new leader makes up for.
 
-use super::hear::{canary_documents, rollout};
 use super::*;
 use crate::serve::SpeakerCounts;
 
@@ -11,21 +10,15 @@ fn mark(revision: u64) -> Mark {
     }
 }
 
-fn slam(revision: u64, rate: u64) -> Incoming {
-    let changed = document("Service/slam", revision, json!({ "config": { "rate_hz": rate } }));
-    commit(revision, revision - 1, vec![(Op::Update, changed)])
-}
-
-/// Notices among what was seen: revision and rate.
+/// Revisions and rates in notices of `slam`.
 fn notices(seen: &[Seen]) -> Vec<(u64, u64)> {
-    let of_slam = seen.iter().filter_map(|seen| match seen {
-        Seen::Notice(channel, notice) if channel.ends_with("/slam") => Some((
-            notice["revision"].as_u64().unwrap(),
-            notice["config"]["rate_hz"].as_u64().unwrap_or_default(),
-        )),
-        Seen::Notice(..) | Seen::Key(..) | Seen::TakenAway(..) => None,
-    });
-    of_slam.collect()
+    let of_slam = noticed(seen).filter(|(channel, _)| channel.ends_with("/slam"));
+    of_slam
+        .map(|(_, notice)| {
+            let rate = notice["config"]["rate_hz"].as_u64();
+            (notice["revision"].as_u64().unwrap(), rate.unwrap_or_default())
+        })
+        .collect()
 }
 
 fn key_of_slam(seen: &[Seen]) -> Option<u64> {
@@ -36,53 +29,18 @@ fn key_of_slam(seen: &[Seen]) -> Option<u64> {
 }
 
 #[tokio::test(start_paused = true)]
-async fn only_the_leader_answers_and_a_new_one_notifies_what_the_last_may_have_left() {
+async fn only_the_leader_answers() {
     let mut w = world_from(None, false);
     w.opens(documents(30), 2).await;
     w.rest().await;
-    let changed = document("Service/slam", 3, json!({ "config": { "rate_hz": 10 } }));
-    w.says(commit(3, 2, vec![(Op::Update, changed)])).await;
+    w.says(slam(3, 10)).await;
     let request = json!({ "id": "1", "service": "slam", "reply_to": "blaze/reply/t" });
     w.gets.send(Bytes::from(request.to_string())).await.unwrap();
     assert_eq!(w.rest().await, []);
     assert!(w.answers.try_recv().is_err());
     w.leader.send_replace(Some(1));
-    let (channel, notice) = loop {
-        let (channel, notice) = w.notice().await;
-        if notice["config"]["rate_hz"] == 10 {
-            break (channel, notice);
-        }
-    };
-    assert_eq!(
-        (channel.as_str(), &notice["revision"]),
-        ("blaze/config/changed/slam", &json!(3))
-    );
+    assert_eq!(notices(&w.rest().await), [(3, 10)]);
     assert_eq!(w.slam().await["config"]["rate_hz"], 10);
-}
-
-#[tokio::test(start_paused = true)]
-async fn what_nobody_told_for_long_is_told_by_whoever_leads_next() {
-    let mut w = world_from(None, false);
-    w.opens(documents(30), 2).await;
-    w.says(slam(3, 10)).await;
-    w.says(slam(4, 11)).await;
-    w.rest().await;
-    tokio::time::sleep(Duration::from_secs(600)).await;
-    w.leader.send_replace(Some(1));
-    let told = w.rest().await;
-    assert_eq!(notices(&told), [(4, 11)], "the last state, once");
-    let Some(Seen::Notice(_, notice)) = told
-        .iter()
-        .find(|seen| matches!(seen, Seen::Notice(channel, _) if channel.ends_with("/slam")))
-    else {
-        panic!("{told:?}");
-    };
-    assert_eq!(
-        notice["previous_hash"],
-        Value::Null,
-        "before the first documents there was nothing"
-    );
-    assert_eq!(key_of_slam(&told), Some(11));
 }
 
 #[tokio::test(start_paused = true)]
@@ -96,8 +54,7 @@ async fn whoever_begins_to_lead_notifies_every_place_once() {
         w.leader.send_replace(Some(term));
         let told = w.rest().await;
         assert_eq!(notices(&told), [(3, 10)]);
-        let all = told.iter().filter(|seen| matches!(seen, Seen::Notice(..))).count();
-        assert_eq!(all, 2, "nav as well: {told:?}");
+        assert_eq!(noticed(&told).count(), 2, "nav as well: {told:?}");
         assert_eq!(key_of_slam(&told), Some(10));
         w.noted.send_replace(Some(mark(3)));
         assert_eq!(w.rest().await, [], "once");
@@ -106,21 +63,12 @@ async fn whoever_begins_to_lead_notifies_every_place_once() {
     w.says(slam(4, 11)).await;
     let told = w.rest().await;
     assert_eq!(notices(&told), [(4, 11)]);
-    assert_eq!(told.iter().filter(|seen| matches!(seen, Seen::Notice(..))).count(), 1);
+    assert_eq!(noticed(&told).count(), 1);
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_copy_is_announced_only_if_services_were_not_notified_of_more() {
-    let copy = || Loaded {
-        position: Position {
-            store_id: "s".to_owned(),
-            layer: "edge".parse().unwrap(),
-            revision: 2,
-            as_of: Timestamp::from_millis(1_000),
-        },
-        documents: documents(30).into_iter().map(Arc::new).collect(),
-        notes: Arc::default(),
-    };
+    let copy = || copy_of("s", 2, documents(30));
     // Alone, and without the main service: nobody knows how old the copy is. Keys are there nevertheless.
     let mut w = world_from(Some(copy()), true);
     let told = w.rest().await;
@@ -134,42 +82,6 @@ async fn a_copy_is_announced_only_if_services_were_not_notified_of_more() {
         w.leader.send_replace(Some(1));
         assert_eq!(notices(&w.rest().await), expected);
     }
-}
-
-#[tokio::test(start_paused = true)]
-async fn what_was_undone_at_the_very_revision_of_the_mark_is_told_if_the_leader_dies_over_it() {
-    let mut w = world_from(None, false);
-    let mut documents = canary_documents();
-    documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
-    w.opens(documents, 2).await;
-    w.says(commit(3, 2, vec![(Op::Update, rollout(3, "u-1", 500))])).await;
-    w.rest().await;
-    w.noted.send_replace(Some(mark(3)));
-    tokio::time::sleep(Duration::from_secs(20)).await;
-    w.acks("0", &json!(null), "rejected").await;
-    // Whoever leads has heard the same, and is frozen before it tells what it is again.
-    tokio::time::sleep(Duration::from_secs(600)).await;
-    assert_eq!(w.rest().await, []);
-    w.leader.send_replace(Some(1));
-    assert_eq!(w.rates().await, [json!(30)]);
-}
-
-#[tokio::test(start_paused = true)]
-async fn that_a_service_was_deleted_is_told_as_well() {
-    let mut w = world_from(None, false);
-    w.opens(documents(30), 2).await;
-    w.rest().await;
-    w.noted.send_replace(Some(mark(2)));
-    tokio::time::sleep(Duration::from_secs(60)).await;
-    let gone = document("Service/slam", 2, json!({ "config": { "rate_hz": 30 } }));
-    w.says(commit(3, 2, vec![(Op::Delete, gone)])).await;
-    tokio::time::sleep(Duration::from_secs(60)).await;
-    w.leader.send_replace(Some(1));
-    let (channel, notice) = w.notice().await;
-    assert_eq!(
-        (channel.as_str(), &notice["deleted"]),
-        ("blaze/config/changed/slam", &json!(true))
-    );
 }
 
 #[tokio::test(start_paused = true)]
@@ -191,7 +103,7 @@ async fn whoever_leads_leaves_how_far_the_broker_has_taken_it() {
         4,
         json!({ "config": { "rate_hz": 10 }, "description": "new" }),
     );
-    w.says(commit(4, 3, vec![(Op::Update, same)])).await;
+    w.says(put(4, same)).await;
     w.rest().await;
     assert_eq!(*w.told.borrow(), Some(mark(4)));
     w.leader.send_replace(None);
@@ -208,7 +120,7 @@ async fn what_waited_when_the_lease_was_lost_is_told_when_it_is_had_again() {
     w.up.send_replace(false);
     w.says(slam(3, 10)).await;
     let gone = document("Service/nav", 1, json!({ "config": { "speed": 1 } }));
-    w.says(commit(4, 3, vec![(Op::Delete, gone)])).await;
+    w.says(remove(4, gone)).await;
     tokio::time::sleep(Duration::from_secs(5)).await;
     w.leader.send_replace(None);
     tokio::time::sleep(Duration::from_secs(60)).await;
@@ -232,20 +144,9 @@ async fn between_two_terms_nothing_is_carried_over_and_everything_told_anew() {
     // It was stopped for a while, others led, and it leads again: it sees only that it is another term.
     w.noted.send_replace(Some(mark(9)));
     w.leader.send_replace(Some(2));
-    let closed = SyncEvent::Closed {
-        reason: "away".to_owned(),
-        is_unreadable: false,
-    };
-    w.sync.send(closed).await.unwrap();
+    w.closes().await;
     w.up.send_replace(true);
-    assert_eq!(
-        w.rest()
-            .await
-            .iter()
-            .filter(|seen| matches!(seen, Seen::Notice(..)))
-            .count(),
-        0
-    );
+    assert_eq!(noticed(&w.rest().await).count(), 0);
 }
 
 #[tokio::test(start_paused = true)]
@@ -254,11 +155,7 @@ async fn whoever_knows_less_than_was_told_answers_and_tells_nothing_until_it_kno
     let stream = w.opens(documents(30), 2).await;
     w.rest().await;
     drop(stream);
-    let closed = SyncEvent::Closed {
-        reason: "away".to_owned(),
-        is_unreadable: false,
-    };
-    w.sync.send(closed).await.unwrap();
+    w.closes().await;
     w.noted.send_replace(Some(mark(5)));
     w.leader.send_replace(Some(1));
     assert_eq!(w.rest().await, [], "neither notices nor keys");
@@ -300,12 +197,11 @@ async fn a_speaker_says_nothing_after_its_term() {
             key: String::new(),
             value: Some(Bytes::from(text)),
         }),
-        revision: 3,
     };
     speaker.tell([told("1")]);
     tokio::time::sleep(Duration::from_secs(5)).await;
     assert!(seen.try_recv().is_err());
-    assert_eq!(speaker.untold(), Some(3));
+    assert!(!speaker.is_done());
     holder.lead(Some(Instant::now() + Duration::from_secs(5)));
     tokio::time::sleep(Duration::from_secs(1)).await;
     assert!(matches!(seen.recv().await, Some(Seen::Key(..))));

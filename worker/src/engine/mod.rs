@@ -28,7 +28,6 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use blaze_domain::LayerName;
 use blaze_domain::config::state::State;
 use blaze_domain::config::{Document, Kind, Timestamp};
 use blaze_proto::v1;
@@ -42,7 +41,7 @@ use ends::Ends;
 
 pub use hear::Sign;
 pub use own::Own;
-pub use ports::{Counts, Identity, Inputs, Outputs, Query, Replies};
+pub use ports::{Counts, Identity, Inputs, Outputs, Replies};
 pub use status::Status;
 
 /// Within this time several changes may become one notice.
@@ -112,8 +111,6 @@ pub struct Engine {
     /// Places that are not notified any more.
     ends: Ends,
     defaults_problem: Option<String>,
-    /// The worker's own configuration.
-    own: Option<Own>,
     counts: Counts,
 }
 
@@ -121,11 +118,10 @@ impl Engine {
     /// An engine that serves what is found at the start, if anything is.
     #[must_use]
     pub fn new(identity: Identity, outputs: Outputs, start: Option<Loaded>) -> Self {
-        let layer = identity.site.layer.clone();
         let now = Instant::now();
         let mut engine = Self {
             served: Served::new(identity.site.clone()),
-            replica: Replica::new(layer.clone()),
+            replica: Replica::default(),
             notes: Arc::default(),
             notes_version: 0,
             wants_all: false,
@@ -154,18 +150,17 @@ impl Engine {
             has_swept: false,
             ends: Ends::default(),
             defaults_problem: None,
-            own: None,
             counts: Counts::default(),
             identity,
             outputs,
         };
         if let Some(loaded) = start {
-            engine.begin_with(layer, loaded, now);
+            engine.begin_with(loaded, now);
         }
         engine
     }
 
-    fn begin_with(&mut self, layer: LayerName, loaded: Loaded, now: Instant) {
+    fn begin_with(&mut self, loaded: Loaded, now: Instant) {
         let Position {
             store_id,
             revision,
@@ -174,11 +169,8 @@ impl Engine {
         } = loaded.position;
         let state = self.state_of(revision, loaded.documents);
         self.take_notes(&loaded.notes);
-        self.replica = Replica::from_copy(layer, Some(store_id), state.clone(), Some(as_of));
-        // Nothing was loaded before it.
-        if let Err(error) = self.served.load(state, Source::Copy) {
-            tracing::error!(%error, "the copy is not used");
-        }
+        self.replica = Replica::from_copy(store_id, state.clone(), as_of);
+        self.served.load(state, Source::Copy);
         self.lacks_texts = lacks_texts(self.replica.state());
         self.note_all_services();
         self.flush_at = Some(now);
@@ -212,7 +204,10 @@ impl Engine {
                 biased;
                 () = stop.cancelled() => return,
                 () = sleep_until(flush_at.unwrap_or_else(Instant::now)), if flush_at.is_some() => self.flush(),
-                Some(query) = inputs.queries.recv() => self.answer_query(query),
+                Some(asked) = inputs.queries.recv() => {
+                    // Whoever asked may have gone.
+                    let _ = asked.send(self.status());
+                }
                 Some(found) = inputs.found.recv() => self.on_found(found),
                 // Before the term that it is of: whoever takes over must not be behind it.
                 Ok(()) = inputs.noted.changed() => {
@@ -309,19 +304,9 @@ impl Engine {
         let Some(current) = &status.current else { return };
         let state = self.state_of(0, current.documents.iter().cloned());
         // What came from the main service or a copy of it is better.
-        if self.served.load(state, Source::File).is_ok() {
+        if self.served.load(state, Source::File) {
             self.note_all_services();
             self.flush_soon();
-        }
-    }
-
-    fn answer_query(&mut self, query: Query) {
-        match query {
-            Query::Status(asked) => {
-                let status = self.status();
-                // Whoever asked may have gone.
-                let _ = asked.send(status);
-            }
         }
     }
 }

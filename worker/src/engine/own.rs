@@ -23,16 +23,9 @@ pub struct Own {
 }
 
 impl Engine {
-    /// The same engine, which tells what the worker's own configuration is.
-    #[must_use]
-    pub fn with_own(mut self, own: Own) -> Self {
-        self.own = Some(own);
-        self
-    }
-
     /// Tells it, if it is another one.
     pub(super) fn tell_own(&self) {
-        let Some(own) = &self.own else { return };
+        let Some(own) = &self.outputs.own else { return };
         let standing = self.served.look_up(&own.place);
         own.tell.send_if_modified(|before| {
             let hash = standing.as_ref().map(|standing| standing.hash.as_str());

@@ -8,7 +8,7 @@ use blaze_proto::v1;
 use bytes::Bytes;
 use tokio::sync::{mpsc, oneshot, watch};
 
-use super::{Sign, Status};
+use super::{Own, Sign, Status};
 use crate::copy::{Copies, Found, defaults};
 use crate::core::Site;
 use crate::core::messages::Delivery;
@@ -34,7 +34,7 @@ pub struct Identity {
     /// Whom it serves.
     pub site: Site,
     /// The node that it runs on.
-    pub node: Option<NodeName>,
+    pub node: NodeName,
     /// Its name among the workers of its layer; no other life of it has the same.
     pub worker_id: String,
     /// How secrets reach services.
@@ -56,7 +56,7 @@ pub struct Inputs {
     /// How far services were told, as it lies beside the lease.
     pub noted: watch::Receiver<Option<Mark>>,
     /// Questions of the admin port.
-    pub queries: mpsc::Receiver<Query>,
+    pub queries: mpsc::Receiver<oneshot::Sender<Status>>,
     /// What copies hold that could not be read at the start.
     pub found: mpsc::Receiver<Found>,
 }
@@ -73,17 +73,12 @@ pub struct Outputs {
     pub copies: Option<Copies>,
     /// What the worker has, for the main service.
     pub acks: watch::Sender<Option<v1::Ack>>,
+    /// Its own configuration; absent where it takes none.
+    pub own: Option<Own>,
     /// Until when this worker leads.
     pub term: Term,
     /// How far it has told services, for whoever leads next.
     pub told: watch::Sender<Option<Mark>>,
-}
-
-/// A question to the engine.
-#[derive(Debug)]
-pub enum Query {
-    /// How it is.
-    Status(oneshot::Sender<Status>),
 }
 
 /// What happened since the start.
@@ -95,12 +90,8 @@ pub struct Counts {
     pub refused: u64,
     /// Requests that another worker of the layer answers.
     pub left_to_others: u64,
-    /// Commits and snapshots that were taken over.
-    pub changes: u64,
     /// Streams that were begun anew because something was missing or different.
     pub faults: u64,
-    /// Notices that followed from changes.
-    pub notices: u64,
     /// Acknowledgements and signs of life that were understood.
     pub signs: u64,
     /// Those that could not be read.

@@ -20,8 +20,6 @@ pub struct Status {
     pub in_sync: bool,
     /// Revision of what is served.
     pub revision: u64,
-    /// Documents.
-    pub documents: usize,
     /// Canaries that are not judged, because there are too many.
     pub unwatched: usize,
     /// Why the mounted file is not used.
@@ -33,7 +31,6 @@ pub struct Status {
 impl Engine {
     pub(super) fn status(&mut self) -> Status {
         let site = self.identity.site.clone();
-        let node = site.node.as_ref().or(self.identity.node.as_ref());
         let freshness = Freshness {
             as_of: self.replica.as_of(),
             now: now(),
@@ -50,7 +47,7 @@ impl Engine {
         let revision = self.replica.state().revision();
         let json = json!({
             "layer": site.layer.as_str(),
-            "node": node.map(NodeName::as_str),
+            "node": self.identity.node.as_str(),
             "worker_id": self.identity.worker_id,
             "leader": self.is_leader(),
             "source": self.served.source().map(Source::as_str),
@@ -72,7 +69,6 @@ impl Engine {
             is_ready: self.served.is_ready(),
             in_sync: self.replica.is_in_sync(),
             revision,
-            documents: self.replica.state().len(),
             unwatched: self.gate.unwatched(),
             defaults_problem: self.defaults_problem.clone(),
             reason: self.reason.clone(),

@@ -37,7 +37,6 @@ impl Engine {
             tracked,
             untracked,
         } = self.served.flush(instant.into_std());
-        self.counts.notices += notices.len() as u64;
         self.shown = self.mark();
         let is_first = self.served.is_ready() && !std::mem::replace(&mut self.has_swept, self.served.is_ready());
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
@@ -167,7 +166,6 @@ impl Engine {
                 key: record_key(&notice.place),
                 value: Some(Bytes::from(text.ok()?)),
             }),
-            revision: self.shown.as_ref().map_or(0, |shown| shown.revision),
         })
     }
 
@@ -180,7 +178,6 @@ impl Engine {
             place: place.to_string(),
             key: Some(self.key(place, standing)?),
             notice: None,
-            revision: 0,
         })
     }
 
@@ -190,7 +187,6 @@ impl Engine {
             place: place.to_string(),
             key: Some(self.key_to_go(place)?),
             notice: None,
-            revision: 0,
         })
     }
 

@@ -25,8 +25,8 @@ use super::*;
 use crate::copy::{Copies, Found};
 use crate::core::Site;
 use crate::core::messages::Delivery;
-use crate::core::testing::document;
-use crate::core::{Edit, Incoming, Op};
+use crate::core::testing::{document, place};
+use crate::core::{Edit, Incoming};
 use crate::lease::Term;
 use crate::serve::{Channels, Outlet, OutletError, Speaker};
 use crate::sync::SyncEvent;
@@ -109,7 +109,7 @@ struct World {
     /// Whether the broker takes anything.
     up: watch::Sender<bool>,
     defaults: watch::Sender<defaults::Status>,
-    queries: mpsc::Sender<Query>,
+    queries: mpsc::Sender<oneshot::Sender<Status>>,
     found: mpsc::Sender<Found>,
     answers: mpsc::Receiver<(String, Value)>,
     seen: mpsc::Receiver<Seen>,
@@ -155,7 +155,7 @@ fn world_on(
             layer: "edge".parse().unwrap(),
             node: Some("robot-1".parse().unwrap()),
         },
-        node: None,
+        node: "robot-1".parse().unwrap(),
         worker_id: "w-1".to_owned(),
         delivery,
     };
@@ -166,6 +166,7 @@ fn world_on(
         channels,
         copies,
         acks: acks_out,
+        own: None,
         term: Term::always(),
         told: told_out,
     };
@@ -213,14 +214,83 @@ fn documents(rate: u64) -> Vec<Document> {
     ]
 }
 
-fn commit(revision: u64, previous: u64, edits: Vec<(Op, Document)>) -> Incoming {
-    let edits = edits.into_iter().map(|(op, document)| Edit { op, document });
+/// A commit right after the one before.
+fn commit(revision: u64, edit: Edit) -> Incoming {
     Incoming::Commit {
         revision,
-        previous,
-        time: Timestamp::default(),
-        subject: "ops".to_owned(),
-        edits: edits.collect(),
+        previous: revision - 1,
+        edits: vec![edit],
+    }
+}
+
+fn put(revision: u64, document: Document) -> Incoming {
+    commit(revision, Edit::Put(document))
+}
+
+fn remove(revision: u64, document: Document) -> Incoming {
+    commit(revision, Edit::Remove(document.key))
+}
+
+/// Another rate of `slam`.
+fn slam(revision: u64, rate: u64) -> Incoming {
+    put(
+        revision,
+        document("Service/slam", revision, json!({ "config": { "rate_hz": rate } })),
+    )
+}
+
+/// Channels and notices among what was seen.
+fn noticed(seen: &[Seen]) -> impl Iterator<Item = (&str, &Value)> {
+    seen.iter().filter_map(|seen| match seen {
+        Seen::Notice(channel, notice) => Some((channel.as_str(), notice)),
+        Seen::Key(..) | Seen::TakenAway(..) => None,
+    })
+}
+
+/// Rates in notices.
+fn rates(seen: &[Seen]) -> Vec<u64> {
+    noticed(seen)
+        .filter_map(|(_, notice)| notice["config"]["rate_hz"].as_u64())
+        .collect()
+}
+
+/// What a copy of a store holds.
+fn copy_of(store_id: &str, revision: u64, documents: Vec<Document>) -> Loaded {
+    Loaded {
+        position: Position {
+            store_id: store_id.to_owned(),
+            layer: "edge".parse().unwrap(),
+            revision,
+            as_of: Timestamp::from_millis(1_000),
+        },
+        documents: documents.into_iter().map(Arc::new).collect(),
+        notes: Arc::default(),
+    }
+}
+
+/// The same with a place that was notified: an instance of `slam`.
+fn with_place(instance: &str, loaded: Loaded) -> Loaded {
+    let notes = Arc::new(Notes {
+        places: vec![place(&format!("slam/{instance}@robot-1"))],
+        ..Notes::default()
+    });
+    Loaded { notes, ..loaded }
+}
+
+/// What a mounted file says.
+fn file(rate: u64) -> defaults::Status {
+    let documents = documents(rate).into_iter().map(|document| {
+        Arc::new(Document {
+            revision: 0,
+            ..document
+        })
+    });
+    defaults::Status {
+        current: Some(Arc::new(defaults::Defaults {
+            documents: documents.collect(),
+            left_out: 0,
+        })),
+        problem: None,
     }
 }
 
@@ -247,6 +317,20 @@ impl World {
         })
         .await;
         stream
+    }
+
+    async fn closes(&self) {
+        let closed = SyncEvent::Closed {
+            reason: "cut".to_owned(),
+            is_unreadable: false,
+        };
+        self.sync.send(closed).await.unwrap();
+    }
+
+    async fn status(&self) -> Status {
+        let (send, status) = oneshot::channel();
+        self.queries.send(send).await.unwrap();
+        status.await.unwrap()
     }
 
     async fn hello(&self) -> v1::Hello {
@@ -310,41 +394,27 @@ async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
     assert_eq!((&answer["node"], &answer["revision"]), (&json!("robot-1"), &json!(2)));
     w.rest().await;
 
-    let changed = document("Service/slam", 3, json!({ "config": { "rate_hz": 10 } }));
-    w.says(commit(3, 2, vec![(Op::Update, changed)])).await;
+    w.says(slam(3, 10)).await;
     let told = w.rest().await;
-    let notices: Vec<_> = told.iter().filter(|seen| matches!(seen, Seen::Notice(..))).collect();
+    let notices: Vec<_> = noticed(&told).collect();
     assert_eq!(
         notices.len(),
         2,
-        "the instance that asked, and the service without one: {told:?}"
+        "the instance that asked, and the one without: {told:?}"
     );
-    for seen in notices {
-        let Seen::Notice(channel, notice) = seen else {
-            unreachable!()
-        };
+    for (channel, notice) in notices {
         assert_eq!(channel, "blaze/config/changed/slam");
         assert_eq!(
-            (&notice["paths"], &notice["scopes"]),
-            (&json!(["/rate_hz"]), &json!(["service"]))
+            (&notice["paths"], &notice["scopes"], &notice["revision"]),
+            (&json!(["/rate_hz"]), &json!(["service"]), &json!(3))
         );
-        assert_eq!(
-            (&notice["config"]["rate_hz"], &notice["revision"]),
-            (&json!(10), &json!(3))
-        );
-        assert_eq!(notice["config"]["log"], "info");
+        assert_eq!(notice["config"], json!({ "rate_hz": 10, "log": "info" }));
     }
-    let keys: Vec<&str> = told
-        .iter()
-        .filter_map(|seen| match seen {
-            Seen::Key(key, Some(value)) => {
-                assert_eq!(value["config"]["rate_hz"], 10);
-                Some(key.as_str())
-            }
-            Seen::Key(_, None) | Seen::Notice(..) | Seen::TakenAway(..) => None,
-        })
-        .collect();
-    assert_eq!(keys, ["blaze:config:slam", "blaze:config:slam:0"]);
+    let keys = told.iter().filter_map(|seen| match seen {
+        Seen::Key(key, Some(value)) if value["config"]["rate_hz"] == 10 => Some(key.as_str()),
+        _ => None,
+    });
+    assert_eq!(keys.collect::<Vec<_>>(), ["blaze:config:slam", "blaze:config:slam:0"]);
 
     // A new revision that says the same is told to nobody.
     let same = document(
@@ -352,7 +422,7 @@ async fn a_service_gets_its_configuration_and_hears_of_its_own_changes_alone() {
         4,
         json!({ "config": { "rate_hz": 10 }, "description": "new" }),
     );
-    w.says(commit(4, 3, vec![(Op::Update, same)])).await;
+    w.says(put(4, same)).await;
     assert_eq!(w.rest().await, []);
     assert_eq!(w.slam().await["revision"], 3);
 }
@@ -363,18 +433,10 @@ async fn what_comes_together_is_told_once_and_the_last_state_always() {
     w.opens(documents(30), 2).await;
     w.rest().await;
     for revision in 3..53 {
-        let changed = document("Service/slam", revision, json!({ "config": { "rate_hz": revision } }));
-        w.says(commit(revision, revision - 1, vec![(Op::Update, changed)]))
-            .await;
+        w.says(slam(revision, revision)).await;
     }
     let told = w.rest().await;
-    let rates: Vec<u64> = told
-        .iter()
-        .filter_map(|seen| match seen {
-            Seen::Notice(_, notice) => notice["config"]["rate_hz"].as_u64(),
-            Seen::Key(..) | Seen::TakenAway(..) => None,
-        })
-        .collect();
+    let rates = rates(&told);
     assert_eq!(rates.last(), Some(&52));
     assert!(rates.len() < 50 && rates.is_sorted(), "{rates:?}");
 }
@@ -384,17 +446,13 @@ async fn what_is_missing_is_asked_for_anew_and_services_keep_what_they_have() {
     let mut w = world();
     let stream = w.opens(documents(30), 2).await;
     w.rest().await;
-    let later = document("Service/slam", 9, json!({ "config": { "rate_hz": 1 } }));
-    w.says(commit(9, 7, vec![(Op::Update, later)])).await;
+    // The one before is missing.
+    w.says(slam(9, 1)).await;
     tokio::time::timeout(Duration::from_secs(10), stream.cancelled())
         .await
         .unwrap();
     assert_eq!(w.slam().await["config"]["rate_hz"], 30);
-    let closed = SyncEvent::Closed {
-        reason: "begins anew".to_owned(),
-        is_unreadable: false,
-    };
-    w.sync.send(closed).await.unwrap();
+    w.closes().await;
     let hello = w.hello().await;
     assert_eq!((hello.revision, hello.store_id.as_str()), (0, ""));
     assert_eq!((hello.layer.as_str(), hello.node.as_str()), ("edge", "robot-1"));
@@ -409,42 +467,8 @@ async fn what_is_missing_is_asked_for_anew_and_services_keep_what_they_have() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn the_main_service_is_told_what_is_here() {
-    let mut w = world();
-    w.opens(documents(30), 2).await;
-    let ack = w.acks.wait_for(Option::is_some).await.unwrap().clone().unwrap();
-    assert_eq!(ack.revision, 2);
-    let (send, status) = oneshot::channel();
-    w.queries.send(Query::Status(send)).await.unwrap();
-    let status = status.await.unwrap();
-    assert_eq!(status.json["digest"], ack.digest);
-    assert_eq!(
-        (&status.json["connected"], &status.json["leader"]),
-        (&json!(true), &json!(true))
-    );
-    assert!(status.is_ready && status.in_sync);
-}
-
-#[tokio::test(start_paused = true)]
 async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
     let mut w = world();
-    let file = |rate| {
-        let documents = documents(rate).into_iter().map(|document| {
-            Arc::new(Document {
-                revision: 0,
-                ..document
-            })
-        });
-        defaults::Status {
-            current: Some(Arc::new(defaults::Defaults {
-                documents: documents.collect(),
-                as_of: Timestamp::default(),
-                left_out: 0,
-                rollouts: 0,
-            })),
-            problem: None,
-        }
-    };
     w.defaults.send_replace(file(1));
     w.rest().await;
     let answer = w.slam().await;
@@ -459,11 +483,7 @@ async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
     w.rest().await;
     w.defaults.send_replace(file(3));
     w.rest().await;
-    let closed = SyncEvent::Closed {
-        reason: "away".to_owned(),
-        is_unreadable: false,
-    };
-    w.sync.send(closed).await.unwrap();
+    w.closes().await;
     let answer = w.slam().await;
     assert_eq!(
         (&answer["config"]["rate_hz"], &answer["source"]),
@@ -473,37 +493,12 @@ async fn the_mounted_file_serves_until_there_is_better_and_never_after() {
 
 #[tokio::test(start_paused = true)]
 async fn a_new_life_serves_what_the_last_one_had_and_tells_only_what_differs() {
-    let (told, mut w) = {
-        let mut w = world();
-        w.opens(documents(30), 2).await;
-        w.rest().await;
-        (w.slam().await, w)
-    };
-    w.rest().await;
-    drop(w);
-    let notes = Notes {
-        places: vec![Place {
-            service: "slam".parse().unwrap(),
-            instance: Some("0".parse().unwrap()),
-            node: Some("robot-1".parse().unwrap()),
-        }],
-        ..Notes::default()
-    };
-    let loaded = Loaded {
-        position: Position {
-            store_id: "s".to_owned(),
-            layer: "edge".parse().unwrap(),
-            revision: 2,
-            as_of: Timestamp::from_millis(1_000),
-        },
-        documents: documents(30).into_iter().map(Arc::new).collect(),
-        notes: Arc::new(notes),
-    };
+    let loaded = with_place("0", copy_of("s", 2, documents(30)));
     let mut w = world_from(Some(loaded), true);
     let answer = w.slam().await;
     assert_eq!(
-        (&answer["config"], &answer["source"]),
-        (&told["config"], &json!("copy"))
+        (&answer["config"]["rate_hz"], &answer["source"]),
+        (&json!(30), &json!("copy"))
     );
     assert_eq!(answer["as_of"], "1970-01-01T00:00:01.000Z");
     let hello = w.hello().await;

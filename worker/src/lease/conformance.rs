@@ -11,18 +11,18 @@ pub const TIME: Duration = Duration::from_secs(3);
 pub const BUSY: Duration = Duration::from_secs(2);
 
 /// Leases of one kind, with a server behind them.
-pub struct Fixture<'f> {
-    /// The lease of a layer for an owner; no owner is asked for twice.
-    pub lease: &'f dyn Fn(&str, &str) -> Arc<dyn Lease>,
-    /// How long the first may have to wait for one that nobody has had.
-    pub first_within: Duration,
+struct Fixture<'f> {
+    lease: &'f dyn Fn(&str, &str) -> Arc<dyn Lease>,
+    first_within: Duration,
 }
 
-/// Runs the whole suite.
+/// Runs the whole suite. `lease`: the one of a layer for an owner; no owner is asked for twice. `first_within`: how long the
+/// first may have to wait for one that nobody has had.
 ///
 /// # Errors
 /// The first rule that does not hold, for people.
-pub async fn run_all(fixture: &Fixture<'_>) -> Result<(), String> {
+pub async fn run_all(lease: &dyn Fn(&str, &str) -> Arc<dyn Lease>, first_within: Duration) -> Result<(), String> {
+    let fixture = &Fixture { lease, first_within };
     let named = |rule: &str, result: Result<(), String>| result.map_err(|error| format!("{rule}: {error}"));
     named("one at a time", one_at_a_time(fixture).await)?;
     named("marks", marks(fixture).await)?;

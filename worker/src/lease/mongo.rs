@@ -104,20 +104,3 @@ fn taken(owner: &str, time: Duration, told: Option<&Mark>) -> Document {
 fn mark(found: &Document) -> Option<Mark> {
     Mark::parse(found.get_str("told").ok()?)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[tokio::test]
-    async fn a_server_that_is_away_is_said_to_be_and_its_password_is_not() {
-        let uri = SecretText::from("mongodb://me:canary@127.0.0.1:1/?directConnection=true".to_owned());
-        let lease = MongoLease::new(uri, "blaze", "fog".parse().unwrap(), "one".to_owned()).unwrap();
-        let error = lease.hold(Duration::from_secs(1), None).await.unwrap_err();
-        assert!(
-            error.contains("MongoDB blaze, lease fog") && !error.contains("canary"),
-            "{error}"
-        );
-        assert!(!lease.describe().contains("canary"));
-    }
-}

@@ -10,7 +10,8 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use blaze_brokers::redis::{KeyChange, KeyError, RedisKeys, RedisLock};
 use blaze_brokers::{
-    Broker, BrokerError, Health, KeyedMessage, PublishOutcome, Publisher, PublisherOptions, WorkerSide, WriteError,
+    Broker, BrokerError, BrokerKind, Health, KeyedMessage, PublishOutcome, Publisher, PublisherOptions, WorkerSide,
+    WriteError,
 };
 use blaze_domain::ServiceName;
 use blaze_domain::names::ChannelName;
@@ -38,12 +39,9 @@ pub enum OutletError {
         /// What one of them waits for.
         reason: String,
     },
-    /// Nothing was done: the server of the keys, which is another one than the broker, does not answer.
+    /// Nothing was done: the server of the keys, which is another one than the broker, does not take them.
     #[error("the keys are not written: {0}")]
-    KeysLater(KeyError),
-    /// Nothing was done: the same server does not take one of the keys, and will not.
-    #[error("a key is not written: {0}")]
-    KeysRefused(KeyError),
+    KeysAlone(KeyError),
     /// It is more than the broker carries.
     #[error("{bytes} bytes are more than the broker carries")]
     TooLarge {
@@ -73,8 +71,7 @@ impl OutletError {
             },
             Self::Away(_)
             | Self::NotYet { .. }
-            | Self::KeysLater(_)
-            | Self::KeysRefused(_)
+            | Self::KeysAlone(_)
             | Self::Led
             | Self::Keys(KeyError::Away { .. }) => false,
         }
@@ -175,37 +172,36 @@ impl BrokerOutlet {
         }
     }
 
-    /// The same with keys on a Redis; `is_broker`: it is the broker's own server; `is_own`: whether a value is one that a
+    /// The same with keys on a Redis; `is_broker`: it is the broker's own server; `lock`: the lease of one of several workers,
+    /// where it lies there as well; `is_own`: whether a value is one that a
     /// worker of this place writes, which others on the same server are not to lose.
     #[must_use]
     pub fn with_keys(
         mut self,
         client: Arc<RedisKeys>,
         is_broker: bool,
+        lock: Option<RedisLock>,
         is_own: impl Fn(&[u8]) -> bool + Send + Sync + 'static,
     ) -> Self {
         self.keys = Some(Keys {
             client,
             is_broker,
-            lock: None,
+            lock,
         });
         self.is_own = Box::new(is_own);
         self
+    }
+
+    /// Which broker it is.
+    #[must_use]
+    pub fn kind(&self) -> BrokerKind {
+        self.broker.kind()
     }
 
     /// Whether channels are to be made, and keep what was said last on them.
     #[must_use]
     pub fn makes_channels(&self) -> bool {
         self.side.is_some()
-    }
-
-    /// The same for one of several workers, whose lease lies on the Redis of the keys.
-    #[must_use]
-    pub fn while_held(mut self, lock: Option<RedisLock>) -> Self {
-        if let Some(keys) = &mut self.keys {
-            keys.lock = lock;
-        }
-        self
     }
 
     /// Publishes one message, now. What a broker that is away does not take is dropped: whoever asked asks again.
@@ -255,8 +251,7 @@ impl Outlet for BrokerOutlet {
                 return keys.apply(changes, &messages).await;
             }
             Some(keys) => keys.apply(changes, &[]).await.map_err(|error| match error {
-                OutletError::Keys(error @ KeyError::Away { .. }) => OutletError::KeysLater(error),
-                OutletError::Keys(error @ KeyError::Refused { .. }) => OutletError::KeysRefused(error),
+                OutletError::Keys(error) => OutletError::KeysAlone(error),
                 other => other,
             })?,
             None => {}

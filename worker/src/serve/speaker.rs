@@ -2,10 +2,10 @@
 //! of each place counts. A broker that is away holds up nobody; what waits then is bounded by the places that there are.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use blaze_brokers::KeyedMessage;
+use blaze_brokers::redis::KeyError;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::Notify;
@@ -37,8 +37,6 @@ pub struct Told {
     pub key: Option<(String, Option<Bytes>)>,
     /// The notice, if there is one.
     pub notice: Option<KeyedMessage>,
-    /// Revision of the documents that it follows from.
-    pub revision: u64,
 }
 
 /// What happened to notices and keys.
@@ -48,8 +46,6 @@ pub struct SpeakerCounts {
     pub notices: u64,
     /// Notices that were replaced by newer ones before the broker took them.
     pub replaced: u64,
-    /// Keys that were written or deleted.
-    pub keys: u64,
     /// Transactions that failed and were tried again.
     pub failures: u64,
     /// Places that were not told, because the broker refuses them.
@@ -61,11 +57,6 @@ pub struct SpeakerCounts {
 struct Shared {
     state: Mutex<State>,
     more: Notify,
-    notices: AtomicU64,
-    replaced: AtomicU64,
-    keys: AtomicU64,
-    failures: AtomicU64,
-    dropped: AtomicU64,
 }
 
 /// Clones share it. [`Speaker::run`] must run once.
@@ -84,38 +75,22 @@ impl Speaker {
             shared: Arc::new(Shared {
                 state: Mutex::default(),
                 more: Notify::new(),
-                notices: AtomicU64::new(0),
-                replaced: AtomicU64::new(0),
-                keys: AtomicU64::new(0),
-                failures: AtomicU64::new(0),
-                dropped: AtomicU64::new(0),
             }),
         }
     }
 
     /// Tells it as soon as the broker takes it. Never waits.
     pub fn tell(&self, told: impl IntoIterator<Item = Told>) {
-        let mut replaced = 0;
-        {
-            let mut state = self.shared.state.lock();
-            for one in told {
-                replaced += u64::from(state.put(one));
-            }
-        }
-        self.shared.replaced.fetch_add(replaced, Ordering::Relaxed);
+        let mut state = self.shared.state.lock();
+        told.into_iter().for_each(|one| state.put(one));
+        drop(state);
         self.shared.more.notify_one();
     }
 
-    /// The lowest revision of what the broker has not yet taken; `None`: it has taken all.
+    /// Whether the broker has taken every notice that it can take: a channel that cannot be made holds up nobody else.
     #[must_use]
-    pub fn untold(&self) -> Option<u64> {
-        self.shared.state.lock().untold()
-    }
-
-    /// The same of those whom the broker can tell: a channel that cannot be made holds up nobody else.
-    #[must_use]
-    pub fn untold_where_possible(&self) -> Option<u64> {
-        self.shared.state.lock().untold_where_possible()
+    pub fn is_done(&self) -> bool {
+        self.shared.state.lock().is_done()
     }
 
     /// Has keys of before, which nobody wants any more, looked for and deleted. All that are wanted must have been told.
@@ -132,14 +107,10 @@ impl Speaker {
     /// What has happened so far.
     #[must_use]
     pub fn counts(&self) -> SpeakerCounts {
-        let count = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        let state = self.shared.state.lock();
         SpeakerCounts {
-            notices: count(&self.shared.notices),
-            replaced: count(&self.shared.replaced),
-            keys: count(&self.shared.keys),
-            failures: count(&self.shared.failures),
-            dropped: count(&self.shared.dropped),
-            waiting: self.shared.state.lock().waiting.len() as u64,
+            waiting: state.waiting.len() as u64,
+            ..state.counts
         }
     }
 
@@ -217,33 +188,33 @@ impl Speaker {
             };
             match delivered {
                 Ok(()) => {
-                    self.shared.state.lock().on_the_way = None;
+                    let mut state = self.shared.state.lock();
+                    state.is_busy = false;
+                    state.counts.notices += messages.len() as u64;
                     (pause, most, trouble) = (PAUSE.0, BATCH, None);
                     if !changes.is_empty() {
                         keys_pause = KEYS_AGAIN.0;
                     }
-                    self.shared.keys.fetch_add(changes.len() as u64, Ordering::Relaxed);
-                    self.shared.notices.fetch_add(messages.len() as u64, Ordering::Relaxed);
                 }
-                Err(OutletError::KeysLater(error)) => {
+                Err(OutletError::KeysAlone(error @ KeyError::Away { .. })) => {
                     if keys_pause == KEYS_AGAIN.0 {
                         tracing::warn!(%error, "keys are not written, notices go on; it is tried again");
                     }
-                    self.shared.failures.fetch_add(1, Ordering::Relaxed);
                     keys_again = Some(Instant::now() + keys_pause);
                     keys_pause = (keys_pause * 2).min(KEYS_AGAIN.1);
                     let mut state = self.shared.state.lock();
+                    state.counts.failures += 1;
                     state.put_back(batch);
                     state.keys_wait = true;
                 }
-                Err(OutletError::KeysRefused(error)) => {
+                Err(OutletError::KeysAlone(error @ KeyError::Refused { .. })) => {
                     let mut state = self.shared.state.lock();
                     if batch.keys.len() > 1 {
                         most = 1;
                         state.put_back(batch);
                     } else {
                         tracing::error!(%error, keys = ?batch.keys, "a key is not written; its service is told by a notice alone");
-                        self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+                        state.counts.dropped += 1;
                         state.put_back(batch.without_keys());
                     }
                 }
@@ -251,14 +222,15 @@ impl Speaker {
                 Err(error) if error.is_refusal() && batch.len() <= 2 && batch.waiting.len() <= 1 => {
                     let place = batch.waiting.first().map(|(place, _)| place.as_str());
                     tracing::error!(%error, place, keys = ?batch.keys, "a service is not told of its configuration");
-                    self.shared.state.lock().on_the_way = None;
-                    self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+                    let mut state = self.shared.state.lock();
+                    state.is_busy = false;
+                    state.counts.dropped += 1;
                 }
                 Err(OutletError::NotYet { channels, reason }) => {
                     tracing::debug!(channels = channels.len(), reason, "services could not be told yet");
-                    self.shared.failures.fetch_add(1, Ordering::Relaxed);
                     aside.get_or_insert(Instant::now() + ASIDE);
                     let mut state = self.shared.state.lock();
+                    state.counts.failures += 1;
                     state.put_back(batch.without_keys());
                     state.set_aside(&channels);
                 }
@@ -268,8 +240,11 @@ impl Speaker {
                         tracing::warn!(error = words, "services cannot be told now; it is tried again");
                     }
                     trouble = Some(words);
-                    self.shared.failures.fetch_add(1, Ordering::Relaxed);
-                    self.shared.state.lock().put_back(batch);
+                    {
+                        let mut state = self.shared.state.lock();
+                        state.counts.failures += 1;
+                        state.put_back(batch);
+                    }
                     if error.is_refusal() {
                         most = 1;
                         continue;

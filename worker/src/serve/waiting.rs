@@ -7,7 +7,7 @@ use blaze_brokers::redis::KeyChange;
 use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 
-use super::Told;
+use super::{SpeakerCounts, Told};
 
 /// Bytes of one transaction, unless one place alone has more (1 MiB): a large one over a slow connection would not be done in
 /// the time that a call may take, and be tried again for ever.
@@ -18,8 +18,6 @@ pub(super) struct Waiting {
     /// The key that must be written no later.
     key: Option<String>,
     pub(super) notice: KeyedMessage,
-    /// The lowest revision that whoever is told may not have heard of.
-    since: u64,
 }
 
 #[derive(Default)]
@@ -37,10 +35,11 @@ pub(super) struct State {
     pub(super) keys_wait: bool,
     /// Keys of before are to be looked for: those of this worker that are not wanted are to go.
     pub(super) sweep: bool,
-    /// The lowest revision of what is being told just now.
-    pub(super) on_the_way: Option<u64>,
+    /// Notices are being told just now.
+    pub(super) is_busy: bool,
     /// How often everything was forgotten.
     pub(super) cleared: u64,
+    pub(super) counts: SpeakerCounts,
 }
 
 /// What is told at once.
@@ -69,14 +68,9 @@ impl Batch {
 
 impl State {
     /// Takes in what is newer than what waits of the same place; it is told at the end, so that the notices of a service come
-    /// in the order of their revisions. Returns whether a notice gave way.
-    pub(super) fn put(&mut self, told: Told) -> bool {
-        let Told {
-            place,
-            key,
-            notice,
-            revision,
-        } = told;
+    /// in the order of their revisions.
+    pub(super) fn put(&mut self, told: Told) {
+        let Told { place, key, notice } = told;
         let name = key.map(|(name, value)| {
             match value {
                 Some(value) => self.wanted.insert(name.clone(), value),
@@ -85,22 +79,14 @@ impl State {
             self.dirty.insert(name.clone());
             name
         });
-        let Some(notice) = notice else { return false };
-        let old = self.waiting.remove(&place);
-        if let Some((at, _)) = &old {
-            self.order.remove(at);
+        let Some(notice) = notice else { return };
+        if let Some((at, _)) = self.waiting.remove(&place) {
+            self.order.remove(&at);
+            self.counts.replaced += 1;
         }
-        // Until it is told, whoever is told has not heard of the one that gives way either.
-        let since = old.as_ref().map_or(revision, |(_, old)| old.since.min(revision));
         self.ends.1 += 1;
         self.order.insert(self.ends.1, place.clone());
-        let waiting = Waiting {
-            key: name,
-            notice,
-            since,
-        };
-        self.waiting.insert(place, (self.ends.1, waiting));
-        old.is_some()
+        self.waiting.insert(place, (self.ends.1, Waiting { key: name, notice }));
     }
 
     /// The first that wait, at most so many and, but for the first, so many bytes.
@@ -134,28 +120,20 @@ impl State {
             bytes += self.wanted.get(&key).map_or(0, Bytes::len);
             batch.keys.insert(key);
         }
-        self.on_the_way = batch.waiting.iter().map(|(_, waiting)| waiting.since).min();
+        self.is_busy = !batch.waiting.is_empty();
         batch
     }
 
-    /// The lowest revision that somebody may not have heard of.
-    pub(super) fn untold(&self) -> Option<u64> {
-        let waiting = self.waiting.values().map(|(_, waiting)| waiting.since);
-        waiting.chain(self.on_the_way).min()
-    }
-
-    /// The same of those whom the broker can tell: what is set aside may wait for ever.
-    pub(super) fn untold_where_possible(&self) -> Option<u64> {
-        let waiting = self.waiting.values();
-        let possible = waiting.filter(|(at, _)| self.order.contains_key(at));
-        let waiting = possible.map(|(_, waiting)| waiting.since);
-        waiting.chain(self.on_the_way).min()
+    /// Whether the broker has taken every notice that it can take: what is set aside may wait for ever.
+    pub(super) fn is_done(&self) -> bool {
+        self.order.is_empty() && !self.is_busy
     }
 
     /// Everything is forgotten, also what is on its way and comes back.
     pub(super) fn clear(&mut self) {
         *self = Self {
             cleared: self.cleared + 1,
+            counts: self.counts,
             ..Self::default()
         };
     }
@@ -174,19 +152,16 @@ impl State {
 
     /// What could not be told goes back to the front; what has come meanwhile is newer.
     pub(super) fn put_back(&mut self, batch: Batch) {
-        self.on_the_way = None;
+        self.is_busy = false;
         if batch.cleared != self.cleared {
             return;
         }
         self.dirty.extend(batch.keys);
         for (place, waiting) in batch.waiting.into_iter().rev() {
-            match self.waiting.get_mut(&place) {
-                Some((_, newer)) => newer.since = newer.since.min(waiting.since),
-                None => {
-                    self.ends.0 -= 1;
-                    self.order.insert(self.ends.0, place.clone());
-                    self.waiting.insert(place, (self.ends.0, waiting));
-                }
+            if !self.waiting.contains_key(&place) {
+                self.ends.0 -= 1;
+                self.order.insert(self.ends.0, place.clone());
+                self.waiting.insert(place, (self.ends.0, waiting));
             }
         }
     }

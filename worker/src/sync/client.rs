@@ -19,6 +19,7 @@ use tonic::{Request, Status, Streaming};
 use super::backoff::Backoff;
 use super::wire::IncomingError;
 use crate::core::Incoming;
+use crate::settings::is_this_machine;
 
 /// Largest message that is taken.
 const MAX_MESSAGE_BYTES: usize = 16 * 1024 * 1024;
@@ -62,18 +63,10 @@ impl MainService {
     /// Whether nobody else can read what is said: over TLS, or within this machine.
     #[must_use]
     pub fn is_safe(&self) -> bool {
-        let Some(rest) = self.server.strip_prefix("http://") else {
-            return self.server.starts_with("https://");
-        };
-        let authority = rest.split(['/', '?', '#']).next().unwrap_or_default();
-        let host = authority.rsplit_once('@').map_or(authority, |(_, host)| host);
-        let host = match host.strip_prefix('[') {
-            Some(rest) => rest.split(']').next().unwrap_or_default(),
-            None => host.split(':').next().unwrap_or_default(),
-        };
-        let is_loopback = |address: std::net::IpAddr| address.to_canonical().is_loopback();
-        host.parse()
-            .map_or_else(|_| host.eq_ignore_ascii_case("localhost"), is_loopback)
+        match self.server.strip_prefix("http://") {
+            Some(rest) => is_this_machine(rest),
+            None => self.server.starts_with("https://"),
+        }
     }
 }
 
@@ -385,14 +378,9 @@ fn words(status: &Status) -> String {
 }
 
 /// The library's errors say little; what caused them says more.
-fn chain(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut source = error.source();
-    while let Some(cause) = source {
-        text = format!("{text}: {cause}");
-        source = cause.source();
-    }
-    text
+fn chain(error: &(dyn std::error::Error + 'static)) -> String {
+    let causes: Vec<String> = anyhow::Chain::new(error).map(ToString::to_string).collect();
+    causes.join(": ")
 }
 
 async fn read(path: &Path, most: u64) -> Result<Vec<u8>, String> {

@@ -3,10 +3,10 @@
 use std::time::Duration;
 
 use blaze_domain::config::Document;
-use blaze_proto::config::{WireError, timestamp_from_wire};
+use blaze_proto::config::WireError;
 use blaze_proto::v1;
 
-use crate::core::{Edit, Incoming, Op};
+use crate::core::{Edit, Incoming};
 
 /// A message of the stream that cannot be taken.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -88,33 +88,25 @@ fn from_commit(commit: v1::Commit) -> Result<Incoming, IncomingError> {
     Ok(Incoming::Commit {
         revision,
         previous: commit.previous,
-        time: timestamp_from_wire(commit.time.as_ref()),
-        subject: commit.subject,
         edits: edits.collect::<Result<_, _>>()?,
     })
 }
 
 fn edit(revision: u64, change: v1::Change) -> Result<Edit, IncomingError> {
-    let op = match v1::Op::try_from(change.op) {
-        Ok(v1::Op::Create) => Op::Create,
-        Ok(v1::Op::Update) => Op::Update,
-        Ok(v1::Op::Delete) => Op::Delete,
-        Ok(v1::Op::Leave) => Op::Leave,
-        Ok(v1::Op::Rollback) => Op::Rollback,
-        Ok(v1::Op::Unspecified | v1::Op::Unchanged) | Err(_) => {
-            return Err(IncomingError::Op {
-                revision,
-                op: change.op,
-            });
-        }
-    };
     let wire = change.document.ok_or(IncomingError::NoDocument { revision })?;
     let document = Document::try_from(wire).map_err(|error| IncomingError::Document {
         message: "the commit",
         revision,
         error,
     })?;
-    Ok(Edit { op, document })
+    match v1::Op::try_from(change.op) {
+        Ok(v1::Op::Create | v1::Op::Update | v1::Op::Rollback) => Ok(Edit::Put(document)),
+        Ok(v1::Op::Delete | v1::Op::Leave) => Ok(Edit::Remove(document.key)),
+        Ok(v1::Op::Unspecified | v1::Op::Unchanged) | Err(_) => Err(IncomingError::Op {
+            revision,
+            op: change.op,
+        }),
+    }
 }
 
 #[cfg(test)]
@@ -148,26 +140,29 @@ mod tests {
     }
 
     #[test]
-    fn every_change_keeps_its_kind_and_its_document() {
-        for (wire, op) in [
-            (v1::Op::Create, Op::Create),
-            (v1::Op::Update, Op::Update),
-            (v1::Op::Delete, Op::Delete),
-            (v1::Op::Leave, Op::Leave),
-            (v1::Op::Rollback, Op::Rollback),
+    fn a_change_puts_its_document_or_removes_it() {
+        for (op, is_there) in [
+            (v1::Op::Create, true),
+            (v1::Op::Update, true),
+            (v1::Op::Rollback, true),
+            (v1::Op::Delete, false),
+            (v1::Op::Leave, false),
         ] {
-            let Ok(Incoming::Commit {
+            let found = commit(op.into(), Some(document("robot-1"))).unwrap();
+            let Incoming::Commit {
                 revision: 7,
                 previous: 5,
                 edits,
-                ..
-            }) = commit(wire.into(), Some(document("robot-1")))
+            } = &found
             else {
-                panic!("{wire:?} is not taken as a commit");
+                panic!("{op:?} is not taken as a commit: {found:?}");
             };
-            assert_eq!(edits.len(), 1);
-            assert_eq!(edits[0].op, op);
-            assert_eq!(edits[0].document.key.to_string(), "Node/robot-1");
+            let key = match &edits[..] {
+                [Edit::Put(document)] if is_there => &document.key,
+                [Edit::Remove(key)] if !is_there => key,
+                _ => panic!("{op:?}"),
+            };
+            assert_eq!(key.to_string(), "Node/robot-1");
         }
     }
 
@@ -181,33 +176,5 @@ mod tests {
         assert_eq!(error, IncomingError::NoDocument { revision: 7 });
         let error = commit(1, Some(document("Robot"))).unwrap_err();
         assert!(matches!(error, IncomingError::Document { revision: 7, .. }), "{error}");
-    }
-
-    #[test]
-    fn an_empty_message_is_refused() {
-        let error = Incoming::try_from(v1::SyncResponse { msg: None }).unwrap_err();
-        assert_eq!(error, IncomingError::Unknown);
-    }
-
-    #[test]
-    fn the_rest_is_taken_over() {
-        let away = incoming(v1::sync_response::Msg::GoAway(v1::GoAway {
-            retry_after_ms: 1500,
-            reason: "shutting down".to_owned(),
-        }));
-        assert!(matches!(
-            away,
-            Ok(Incoming::GoAway { retry_after, ref reason })
-                if retry_after == Duration::from_millis(1500) && reason == "shutting down"
-        ));
-        let snapshot = incoming(v1::sync_response::Msg::Snapshot(v1::Snapshot {
-            revision: 9,
-            documents: vec![document("robot-1"), document("robot-2")],
-            last: true,
-        }));
-        assert!(matches!(
-            snapshot,
-            Ok(Incoming::Snapshot { revision: 9, ref documents, last: true }) if documents.len() == 2
-        ));
     }
 }

@@ -9,7 +9,7 @@ use blaze_tests::servers::{
     KafkaOptions, KafkaServer, MongoOptions, MongoServer, RedisKind, RedisOptions, RedisServer, drop_mongo_database,
     shared_mongo, unique_name,
 };
-use blaze_worker::lease::conformance::{BUSY, Fixture, TIME, run_all};
+use blaze_worker::lease::conformance::{BUSY, TIME, run_all};
 use blaze_worker::lease::{KafkaLease, Lease, MongoLease, RedisLease};
 use rdkafka::ClientConfig;
 use rdkafka::admin::{AdminClient, AdminOptions};
@@ -28,13 +28,7 @@ async fn run_on_redis(kind: RedisKind) {
         let keys = Arc::new(RedisKeys::open(&section).unwrap());
         Arc::new(RedisLease::new(keys, &layer.parse().unwrap(), owner.to_owned()))
     };
-    let first_within = BUSY;
-    run_all(&Fixture {
-        lease: &lease,
-        first_within,
-    })
-    .await
-    .unwrap();
+    run_all(&lease, BUSY).await.unwrap();
 }
 
 async fn run_on_mongo(uri: &str, database: &str) -> Result<(), String> {
@@ -42,12 +36,7 @@ async fn run_on_mongo(uri: &str, database: &str) -> Result<(), String> {
         let (layer, uri) = (layer.parse().unwrap(), uri.to_owned().into());
         Arc::new(MongoLease::new(uri, database, layer, owner.to_owned()).unwrap())
     };
-    let first_within = BUSY;
-    run_all(&Fixture {
-        lease: &lease,
-        first_within,
-    })
-    .await
+    run_all(&lease, BUSY).await
 }
 
 fn on_kafka(server: &KafkaServer, layer: &str) -> Arc<dyn Lease> {
@@ -87,13 +76,8 @@ async fn one_on_a_mongodb_that_is_alone_passes_the_suite() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn one_in_a_group_of_kafka_passes_the_suite() {
     let server = KafkaServer::start(KafkaOptions::default()).unwrap();
-    let (lease, first_within) = (|layer: &str, _: &str| on_kafka(&server, layer), FIRST_ON_KAFKA);
-    run_all(&Fixture {
-        lease: &lease,
-        first_within,
-    })
-    .await
-    .unwrap();
+    let lease = |layer: &str, _: &str| on_kafka(&server, layer);
+    run_all(&lease, FIRST_ON_KAFKA).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -1,7 +1,5 @@
 //! Requests for a configuration.
 
-use std::fmt;
-
 use blaze_domain::control::{MAX_ID_BYTES, REPLY_PREFIX};
 use blaze_domain::names::ChannelName;
 use blaze_domain::{InstanceName, NodeName, ServiceName};
@@ -40,15 +38,8 @@ impl ErrorCode {
     }
 }
 
-impl fmt::Display for ErrorCode {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
-    }
-}
-
 /// Why a request gets no configuration, for the caller.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{code}: {detail}")]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RequestError {
     /// For programs.
     pub code: ErrorCode,
@@ -84,8 +75,7 @@ pub struct GetRequest {
 }
 
 /// A request that is faulty.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{error}")]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RefusedRequest {
     /// Is echoed, if it could be read.
     pub id: Option<String>,
@@ -205,7 +195,7 @@ mod tests {
             );
             assert_eq!(refused.id.as_deref(), (member != "id").then_some("7f1c"));
             assert_eq!(refused.error.code, ErrorCode::InvalidRequest);
-            assert!(refused.error.detail.starts_with(&format!("{member}: ")), "{refused}");
+            assert!(refused.error.detail.starts_with(&format!("{member}: ")), "{refused:?}");
         }
         let refused = parse(&json!({"instance": "0"})).unwrap_err();
         assert_eq!(refused.error.detail, "instance: needs its service");
@@ -225,7 +215,7 @@ mod tests {
         ] {
             let refused = parse(&json!({"id": "7f1c", "reply_to": reply_to})).unwrap_err();
             assert_eq!(refused.reply_to, None, "{reply_to}");
-            assert!(refused.error.detail.starts_with("reply_to: "), "{refused}");
+            assert!(refused.error.detail.starts_with("reply_to: "), "{refused:?}");
         }
     }
 

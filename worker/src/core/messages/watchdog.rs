@@ -10,7 +10,6 @@ pub const DEFAULT_TTL_MS: u64 = 15_000;
 /// Longest that one may count, in ms (an hour).
 const MAX_TTL_MS: u64 = 3_600_000;
 const MAX_WORD_BYTES: usize = 32;
-const MAX_VERSION_BYTES: usize = 256;
 const MAX_HASH_BYTES: usize = 128;
 
 /// How an instance is.
@@ -53,11 +52,10 @@ pub struct WatchdogKey {
 }
 
 impl WatchdogKey {
-    /// Reads a key of Redis; `None` if it is no watchdog's.
+    /// Reads a key of Redis, without its prefix; `None` if it is no watchdog's.
     #[must_use]
-    pub fn parse(prefix: &str, key: &str) -> Option<Self> {
-        let rest = key.strip_prefix(prefix)?.strip_prefix("blaze:watchdog:")?;
-        let mut parts = rest.split(':');
+    pub fn parse(key: &str) -> Option<Self> {
+        let mut parts = key.strip_prefix("blaze:watchdog:")?.split(':');
         let out = Self {
             service: parts.next()?.parse().ok()?,
             node: parts.next()?.parse().ok()?,
@@ -78,10 +76,6 @@ pub struct ServiceState {
     pub epoch: u64,
     /// How it is.
     pub health: Health,
-    /// Since when, in ms since 1970.
-    pub since_ms: u64,
-    /// Version of the program.
-    pub version: String,
     /// Revision of the configuration that it runs with; 0: none.
     pub config_revision: u64,
     /// Hash of the configuration that it runs with; empty: none.
@@ -114,9 +108,6 @@ impl ServiceState {
         let word = need(text(members, "state", MAX_WORD_BYTES)?, "state")?;
         let health = Health::ALL.into_iter().find(|health| health.as_str() == word);
         let health = health.ok_or("state: must be starting, ready, unhealthy or stopping")?;
-        let text = |name: &str, max_bytes: usize| -> Result<String, String> {
-            Ok(text(members, name, max_bytes)?.unwrap_or_default().to_owned())
-        };
         let number = |name: &str| -> Result<u64, String> { Ok(whole(members, name)?.unwrap_or(0)) };
         // Redis has no null: an empty text is none.
         let layer = match members.get("layer").and_then(Value::as_str) {
@@ -132,10 +123,10 @@ impl ServiceState {
             layer,
             epoch: number("epoch")?,
             health,
-            since_ms: number("since_ms")?,
-            version: text("version", MAX_VERSION_BYTES)?,
             config_revision: number("config_revision")?,
-            config_hash: text("config_hash", MAX_HASH_BYTES)?,
+            config_hash: text(members, "config_hash", MAX_HASH_BYTES)?
+                .unwrap_or_default()
+                .to_owned(),
             ttl_ms: whole(members, "ttl_ms")?.unwrap_or(DEFAULT_TTL_MS).clamp(1, MAX_TTL_MS),
         })
     }
@@ -171,10 +162,7 @@ mod tests {
             (of_hash.epoch, of_hash.health, of_hash.config_revision),
             (17, Health::Ready, 431)
         );
-        assert_eq!(
-            WatchdogKey::parse("lab:", "lab:blaze:watchdog:slam:robot-1:0"),
-            Some(of_hash.key)
-        );
+        assert_eq!(WatchdogKey::parse("blaze:watchdog:slam:robot-1:0"), Some(of_hash.key));
     }
 
     #[test]
@@ -207,8 +195,7 @@ mod tests {
             "blaze:config:slam:0",
             "",
         ] {
-            assert_eq!(WatchdogKey::parse("", key), None, "{key}");
+            assert_eq!(WatchdogKey::parse(key), None, "{key}");
         }
-        assert_eq!(WatchdogKey::parse("lab:", "blaze:watchdog:slam:robot-1:0"), None);
     }
 }

@@ -4,13 +4,12 @@ use std::sync::Arc;
 
 use blaze_domain::config::secret::{self, Secret};
 use blaze_domain::config::{Document, MAX_EFFECTIVE_BYTES, Timestamp};
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 
 use super::get::{ErrorCode, RequestError};
 use crate::core::answer::{Freshness, Reply};
 use crate::core::incoming::redact;
 use crate::core::notice::{Notice, Scope, Standing};
-use crate::core::place::Source;
 
 /// How secrets reach a service.
 ///
@@ -79,32 +78,40 @@ impl Delivery {
 /// An answer to a request with an id.
 #[must_use]
 pub fn reply(reply: &Reply, id: Option<&str>, delivery: Delivery, freshness: Freshness) -> String {
-    let mut out = begin(id);
-    match reply {
-        Reply::Standing(standing) => {
-            if let Err(error) = put_standing(&mut out, standing, delivery, freshness) {
+    let members = match reply {
+        Reply::Standing(standing) => match members(standing, delivery, freshness) {
+            Ok(members) => members,
+            Err(error) => {
                 let error = RequestError::new(ErrorCode::TooLarge, error.to_string());
                 return refusal(&error, id);
             }
-        }
-        Reply::Unchanged { revision, hash, source } => {
-            out.insert("unchanged".to_owned(), true.into());
-            out.insert("revision".to_owned(), (*revision).into());
-            out.insert("hash".to_owned(), hash.as_str().into());
-            put_freshness(&mut out, *source, freshness);
-        }
+        },
+        Reply::Unchanged { revision, hash, source } => json!({
+            "unchanged": true, "revision": revision, "hash": hash,
+            "source": source.as_str(), "as_of": freshness.as_of(), "age_s": freshness.age_s(),
+        }),
         Reply::Error(error) => return refusal(error, id),
-    }
-    Value::Object(out).to_string()
+    };
+    with_id(id, members)
 }
 
 /// The refusal of a request with an id.
 #[must_use]
 pub fn refusal(error: &RequestError, id: Option<&str>) -> String {
-    let mut out = begin(id);
-    let error = json!({ "code": error.code.as_str(), "detail": error.detail });
-    out.insert("error".to_owned(), error);
-    Value::Object(out).to_string()
+    with_id(
+        id,
+        json!({ "error": { "code": error.code.as_str(), "detail": error.detail } }),
+    )
+}
+
+/// Members behind the id, if there is one.
+fn with_id(id: Option<&str>, members: Value) -> String {
+    let Some(id) = id else { return members.to_string() };
+    let mut out = json!({ "id": id });
+    if let (Value::Object(out), Value::Object(members)) = (&mut out, members) {
+        out.extend(members);
+    }
+    out.to_string()
 }
 
 /// What stands in Redis: an answer without id.
@@ -112,9 +119,20 @@ pub fn refusal(error: &RequestError, id: Option<&str>) -> String {
 /// # Errors
 /// The configuration is too large.
 pub fn state_value(standing: &Standing, delivery: Delivery, freshness: Freshness) -> Result<String, TooLargeMessage> {
-    let mut out = Map::new();
-    put_standing(&mut out, standing, delivery, freshness)?;
-    Ok(Value::Object(out).to_string())
+    members(standing, delivery, freshness).map(|members| members.to_string())
+}
+
+fn members(standing: &Standing, delivery: Delivery, freshness: Freshness) -> Result<Value, TooLargeMessage> {
+    let at = &standing.at;
+    let mut out = json!({
+        "service": at.service, "instance": at.instance, "layer": at.layer, "node": at.node,
+        "revision": standing.revision, "hash": standing.hash, "config": null,
+        "source": standing.source.as_str(), "as_of": freshness.as_of(), "age_s": freshness.age_s(),
+        "rollout": standing.rollout,
+    });
+    // Afterwards, for it may be large: what stands in the macro is copied.
+    out["config"] = delivery.sized(standing.config.value())?;
+    Ok(out)
 }
 
 /// A notice, written at a time.
@@ -122,68 +140,25 @@ pub fn state_value(standing: &Standing, delivery: Delivery, freshness: Freshness
 /// # Errors
 /// The configuration is too large.
 pub fn notice(notice: &Notice, delivery: Delivery, time: Timestamp) -> Result<String, TooLargeMessage> {
-    let config = notice
-        .config
-        .as_ref()
-        .map(|config| delivery.sized(config.value()))
-        .transpose()?;
-    let mut out = Map::new();
-    let mut put = |name: &str, value: Value| out.insert(name.to_owned(), value);
-    put("service", notice.place.service.as_str().into());
-    put("instance", text(notice.place.instance.as_ref()));
-    put("layer", notice.layer.as_str().into());
-    put("node", text(notice.place.node.as_ref()));
-    put("revision", notice.revision.into());
-    put("hash", text(notice.hash.as_ref()));
-    put("previous_hash", text(notice.previous_hash.as_ref()));
-    put("paths", notice.paths.as_slice().into());
-    put("scopes", notice.scopes.iter().copied().map(Scope::as_str).collect());
-    let is_deleted = config.is_none();
-    put("config", config.unwrap_or(Value::Null));
-    if is_deleted {
-        put("deleted", true.into());
+    let scopes = notice.scopes.iter().copied().map(Scope::as_str);
+    let mut out = json!({
+        "service": notice.place.service, "instance": notice.place.instance, "layer": notice.layer,
+        "node": notice.place.node, "revision": notice.revision, "hash": notice.hash,
+        "previous_hash": notice.previous_hash, "paths": notice.paths, "scopes": scopes.collect::<Vec<_>>(),
+        "config": null, "deleted": true, "source": notice.source.as_str(), "time": time.to_string(),
+    });
+    if let (Value::Object(members), Some(config)) = (&mut out, &notice.config) {
+        members.shift_remove("deleted");
+        members.insert("config".to_owned(), delivery.sized(config.value())?);
     }
-    put("source", notice.source.as_str().into());
-    put("time", time.to_string().into());
-    Ok(Value::Object(out).to_string())
-}
-
-fn begin(id: Option<&str>) -> Map<String, Value> {
-    let mut out = Map::new();
-    if let Some(id) = id {
-        out.insert("id".to_owned(), id.into());
-    }
-    out
-}
-
-fn put_standing(
-    out: &mut Map<String, Value>,
-    standing: &Standing,
-    delivery: Delivery,
-    freshness: Freshness,
-) -> Result<(), TooLargeMessage> {
-    let config = delivery.sized(standing.config.value())?;
-    let at = &standing.at;
-    out.insert("service".to_owned(), text(at.service.as_ref()));
-    out.insert("instance".to_owned(), text(at.instance.as_ref()));
-    out.insert("layer".to_owned(), text(at.layer.as_ref()));
-    out.insert("node".to_owned(), text(at.node.as_ref()));
-    out.insert("revision".to_owned(), standing.revision.into());
-    out.insert("hash".to_owned(), standing.hash.as_str().into());
-    out.insert("config".to_owned(), config);
-    put_freshness(out, standing.source, freshness);
-    out.insert("rollout".to_owned(), text(standing.rollout.as_ref()));
-    Ok(())
-}
-
-fn put_freshness(out: &mut Map<String, Value>, source: Source, freshness: Freshness) {
-    out.insert("source".to_owned(), source.as_str().into());
-    let as_of = freshness.as_of.map(|time| time.to_string());
-    out.insert("as_of".to_owned(), text(as_of.as_ref()));
-    out.insert("age_s".to_owned(), freshness.age_s().map_or(Value::Null, Value::from));
+    Ok(out.to_string())
 }
 
 impl Freshness {
+    fn as_of(&self) -> Option<String> {
+        self.as_of.map(|time| time.to_string())
+    }
+
     /// Seconds since the worker last knew itself in sync, to a tenth; a clock that was set back does not make it negative.
     #[must_use]
     pub fn age_s(&self) -> Option<f64> {
@@ -192,10 +167,6 @@ impl Freshness {
         let tenths = u32::try_from((ms.max(0) + 50) / 100).unwrap_or(u32::MAX);
         Some(f64::from(tenths) / 10.0)
     }
-}
-
-fn text(value: Option<&impl AsRef<str>>) -> Value {
-    value.map_or(Value::Null, |value| value.as_ref().into())
 }
 
 #[cfg(test)]
