@@ -65,7 +65,12 @@ impl Flows {
     }
 
     fn connect(&self, route: &Route<'_>) -> anyhow::Result<()> {
-        let lease = |op: &str| json!({"op": op, "topic": route.topic, "service": "bench", "reliability": "reliable", "ttl_s": 0});
+        let terms = json!({"topic": route.topic, "service": "bench", "reliability": "reliable", "ttl_s": 0});
+        let lease = |op: &str| {
+            let mut lease = terms.clone();
+            lease["op"] = json!(op);
+            lease
+        };
         let mut advertise = lease("advertise");
         advertise["max_bytes"] = json!(route.bytes);
         if let Some(rate) = route.rate_hz {
