@@ -14,6 +14,7 @@ mod pending;
 pub mod port;
 pub mod redis;
 pub mod retained;
+mod wake;
 mod worker_side;
 
 pub use open::{OpenError, check_layer, open_layer, open_node};

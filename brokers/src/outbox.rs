@@ -12,13 +12,13 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use blaze_domain::DropReason;
+use blaze_domain::{DropReason, MAX_PAYLOAD_BYTES};
 use blaze_proto::Frame;
 use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
-use crate::port::{Later, PublishOutcome};
+use crate::port::{Later, PublishOutcome, Publisher};
 
 /// Messages that one lane gives per turn.
 const TURN: usize = 16;
@@ -424,6 +424,50 @@ impl<C> Lane<C> {
     /// What became of what was pushed.
     pub(crate) fn later(&self) -> Later {
         *self.counts.0.lock()
+    }
+}
+
+/// What an adapter knows of its publishers beside their queues.
+pub(crate) trait Admission: Send + Sync {
+    /// Whether nothing is taken now.
+    fn is_shut(&self) -> bool;
+
+    /// A message has been queued; it may have been shut meanwhile.
+    fn queued(&self) {}
+}
+
+/// Writes one channel through a lane.
+pub(crate) struct LanePublisher<C, A> {
+    pub(crate) lane: Lane<C>,
+    pub(crate) admission: A,
+}
+
+impl<C, A: Admission> LanePublisher<C, A> {
+    fn push(&self, body: Body, payload_bytes: usize, deadline: Option<Instant>) -> PublishOutcome {
+        if self.admission.is_shut() {
+            return PublishOutcome::Dropped;
+        }
+        if payload_bytes > MAX_PAYLOAD_BYTES {
+            return PublishOutcome::TooLarge;
+        }
+        let outcome = self.lane.push(body, deadline);
+        self.admission.queued();
+        outcome
+    }
+}
+
+impl<C: Send + Sync, A: Admission> Publisher for LanePublisher<C, A> {
+    fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
+        self.push(Body::Frame(frame.clone()), frame.payload().len(), deadline)
+    }
+
+    /// As [`Publisher::publish_bare`]. A payload without a header has no writer, so it is not kept for late joiners.
+    fn publish_bare(&self, payload: &Bytes, deadline: Option<Instant>) -> PublishOutcome {
+        self.push(Body::Bare(payload.clone()), payload.len(), deadline)
+    }
+
+    fn later(&self) -> Later {
+        self.lane.later()
     }
 }
 

@@ -3,8 +3,7 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::task::{Wake, Waker};
-use std::thread::{self, JoinHandle, Thread};
+use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -13,6 +12,7 @@ use rustdds::no_key::SimpleDataReader;
 use super::participant::prefix_of;
 use super::sample::{Octets, OctetsAdapter};
 use super::{DdsError, GuidPrefix, create_error};
+use crate::wake::unpark_waker;
 
 /// Takes each sample and the participant that wrote it. It runs in the reader's thread: while it works, at most `depth`
 /// samples wait, then the oldest are lost.
@@ -79,19 +79,6 @@ fn drain(reader: &SimpleDataReader<Octets, OctetsAdapter>, sink: &SampleSink, ma
             }
         }
     }
-}
-
-struct Unpark(Thread);
-
-impl Wake for Unpark {
-    fn wake(self: Arc<Self>) {
-        self.0.unpark();
-    }
-}
-
-/// A waker of the calling thread.
-pub(super) fn unpark_waker() -> Waker {
-    Waker::from(Arc::new(Unpark(thread::current())))
 }
 
 /// A named thread that is asked to stop and waited for on drop. A panic in it sets `failed`.

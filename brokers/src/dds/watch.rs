@@ -13,9 +13,10 @@ use futures::Stream;
 use rustdds::{DomainParticipant, DomainParticipantStatusEvent as Event, StatusEvented};
 
 use super::participant::prefix_of;
-use super::reader::{StoppableThread, unpark_waker};
+use super::reader::StoppableThread;
 use super::writer::{EndpointId, endpoint_of};
 use super::{DdsError, GuidPrefix};
+use crate::wake::unpark_waker;
 
 /// RustDDS drops events when its queue of 2048 is full, so all readers are looked at once in this time.
 const RECONCILE: Duration = Duration::from_secs(1);

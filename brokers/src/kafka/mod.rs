@@ -40,20 +40,17 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
-use blaze_domain::MAX_PAYLOAD_BYTES;
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::KafkaBroker as Section;
-use blaze_proto::Frame;
 use blaze_runtime::supervisor::TaskPolicy;
-use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
 use crate::open::OpenError;
-use crate::outbox::{Body, Lane};
+use crate::outbox::{Admission, LanePublisher};
 use crate::port::{
-    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Later, PublishOutcome, Publisher,
-    PublisherOptions, Role, StatusCell, SubscribeOptions, Subscription,
+    Begin, Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Health, Publisher, PublisherOptions, Role,
+    StatusCell, SubscribeOptions, Subscription,
 };
 use crate::worker_side::WorkerSide;
 pub use group_lease::{GroupLease, GroupLeaseOptions};
@@ -205,11 +202,13 @@ impl Broker for KafkaBroker {
         } else {
             Keying::Writer { depth: options.depth }
         };
-        let stays_open = topic.stays_open;
-        Ok(Arc::new(KafkaPublisher {
-            lane: producer.lane(Target { topic, keying }),
+        let admission = TopicAdmission {
             shared: Arc::clone(&inner.shared),
-            stays_open,
+            stays_open: topic.stays_open,
+        };
+        Ok(Arc::new(LanePublisher {
+            lane: producer.lane(Target { topic, keying }),
+            admission,
         }))
     }
 
@@ -260,34 +259,14 @@ impl Broker for KafkaBroker {
     }
 }
 
-struct KafkaPublisher {
-    lane: Lane<Target>,
+/// Whether messages of a topic are taken.
+struct TopicAdmission {
     shared: Arc<Shared>,
     stays_open: bool,
 }
 
-impl KafkaPublisher {
-    fn push(&self, body: Body, payload: usize, deadline: Option<Instant>) -> PublishOutcome {
-        if payload > MAX_PAYLOAD_BYTES {
-            return PublishOutcome::TooLarge;
-        }
-        if !self.shared.gate.lets(self.stays_open) {
-            return PublishOutcome::Dropped;
-        }
-        self.lane.push(body, deadline)
-    }
-}
-
-impl Publisher for KafkaPublisher {
-    fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
-        self.push(Body::Frame(frame.clone()), frame.payload().len(), deadline)
-    }
-
-    fn publish_bare(&self, payload: &Bytes, deadline: Option<Instant>) -> PublishOutcome {
-        self.push(Body::Bare(payload.clone()), payload.len(), deadline)
-    }
-
-    fn later(&self) -> Later {
-        self.lane.later()
+impl Admission for TopicAdmission {
+    fn is_shut(&self) -> bool {
+        !self.shared.gate.lets(self.stays_open)
     }
 }

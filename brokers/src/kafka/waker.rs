@@ -4,6 +4,8 @@ use std::time::Duration;
 
 use parking_lot::{Condvar, Mutex};
 
+use crate::wake::unpark_waker;
+
 /// A thread waits for it. A wake-up before the wait ends the wait at once.
 #[derive(Debug, Default)]
 pub(super) struct ThreadWaker {
@@ -29,13 +31,7 @@ impl ThreadWaker {
 
 /// Runs a future to its end on this thread, which waits in between.
 pub(super) fn block_on<F: Future>(future: F) -> F::Output {
-    struct Unpark(std::thread::Thread);
-    impl std::task::Wake for Unpark {
-        fn wake(self: std::sync::Arc<Self>) {
-            self.0.unpark();
-        }
-    }
-    let waker = std::sync::Arc::new(Unpark(std::thread::current())).into();
+    let waker = unpark_waker();
     let mut context = std::task::Context::from_waker(&waker);
     let mut future = std::pin::pin!(future);
     loop {

@@ -8,7 +8,7 @@ use blaze_domain::DropReason;
 use tokio::sync::Notify;
 
 use super::publisher::Target;
-use crate::outbox::{Outbox, OutboxLimits};
+use crate::outbox::{Admission, Outbox, OutboxLimits};
 
 /// Queues of small topics: 16 MiB per publisher hold 10 s of a 1-kB topic at 1.6 kHz.
 const SMALL: OutboxLimits = OutboxLimits {
@@ -82,6 +82,19 @@ impl Gate {
         };
         // What is left then is counted as dropped.
         let _ = tokio::time::timeout(most, empty).await;
+    }
+}
+
+impl Admission for Arc<Gate> {
+    fn is_shut(&self) -> bool {
+        !self.is_open()
+    }
+
+    fn queued(&self) {
+        if !self.is_open() {
+            // It closed between the two: what slipped in after it was emptied is dropped here.
+            self.outbox.clear(DropReason::BrokerError);
+        }
     }
 }
 

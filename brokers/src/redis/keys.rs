@@ -324,9 +324,7 @@ impl RedisKeys {
     /// # Errors
     /// [`KeyError`].
     pub async fn run_id(&self) -> Result<Option<String>, KeyError> {
-        let mut info = redis::cmd("INFO");
-        info.arg("server");
-        let info: InfoDict = self.ask(info).await?;
+        let info: InfoDict = self.ask(redis::cmd("INFO").arg("server").take()).await?;
         Ok(info.get("run_id"))
     }
 

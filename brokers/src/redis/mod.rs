@@ -47,6 +47,7 @@ pub use keys::{KeyChange, KeyError, Record, RedisKeys};
 pub use lock::RedisLock;
 
 use crate::open::OpenError;
+use crate::outbox::LanePublisher;
 use crate::port::{
     Broker, BrokerError, BrokerKind, BrokerStatus, FlowSide, Publisher, PublisherOptions, Role, SubscribeOptions,
     Subscription,
@@ -56,7 +57,7 @@ use gate::Gate;
 use kept::Mirror;
 use leases::Leases;
 use owner::Owner;
-use publisher::{RedisPublisher, Target};
+use publisher::Target;
 use server::{BufferLimits, ServerFacts};
 use settings::Settings;
 use state::{Line, LineState, Scope, State};
@@ -296,8 +297,11 @@ impl Broker for RedisBroker {
         }
         self.start(Line::publish(options.large));
         let target = Target::new(&self.shared.settings.names, channel, options);
-        let gate = Arc::clone(self.shared.gate(options.large));
-        Ok(Arc::new(RedisPublisher::new(gate, target)))
+        let gate = self.shared.gate(options.large);
+        Ok(Arc::new(LanePublisher {
+            lane: gate.outbox.lane(target, None),
+            admission: Arc::clone(gate),
+        }))
     }
 
     async fn subscribe(&self, channel: &ChannelName, options: SubscribeOptions) -> Result<Subscription, BrokerError> {

@@ -1,4 +1,4 @@
-//! Publishers, and the task that writes what they hand over.
+//! What publishers hand over, as the commands that are sent.
 //!
 //! ```text
 //! publisher ─► Gate: outbox ─► Writer: batches of PUBLISH, some under way at once ─► answers settle messages
@@ -9,18 +9,17 @@
 use std::sync::Arc;
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
+use blaze_domain::DropReason;
 use blaze_domain::names::ChannelName;
-use blaze_domain::{DropReason, MAX_PAYLOAD_BYTES};
 use blaze_proto::Frame;
 use bytes::Bytes;
 use redis::{Cmd, RedisWrite, ToRedisArgs};
 
-use super::gate::Gate;
 use super::kept::{KeptFrame, Mirror};
 use super::settings::Names;
 use super::state::Line;
-use crate::outbox::{Body, Fate, Lane, Receipt, Waiting};
-use crate::port::{Later, PublishOutcome, Publisher, PublisherOptions};
+use crate::outbox::{Body, Fate, Receipt, Waiting};
+use crate::port::PublisherOptions;
 
 /// Where a publisher's messages go.
 #[derive(Debug)]
@@ -44,49 +43,6 @@ impl Target {
                 depth: usize::try_from(options.depth).unwrap_or(usize::MAX),
             }),
         }
-    }
-}
-
-/// Writes one channel.
-pub(super) struct RedisPublisher {
-    gate: Arc<Gate>,
-    lane: Lane<Target>,
-}
-
-impl RedisPublisher {
-    pub(super) fn new(gate: Arc<Gate>, target: Target) -> Self {
-        let lane = gate.outbox.lane(target, None);
-        Self { gate, lane }
-    }
-
-    fn push(&self, body: Body, payload_bytes: usize, deadline: Option<Instant>) -> PublishOutcome {
-        if !self.gate.is_open() {
-            PublishOutcome::Dropped
-        } else if payload_bytes > MAX_PAYLOAD_BYTES {
-            PublishOutcome::TooLarge
-        } else {
-            let outcome = self.lane.push(body, deadline);
-            if !self.gate.is_open() {
-                // It closed between the two: what slipped in after it was emptied is dropped here.
-                self.gate.outbox.clear(DropReason::BrokerError);
-            }
-            outcome
-        }
-    }
-}
-
-impl Publisher for RedisPublisher {
-    fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
-        self.push(Body::Frame(frame.clone()), frame.payload().len(), deadline)
-    }
-
-    /// As [`Publisher::publish_bare`]. A payload without a header has no writer, so it is not kept for late joiners.
-    fn publish_bare(&self, payload: &Bytes, deadline: Option<Instant>) -> PublishOutcome {
-        self.push(Body::Bare(payload.clone()), payload.len(), deadline)
-    }
-
-    fn later(&self) -> Later {
-        self.lane.later()
     }
 }
 

@@ -32,20 +32,16 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
-use blaze_domain::MAX_PAYLOAD_BYTES;
 use blaze_domain::names::ChannelName;
 use blaze_domain::node_file::DdsLayerBroker as Section;
-use blaze_proto::Frame;
-use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
 use super::DdsError;
 use super::reader::StoppableThread;
-use crate::outbox::{Body, Lane};
+use crate::outbox::{Admission, LanePublisher};
 use crate::port::{
-    Broker, BrokerError, BrokerKind, BrokerStatus, Later, PublishOutcome, Publisher, PublisherOptions,
-    SubscribeOptions, Subscription,
+    Broker, BrokerError, BrokerKind, BrokerStatus, Publisher, PublisherOptions, SubscribeOptions, Subscription,
 };
 use crate::worker_side::WorkerSide;
 use send::Target;
@@ -164,7 +160,7 @@ impl Broker for DdsBroker {
         };
         Ok(Arc::new(DdsPublisher {
             lane: self.shared.outbox.lane(target, Some(longest_wait)),
-            shared: Arc::clone(&self.shared),
+            admission: Arc::clone(&self.shared),
         }))
     }
 
@@ -214,34 +210,10 @@ impl Drop for DdsBroker {
 }
 
 /// Writes one channel.
-struct DdsPublisher {
-    shared: Arc<Shared>,
-    lane: Lane<Target>,
-}
+type DdsPublisher = LanePublisher<Target, Arc<Shared>>;
 
-impl DdsPublisher {
-    fn push(&self, body: Body, payload_bytes: usize, deadline: Option<Instant>) -> PublishOutcome {
-        if self.shared.is_down() {
-            PublishOutcome::Dropped
-        } else if payload_bytes > MAX_PAYLOAD_BYTES {
-            PublishOutcome::TooLarge
-        } else {
-            self.lane.push(body, deadline)
-        }
-    }
-}
-
-impl Publisher for DdsPublisher {
-    fn publish(&self, frame: &Frame, deadline: Option<Instant>) -> PublishOutcome {
-        self.push(Body::Frame(frame.clone()), frame.payload().len(), deadline)
-    }
-
-    /// As [`Publisher::publish_bare`]. A payload without a header has no writer, so it is not kept for late joiners.
-    fn publish_bare(&self, payload: &Bytes, deadline: Option<Instant>) -> PublishOutcome {
-        self.push(Body::Bare(payload.clone()), payload.len(), deadline)
-    }
-
-    fn later(&self) -> Later {
-        self.lane.later()
+impl Admission for Arc<Shared> {
+    fn is_shut(&self) -> bool {
+        self.is_down()
     }
 }

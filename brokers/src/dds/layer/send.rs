@@ -18,9 +18,10 @@ use super::names;
 use super::shared::Shared;
 use super::slot::{Attempt, Slot, SlotKey};
 use crate::dds::DdsError;
-use crate::dds::reader::{StoppableThread, unpark_waker};
+use crate::dds::reader::StoppableThread;
 use crate::outbox::{Body, Fate, Waiting};
 use crate::port::{Content, PublisherOptions};
+use crate::wake::unpark_waker;
 
 /// Messages and bytes of one turn; one message always fits.
 const TURN_MESSAGES: usize = 64;

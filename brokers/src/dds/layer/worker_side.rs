@@ -66,7 +66,7 @@ impl WorkerSide for DdsWorkerSide {
         let target = Target::keeping(&self.shared, names::topic(channel), DEPTH);
         let publisher = DdsPublisher {
             lane: self.shared.outbox.lane(target, Some(RELIABLE_WAIT)),
-            shared: Arc::clone(&self.shared),
+            admission: Arc::clone(&self.shared),
         };
         prepared.insert(channel.clone(), Arc::new(publisher));
         Ok(())
