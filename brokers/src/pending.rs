@@ -29,8 +29,8 @@ impl<K, V> Default for Pending<K, V> {
 }
 
 impl<K: Hash + Eq + Clone, V> Pending<K, V> {
-    /// Takes a value in; an older one of the key that still waits is forgotten.
-    pub(crate) fn put(&mut self, key: K, value: V) {
+    /// Takes a value in; an older one of the key that still waits is forgotten. Returns false where too many wait.
+    pub(crate) fn put(&mut self, key: K, value: V) -> bool {
         if let Some(before) = self.values.get_mut(&key) {
             *before = value;
         } else if self.values.len() < MAX_PENDING {
@@ -41,7 +41,15 @@ impl<K: Hash + Eq + Clone, V> Pending<K, V> {
             if self.dropped.is_power_of_two() {
                 tracing::warn!(dropped = self.dropped, "too many leases wait for the broker");
             }
+            return false;
         }
+        true
+    }
+
+    /// Forgets what waits.
+    pub(crate) fn clear(&mut self) {
+        self.values.clear();
+        self.order.clear();
     }
 
     /// The oldest values that may be written now, up to a limit. Those of the call before are settled: written, or put back.
@@ -109,7 +117,7 @@ mod tests {
     fn what_waits_is_bounded() {
         let mut pending = Pending::default();
         for key in 0..MAX_PENDING + 3 {
-            pending.put(key, ());
+            assert_eq!(pending.put(key, ()), key < MAX_PENDING);
         }
         assert_eq!((pending.values.len(), pending.dropped), (MAX_PENDING, 3));
     }

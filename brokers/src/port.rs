@@ -95,10 +95,10 @@ impl StatusCell {
         Self(watch::Sender::new(BrokerStatus { health, detail, since }))
     }
 
-    /// Tells a change; a closed broker stays closed. Returns whether the health is another one.
-    pub(crate) fn set(&self, health: Health, detail: &str) -> bool {
+    /// Tells a change; a closed broker stays closed. Returns whether the health is another one, where anything is.
+    pub(crate) fn set(&self, health: Health, detail: &str) -> Option<bool> {
         let mut turned = false;
-        self.0.send_if_modified(|status| {
+        let is_changed = self.0.send_if_modified(|status| {
             turned = status.health != health && status.health != Health::Closed;
             let changes = turned || (status.health == health && status.detail != detail);
             if changes {
@@ -110,7 +110,7 @@ impl StatusCell {
             }
             changes
         });
-        turned
+        is_changed.then_some(turned)
     }
 
     pub(crate) fn borrow(&self) -> watch::Ref<'_, BrokerStatus> {

@@ -46,6 +46,7 @@ pub struct RetainedCache<K: Hash + Eq, M> {
     writers: LruCache<K, Retained<M>>,
     bounds: RetainedBounds,
     bytes: usize,
+    evicted: u64,
 }
 
 impl<K: Hash + Eq + Clone, M> RetainedCache<K, M> {
@@ -56,6 +57,7 @@ impl<K: Hash + Eq + Clone, M> RetainedCache<K, M> {
             writers: LruCache::unbounded(),
             bounds,
             bytes: 0,
+            evicted: 0,
         }
     }
 
@@ -70,6 +72,7 @@ impl<K: Hash + Eq + Clone, M> RetainedCache<K, M> {
         retained.messages.push_back((message, size));
         let most = self.bounds.bytes.min(self.bounds.bytes_of_writer);
         while retained.messages.len() > 1 && (retained.messages.len() > depth || retained.bytes > most) {
+            self.evicted += u64::from(retained.messages.len() <= depth);
             retained.pop();
         }
         self.bytes = self.bytes - before + retained.bytes;
@@ -79,7 +82,14 @@ impl<K: Hash + Eq + Clone, M> RetainedCache<K, M> {
                 break;
             };
             self.bytes -= oldest.bytes;
+            self.evicted += oldest.messages.len() as u64;
         }
+    }
+
+    /// Messages that gave way to a bound of the cache; those beyond the depth of their writer do not count.
+    #[must_use]
+    pub fn evicted(&self) -> u64 {
+        self.evicted
     }
 
     /// What is retained of a writer.
@@ -146,6 +156,7 @@ mod tests {
         cache.keep(1, 5, 10, 2);
         cache.keep(3, 1, 10, 2);
         assert_eq!(found(&cache), [(1, vec![4, 5]), (3, vec![1])]);
+        assert_eq!(cache.evicted(), 1);
     }
 
     #[test]
@@ -161,6 +172,7 @@ mod tests {
         assert_eq!(found(&cache), [(2, vec![1]), (3, vec![1])], "a whole writer");
         cache.keep(3, 2, 1_000, 9);
         assert_eq!(found(&cache), [(3, vec![2])]);
+        assert_eq!(cache.evicted(), 1 + 3 + 1 + 1);
     }
 
     #[test]

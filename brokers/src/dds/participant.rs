@@ -253,12 +253,17 @@ impl Participant {
         Reader::start(self.raw_reader(topic, profile)?, sink, Arc::clone(&self.failed))
     }
 
-    /// Calls `sink` with the readers and writers of other participants, whenever one comes or goes, and once a second.
+    /// Calls `sink` with the readers and writers of other participants whose topics begin with `topics`, whenever one comes
+    /// or goes, and once a second.
     ///
     /// # Errors
     /// [`DdsError`] when there is no thread for it.
-    pub fn watch_endpoints(&self, sink: Box<dyn Fn(Endpoints) + Send>) -> Result<EndpointWatch, DdsError> {
-        EndpointWatch::start(self.dds.clone(), self.prefix, sink, Arc::clone(&self.failed))
+    pub fn watch_endpoints(
+        &self,
+        topics: &'static str,
+        sink: Box<dyn Fn(Endpoints) + Send>,
+    ) -> Result<EndpointWatch, DdsError> {
+        EndpointWatch::start(self.dds.clone(), self.prefix, topics, sink, Arc::clone(&self.failed))
     }
 
     /// Whether its threads are alive, as far as that shows without traffic: a panic anywhere was seen, the event loop

@@ -295,6 +295,7 @@ fn hear(state: &Mutex<State>, datagram: &[u8]) {
 /// Sends the announcement to the hosts without a live flow: to all of them when `repeat`, else to those that never got
 /// this one.
 fn announce(config: &RelayConfig, state: &Mutex<State>, sender: &UdpSocket, repeat: bool) {
+    static REFUSED: AtomicBool = AtomicBool::new(false);
     let (datagram, targets) = {
         let mut state = state.lock();
         let Some(own) = state.own else { return };
@@ -322,8 +323,12 @@ fn announce(config: &RelayConfig, state: &Mutex<State>, sender: &UdpSocket, repe
     };
     for address in targets {
         for slot in 0..config.slots.min(LOCAL_SLOTS) {
-            // What the system refuses is repeated.
-            let _ = sender.send_to(&datagram, (address, announcement_port(config.domain, slot)));
+            let sent = sender.send_to(&datagram, (address, announcement_port(config.domain, slot)));
+            if let Err(error) = sent
+                && !REFUSED.swap(true, Ordering::Relaxed)
+            {
+                tracing::warn!(%address, %error, "a DDS announcement could not be sent; announcements are repeated");
+            }
         }
     }
 }

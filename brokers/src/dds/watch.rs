@@ -69,13 +69,14 @@ impl EndpointWatch {
     pub(super) fn start(
         participant: DomainParticipant,
         own: GuidPrefix,
+        topics: &'static str,
         sink: Box<dyn Fn(Endpoints) + Send>,
         failed: Arc<AtomicBool>,
     ) -> Result<Self, DdsError> {
         let returned = Arc::<AtomicBool>::default();
         let tell = Arc::clone(&returned);
         let thread = StoppableThread::start("dds-watch", failed, move |stop| {
-            watch(&participant, stop, &tell, || sink(endpoints(&participant, own)));
+            watch(&participant, stop, &tell, || sink(endpoints(&participant, own, topics)));
         })?;
         Ok(Self {
             _thread: thread,
@@ -133,7 +134,7 @@ fn watch(participant: &DomainParticipant, stop: &AtomicBool, returned: &AtomicBo
     }
 }
 
-fn endpoints(participant: &DomainParticipant, own: GuidPrefix) -> Endpoints {
+fn endpoints(participant: &DomainParticipant, own: GuidPrefix, topics: &str) -> Endpoints {
     let readers = participant.discovered_readers();
     let writers = participant.discovered_writers();
     let is_foreign = |guid: rustdds::GUID| guid.entity_id.kind().is_user_defined() && prefix_of(guid) != own;
@@ -141,6 +142,7 @@ fn endpoints(participant: &DomainParticipant, own: GuidPrefix) -> Endpoints {
         readers: readers
             .iter()
             .filter(|reader| is_foreign(reader.reader_proxy.remote_reader_guid))
+            .filter(|reader| reader.subscription_topic_data.topic_name().starts_with(topics))
             .map(|reader| FoundReader {
                 participant: prefix_of(reader.reader_proxy.remote_reader_guid),
                 topic: reader.subscription_topic_data.topic_name().clone(),
@@ -157,6 +159,7 @@ fn endpoints(participant: &DomainParticipant, own: GuidPrefix) -> Endpoints {
         writers: writers
             .iter()
             .filter(|writer| is_foreign(writer.writer_proxy.remote_writer_guid))
+            .filter(|writer| writer.publication_topic_data.topic_name.starts_with(topics))
             .map(|writer| FoundWriter {
                 id: endpoint_of(writer.writer_proxy.remote_writer_guid),
                 topic: writer.publication_topic_data.topic_name.clone(),

@@ -26,8 +26,6 @@ pub(super) enum Purpose {
     LastValues,
     /// The same, of few and small values: what is old goes soon, so that whoever reads all has little to read.
     Notices,
-    /// The same, where the order counts for a while, and not the last values alone.
-    Terms,
 }
 
 impl Purpose {
@@ -35,7 +33,7 @@ impl Purpose {
         let (segment, message) = match self {
             Self::Messages | Self::LastValues => ("67108864", "17825792"),
             // A segment that is written to is never compacted.
-            Self::Notices | Self::Terms => ("4194304", "2097152"),
+            Self::Notices => ("4194304", "2097152"),
         };
         let mut settings = vec![
             ("segment.bytes", segment),
@@ -44,13 +42,8 @@ impl Purpose {
         ];
         settings.extend(match self {
             Self::Messages => [("retention.ms", "600000"), ("retention.bytes", "268435456")],
-            Self::LastValues | Self::Notices | Self::Terms => {
-                [("cleanup.policy", "compact"), ("min.cleanable.dirty.ratio", "0.1")]
-            }
+            Self::LastValues | Self::Notices => [("cleanup.policy", "compact"), ("min.cleanable.dirty.ratio", "0.1")],
         });
-        if self == Self::Terms {
-            settings.push(("min.compaction.lag.ms", "3600000"));
-        }
         settings
     }
 
@@ -58,7 +51,7 @@ impl Purpose {
     pub(super) fn keeps(self) -> bool {
         match self {
             Self::Messages => false,
-            Self::LastValues | Self::Notices | Self::Terms => true,
+            Self::LastValues | Self::Notices => true,
         }
     }
 }

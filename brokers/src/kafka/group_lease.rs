@@ -88,15 +88,15 @@ impl GroupLease {
             patience: (options.time / 4).clamp(PATIENCE.0, PATIENCE.1),
             options,
             last_error: Arc::default(),
+            stop: stop.clone(),
             is_warned: false,
             consumer: None,
             asked: None,
             is_held: false,
             note: None,
         };
-        let stopped = stop.clone();
         supervisor
-            .spawn_thread("kafka-lease", TaskPolicy::MayEnd, move || member.run(&asked, &stopped))
+            .spawn_thread("kafka-lease", TaskPolicy::MayEnd, move || member.run(&asked))
             .map_err(|error| OpenError::Setting {
                 key: "kafka".to_owned(),
                 reason: error.to_string(),
@@ -126,14 +126,16 @@ impl GroupLease {
         answered.await.unwrap_or_else(|_| Err(GIVEN_UP.to_owned()))
     }
 
-    /// Leaves the group, so that another member has it at once; it is not asked for again.
+    /// Leaves the group, so that another member has it at once; it is not asked for again. The caller no longer acts as
+    /// the owner.
     pub async fn release(&self) {
+        // Before the question, which the thread does not see while it waits for the end of the lease.
+        self.stop.cancel();
         let (answer, answered) = oneshot::channel();
         if self.questions.try_send(Question::Release(answer)).is_ok() {
-            // If the thread has ended, the session runs out.
+            // If the thread has ended, it has left the group.
             let _ = answered.await;
         }
-        self.stop.cancel();
     }
 }
 
@@ -148,6 +150,25 @@ struct Context {
     last_error: Arc<LastError>,
     /// Until then the lease was told to be held.
     promised: Mutex<Option<Instant>>,
+    /// Why it is no member of the group; `None` once the group has taken it in.
+    trouble: Mutex<Option<String>>,
+    stop: CancellationToken,
+}
+
+impl Context {
+    /// Waits until the lease that was told is over, or its owner has stopped.
+    fn wait_until_over(&self) {
+        let Some(until) = self.promised.lock().take() else {
+            return;
+        };
+        while !self.stop.is_cancelled() {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return;
+            }
+            std::thread::sleep(left.min(TURN));
+        }
+    }
 }
 
 impl ClientContext for Context {
@@ -162,11 +183,12 @@ impl ClientContext for Context {
 
 impl ConsumerContext for Context {
     fn pre_rebalance(&self, _consumer: &BaseConsumer<Self>, rebalance: &Rebalance<'_>) {
-        let Rebalance::Revoke(_) = rebalance else { return };
-        let promised = self.promised.lock().take();
-        // Until this returns, nobody else gets the partition.
-        if let Some(until) = promised {
-            std::thread::sleep(until.saturating_duration_since(Instant::now()));
+        match rebalance {
+            // Also where it gets no partition.
+            Rebalance::Assign(_) => *self.trouble.lock() = None,
+            // Until this returns, nobody else gets the partition.
+            Rebalance::Revoke(_) => self.wait_until_over(),
+            Rebalance::Error(_) => {}
         }
     }
 }
@@ -178,10 +200,11 @@ struct Member {
     options: GroupLeaseOptions,
     patience: Duration,
     last_error: Arc<LastError>,
-    /// It was said that somebody else must make the topic.
+    stop: CancellationToken,
+    /// A refusal was logged since the lease was last held.
     is_warned: bool,
     consumer: Option<BaseConsumer<Context>>,
-    /// When the lease was last asked for.
+    /// When the last question was dealt with.
     asked: Option<Instant>,
     /// Whether it was held at the last call.
     is_held: bool,
@@ -190,15 +213,16 @@ struct Member {
 }
 
 impl Member {
-    fn run(mut self, questions: &Receiver<Question>, stop: &CancellationToken) {
-        while !stop.is_cancelled() {
+    fn run(mut self, questions: &Receiver<Question>) {
+        while !self.stop.is_cancelled() {
             let question = questions.recv_timeout(if self.consumer.is_some() { TURN } else { AGAIN });
             match question {
                 // Whoever asked has given up waiting, and asks again.
-                Ok(Question::Hold { answer, .. }) if answer.is_closed() => {}
+                Ok(Question::Hold { answer, .. }) if answer.is_closed() => self.asked = Some(Instant::now()),
                 Ok(Question::Hold { note, answer }) => {
                     let held = self.hold(note);
                     self.is_held = held.as_ref().is_ok_and(|held| held.is_held);
+                    self.asked = Some(Instant::now());
                     // Whoever asked may have given up waiting.
                     let _ = answer.send(held);
                 }
@@ -208,33 +232,36 @@ impl Member {
                     let _ = answer.send(());
                     return;
                 }
+                // The client stays a member by itself, whatever becomes of the one who asks.
+                Err(RecvTimeoutError::Timeout) if self.asked.is_some_and(|at| at.elapsed() > self.options.time) => {
+                    self.leave();
+                }
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
             }
             self.poll();
-            // The client stays a member by itself, whatever becomes of the one who asks.
-            if self.asked.is_some_and(|asked| asked.elapsed() > self.options.time) {
-                self.leave();
-            }
         }
         self.leave();
     }
 
-    /// Leaves the group; whoever asks joins it again.
+    /// Leaves the group once the lease that was told is over; whoever asks joins it again.
     fn leave(&mut self) {
         if let Some(consumer) = self.consumer.take() {
-            *consumer.context().promised.lock() = None;
+            consumer.context().wait_until_over();
             consumer.unsubscribe();
         }
         (self.asked, self.is_held) = (None, false);
     }
 
     fn join(&mut self) -> Result<(), String> {
-        self.make_topic()?;
+        // Where the topic is there already, nobody need be able to make it.
+        let trouble = self.make_topic().err();
         let session = SESSION.max(self.options.time);
         let context = Context {
             last_error: Arc::clone(&self.last_error),
             promised: Mutex::default(),
+            trouble: Mutex::new(trouble),
+            stop: self.stop.clone(),
         };
         let away = |error: KafkaError| error.to_string();
         let config = self.settings.lease_member(&self.options.group, session);
@@ -244,23 +271,17 @@ impl Member {
         Ok(())
     }
 
-    /// Where it is there already, nobody need be able to make it.
-    fn make_topic(&mut self) -> Result<(), String> {
+    fn make_topic(&self) -> Result<(), String> {
         let away = |error: KafkaError| self.last_error.take().unwrap_or_else(|| error.to_string());
         let admin = Admin::new(&self.settings, &self.last_error).map_err(away)?;
-        let refused = admin.make(&[(Arc::clone(&self.topic), Purpose::Terms)]).map_err(away)?;
-        for (topic, code) in refused {
-            match code {
-                // Somebody with more rights may have made it.
-                RDKafkaErrorCode::TopicAuthorizationFailed | RDKafkaErrorCode::ClusterAuthorizationFailed => {
-                    if !std::mem::replace(&mut self.is_warned, true) {
-                        tracing::warn!(%topic, %code, "the topic of the lease must be made by an administrator, as the documentation of the worker says");
-                    }
-                }
-                _ => return Err(format!("the topic {topic} could not be made: {code}")),
-            }
-        }
-        Ok(())
+        let refused = admin
+            .make(&[(Arc::clone(&self.topic), Purpose::Notices)])
+            .map_err(away)?;
+        refused.first().map_or(Ok(()), |(topic, code)| {
+            Err(format!(
+                "the topic {topic} could not be made, so an administrator has to: {code}"
+            ))
+        })
     }
 
     /// Has the client call back.
@@ -268,9 +289,21 @@ impl Member {
         let Some(consumer) = &self.consumer else { return };
         let mut is_gone = consumer.client().fatal_error().is_some();
         while let Some(polled) = consumer.poll(Duration::ZERO) {
-            if let Err(error) = polled {
-                tracing::debug!(%error, topic = %self.topic, "the group of the lease");
-                is_gone |= is_topic_gone(&error);
+            let Err(error) = polled else { continue };
+            tracing::debug!(%error, topic = %self.topic, "the group of the lease");
+            let mut trouble = consumer.context().trouble.lock();
+            if is_topic_gone(&error) {
+                is_gone = true;
+            } else if is_refusal(&error) {
+                *trouble = Some(error.to_string());
+            } else {
+                continue;
+            }
+            // A topic that is not there is no trouble where it can be made.
+            if let Some(why) = &*trouble
+                && !std::mem::replace(&mut self.is_warned, true)
+            {
+                tracing::warn!(topic = %self.topic, why, "the lease cannot be had");
             }
         }
         if is_gone {
@@ -281,7 +314,6 @@ impl Member {
 
     fn hold(&mut self, note: Option<String>) -> Result<Held, String> {
         let now = Instant::now();
-        self.asked = Some(now);
         if self.consumer.is_none() {
             self.join()?;
         }
@@ -291,16 +323,20 @@ impl Member {
         };
         let held = self.ask(&consumer, note, now);
         let is_gone = held.as_ref().is_err_and(is_topic_gone);
+        let trouble = consumer.context().trouble.lock().clone();
         self.consumer = Some(consumer);
         if is_gone {
             self.leave();
         }
-        held.map_err(|error| error.to_string())
+        let held = held.map_err(|error| error.to_string());
+        let is_held = held.as_ref().is_ok_and(|held| held.is_held);
+        trouble.filter(|_| !is_held).map_or(held, Err)
     }
 
     fn ask(&mut self, consumer: &BaseConsumer<Context>, note: Option<String>, now: Instant) -> KafkaResult<Held> {
         let is_own = || {
-            let is_assigned = consumer.assignment().is_ok_and(|assigned| assigned.count() > 0);
+            let assigned = consumer.assignment();
+            let is_assigned = assigned.is_ok_and(|assigned| assigned.find_partition(&self.topic, PARTITION).is_some());
             is_assigned && !consumer.assignment_lost()
         };
         let is_assigned = is_own();
@@ -311,12 +347,13 @@ impl Member {
         };
         self.note = note.or(self.note.take());
         if is_assigned {
-            // The callback of a commit that does not wait is never called by this client. One that waits does so for at most
-            // the session timeout while the coordinator is away.
+            // The callback of a commit that does not wait is never called by this client. One that waits does so for
+            // `socket.timeout.ms`, and while the coordinator is away for the session timeout as well.
             consumer.commit(&position(&self.topic, self.note.as_deref())?, CommitMode::Sync)?;
         }
         let is_held = is_assigned && is_own();
         if is_held {
+            self.is_warned = false;
             *consumer.context().promised.lock() = Some(now + self.options.time);
         }
         Ok(Held {
@@ -337,6 +374,11 @@ fn is_topic_gone(error: &KafkaError) -> bool {
     )
 }
 
+/// Whether a server said no; the other errors are of connections, which the client makes again.
+fn is_refusal(error: &KafkaError) -> bool {
+    error.rdkafka_error_code().is_some_and(|code| code as i32 > 0)
+}
+
 /// The partition with a note.
 fn position(topic: &str, note: Option<&str>) -> KafkaResult<TopicPartitionList> {
     let mut list = TopicPartitionList::new();
@@ -350,7 +392,10 @@ fn position(topic: &str, note: Option<&str>) -> KafkaResult<TopicPartitionList> 
 /// The note that was committed last.
 fn committed(consumer: &BaseConsumer<Context>, topic: &str, patience: Duration) -> KafkaResult<Option<String>> {
     let found = consumer.committed_offsets(position(topic, None)?, patience)?;
-    let note = found.find_partition(topic, PARTITION);
-    let note = note.map(|partition| partition.metadata().to_owned());
-    Ok(note.filter(|note| !note.is_empty()))
+    let Some(partition) = found.find_partition(topic, PARTITION) else {
+        return Ok(None);
+    };
+    partition.error()?;
+    let note = partition.metadata().to_owned();
+    Ok(Some(note).filter(|note| !note.is_empty()))
 }

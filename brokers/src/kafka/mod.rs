@@ -5,10 +5,10 @@
 //!                  Directory: metadata, offsets ◄── health thread: answers, topics, positions ──► status
 //! ```
 //!
-//! A channel is a topic; a message is a record whose headers are the message's header, as text (module `record`). There is no
-//! consumer group: each client reads all partitions at positions of its own, also where the order of records decides who has a
-//! lease (module `group_lease`). Topics are made by the flow of the layer alone (module `flow_side`), and those of configurations by its worker
-//! (module `worker_side`); messages that a service publishes before that wait.
+//! A channel is a topic; a message is a record whose headers are the message's header, as text (module `record`). Clients
+//! that read channels use no consumer group: each reads all partitions at positions of its own. The lease of workers is one
+//! (module `group_lease`). Topics are made by the flow of the layer alone (module `flow_side`), and those of configurations
+//! by its worker (module `worker_side`); messages that a service publishes before that wait.
 
 mod admin;
 mod clock;

@@ -1,6 +1,6 @@
 //! The flow's leases on the server: an own copy, what is still to be written, and the task that writes it.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -18,6 +18,8 @@ use crate::port::BrokerError;
 
 /// Leases that are kept at most: a flow has 10,000, and some are on their way out.
 const MAX_LEASES: usize = 20_000;
+/// Writers that wait to be forgotten; the oldest give way.
+const MAX_FORGOTTEN: usize = 65_536;
 /// Commands that are sent together.
 const PER_BATCH: usize = 500;
 /// After a refusal the server is left alone for this long.
@@ -35,6 +37,20 @@ pub(super) struct Ledger {
     hash: Arc<str>,
     kept: HashMap<String, Bytes>,
     pending: Pending<(Arc<str>, String), Option<Bytes>>,
+    /// More changes were made than can wait: the hash is deleted before the leases are written.
+    clear_first: bool,
+    /// Fields of writers that are to be forgotten.
+    forgotten: VecDeque<(Arc<str>, String)>,
+    /// The last batch is not settled.
+    under_way: bool,
+}
+
+/// Changes that are sent together.
+#[derive(Debug, Default)]
+struct Batch {
+    /// The hash of the leases goes first.
+    clears: bool,
+    changes: Vec<Change>,
 }
 
 impl Ledger {
@@ -43,6 +59,9 @@ impl Ledger {
             hash,
             kept: HashMap::new(),
             pending: Pending::default(),
+            clear_first: false,
+            forgotten: VecDeque::new(),
+            under_way: false,
         }
     }
 
@@ -52,13 +71,62 @@ impl Ledger {
             return false;
         }
         self.kept.insert(key.to_owned(), value.clone());
-        self.pending.put(self.field(key), Some(value));
+        self.note(key, Some(value));
         true
     }
 
     fn remove(&mut self, key: &str) {
         self.kept.remove(key);
-        self.pending.put(self.field(key), None);
+        self.note(key, None);
+    }
+
+    fn note(&mut self, key: &str, value: Option<Bytes>) {
+        if !self.pending.put(self.field(key), value) {
+            self.write_anew();
+        }
+    }
+
+    /// Of changes that are too many only the outcome is written.
+    fn write_anew(&mut self) {
+        self.clear_first = true;
+        self.pending.clear();
+        // These fit.
+        self.rewrite_all();
+    }
+
+    fn forget(&mut self, hash: Arc<str>, writer: WriterId) {
+        if self.forgotten.len() >= MAX_FORGOTTEN {
+            self.forgotten.pop_front();
+        }
+        self.forgotten.push_back((hash, writer.to_string()));
+    }
+
+    /// The next changes; those of the call before are settled: written, or put back.
+    fn take(&mut self) -> Option<Batch> {
+        let mut changes = self.pending.take(PER_BATCH, |_| true);
+        let room = (PER_BATCH - changes.len()).min(self.forgotten.len());
+        changes.extend(self.forgotten.drain(..room).map(|field| (field, None)));
+        let clears = std::mem::take(&mut self.clear_first);
+        self.under_way = clears || !changes.is_empty();
+        self.under_way.then_some(Batch { clears, changes })
+    }
+
+    /// Changes that may not have arrived wait again.
+    fn put_back(&mut self, batch: Batch) {
+        let is_lease = |((hash, _), _): &Change| *hash == self.hash;
+        let (leases, forgotten): (Vec<_>, Vec<_>) = batch.changes.into_iter().partition(is_lease);
+        for (field, _) in forgotten.into_iter().rev() {
+            self.forgotten.push_front(field);
+        }
+        // Otherwise all that counts was queued meanwhile.
+        if !self.clear_first {
+            self.pending.put_back(leases);
+        }
+        self.clear_first |= batch.clears;
+    }
+
+    fn is_settled(&self) -> bool {
+        !self.under_way && !self.clear_first && self.pending.is_settled() && self.forgotten.is_empty()
     }
 
     fn field(&self, key: &str) -> (Arc<str>, String) {
@@ -67,9 +135,10 @@ impl Ledger {
 
     /// The server may have lost everything.
     pub(super) fn rewrite_all(&mut self) {
-        for (key, value) in &self.kept {
-            self.pending
-                .put((Arc::clone(&self.hash), key.clone()), Some(value.clone()));
+        let (hash, pending) = (&self.hash, &mut self.pending);
+        let mut all = self.kept.iter();
+        if !all.all(|(key, value)| pending.put((Arc::clone(hash), key.clone()), Some(value.clone()))) {
+            self.write_anew();
         }
     }
 
@@ -118,7 +187,7 @@ impl Leases {
 
     /// A writer's field of what is kept for late joiners goes.
     pub(super) fn forget(&self, hash: Arc<str>, writer: WriterId) {
-        self.ledger.lock().pending.put((hash, writer.to_string()), None);
+        self.ledger.lock().forget(hash, writer);
         self.wake();
     }
 
@@ -127,7 +196,7 @@ impl Leases {
     }
 }
 
-/// Writes changes in their order while the scope is ours, until the broker is closed.
+/// Writes changes, of each field the last, while the scope is ours, until the broker is closed.
 pub(super) async fn write(shared: Arc<Shared>, leases: Arc<Leases>) {
     shared.stop.run_until_cancelled(write_on(&shared, &leases)).await;
 }
@@ -137,16 +206,15 @@ async fn write_on(shared: &Shared, leases: &Leases) {
         // An owner's claim rings, too, so nothing stays unwritten after an outage.
         leases.changed.notified().await;
         while is_owned(shared) {
-            let changes = leases.ledger.lock().pending.take(PER_BATCH, |_| true);
-            if changes.is_empty() {
+            let Some(batch) = leases.ledger.lock().take() else {
                 leases.settled.notify_one();
                 break;
-            }
+            };
             let mut connection = shared.commands().await;
-            let pipeline = pipeline(&changes);
+            let pipeline = pipeline(&batch, &shared.settings.names.leases());
             let answers = connection.send_packed_commands(&pipeline, 0, pipeline.len()).await;
             if let Err(why) = judge(answers) {
-                leases.ledger.lock().pending.put_back(changes);
+                leases.ledger.lock().put_back(batch);
                 if let Some(why) = why {
                     tracing::warn!(why, "redis refuses leases");
                 }
@@ -163,7 +231,7 @@ fn is_owned(shared: &Shared) -> bool {
 /// Waits until the server has all changes, if it takes any.
 pub(super) async fn drained(shared: &Shared, leases: &Leases, most: Duration) {
     let settled = async {
-        while is_owned(shared) && !leases.ledger.lock().pending.is_settled() {
+        while is_owned(shared) && !leases.ledger.lock().is_settled() {
             leases.settled.notified().await;
         }
     };
@@ -185,9 +253,12 @@ fn judge(answers: redis::RedisResult<Vec<redis::Value>>) -> Result<(), Option<St
     }
 }
 
-fn pipeline(changes: &[Change]) -> redis::Pipeline {
-    let mut pipeline = redis::Pipeline::with_capacity(changes.len());
-    for ((hash, field), value) in changes {
+fn pipeline(batch: &Batch, leases: &str) -> redis::Pipeline {
+    let mut pipeline = redis::Pipeline::with_capacity(batch.changes.len() + 1);
+    if batch.clears {
+        pipeline.add_command(command("DEL", &[leases]));
+    }
+    for ((hash, field), value) in &batch.changes {
         pipeline.add_command(match value {
             Some(value) => hset_command(hash, field, &value[..], value.len()),
             None => command("HDEL", &[hash, field]),
@@ -209,7 +280,7 @@ pub(super) async fn load(shared: &Shared, leases: &Leases) -> Result<Vec<(String
     }
     let mut connection = shared.commands().await;
     let hash = shared.settings.names.leases();
-    let fields = server::fields(&mut connection, &hash, LOAD).await?;
+    let fields = server::fields(&mut connection, (&hash, "the leases"), LOAD).await?;
     let mut loaded: Vec<(String, Bytes)> = fields
         .into_iter()
         .filter_map(|(key, value)| Some((String::from_utf8(key).ok()?, Bytes::from(value))))
@@ -235,7 +306,7 @@ mod tests {
     }
 
     fn take(ledger: &mut Ledger) -> Vec<(String, Option<Bytes>)> {
-        let taken = ledger.pending.take(usize::MAX, |_| true);
+        let taken = ledger.take().unwrap_or_default().changes;
         let mut all: Vec<_> = taken.into_iter().map(|((_, key), value)| (key, value)).collect();
         all.sort();
         all
@@ -272,5 +343,38 @@ mod tests {
             ledger.put(&format!("key-{number}"), value("x"));
         }
         assert_eq!(ledger.kept.len(), MAX_LEASES);
+    }
+
+    #[test]
+    fn of_changes_that_are_too_many_the_outcome_is_written() {
+        let mut ledger = Ledger::new(Arc::from("h"));
+        for key in ["a", "b"] {
+            ledger.put(key, value("1"));
+        }
+        let under_way = ledger.take().unwrap();
+        ledger.remove("a");
+        for number in 0.. {
+            ledger.remove(&format!("gone-{number}"));
+            if ledger.clear_first {
+                break;
+            }
+        }
+        ledger.put_back(under_way);
+        let batch = ledger.take().unwrap();
+        assert!(batch.clears && !ledger.is_settled());
+        assert_eq!(batch.changes, [(ledger.field("b"), Some(value("1")))]);
+        ledger.put_back(batch);
+        let batch = ledger.take().unwrap();
+        assert!(batch.clears, "it may not have arrived");
+        assert_eq!(batch.changes.len(), 1);
+        assert!(ledger.take().is_none() && ledger.is_settled());
+        for number in 0..=MAX_FORGOTTEN {
+            ledger.forget(Arc::from("other"), WriterId([u8::try_from(number % 200).unwrap(); 16]));
+        }
+        assert_eq!(ledger.forgotten.len(), MAX_FORGOTTEN);
+        let batch = ledger.take().unwrap();
+        assert!(!batch.clears && batch.changes.len() == PER_BATCH);
+        ledger.put_back(batch);
+        assert_eq!(ledger.forgotten.len(), MAX_FORGOTTEN, "what was refused waits again");
     }
 }

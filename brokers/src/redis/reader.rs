@@ -91,7 +91,7 @@ fn check(result: RedisResult<()>) -> Result<(), Failure> {
 
 /// What is kept of a channel for late joiners, in the order of publishing as far as the times tell.
 pub(super) async fn read_kept(mut connection: MultiplexedConnection, hash: &str) -> Result<Vec<Received>, BrokerError> {
-    let fields = server::fields(&mut connection, hash, READ_KEPT).await?;
+    let fields = server::fields(&mut connection, (hash, "what is kept for late joiners"), READ_KEPT).await?;
     Ok(kept_messages(fields, hash, unix_time_ns(), Instant::now()))
 }
 

@@ -92,16 +92,16 @@ pub(super) async fn buffer_limits(connection: &mut MultiplexedConnection) -> Red
     }
 }
 
-/// All fields of a hash, as far as they can be read within a time.
+/// All fields of a hash, as far as they can be read within a time. `what` is in it, for people.
 pub(super) async fn fields(
     connection: &mut MultiplexedConnection,
-    hash: &str,
+    (hash, what): (&str, &str),
     longest: Duration,
 ) -> Result<Vec<(Vec<u8>, Vec<u8>)>, BrokerError> {
     let asked = Cmd::hgetall(hash);
     match tokio::time::timeout(longest, asked.query_async(connection)).await {
         Ok(fields) => fields.map_err(|error: RedisError| BrokerError::Away(error.to_string())),
-        Err(_) => Err(BrokerError::Away(format!("{hash} was not read in time"))),
+        Err(_) => Err(BrokerError::Away(format!("{what} could not be read in time"))),
     }
 }
 

@@ -324,11 +324,13 @@ impl State {
         if unreachable && !self.told.swap(true, Ordering::AcqRel) {
             tracing::warn!(detail, "redis cannot be reached, trying on");
         }
-        let turned = self.status.set(health, &detail);
+        let Some(turned) = self.status.set(health, &detail) else {
+            return;
+        };
         match health {
             Health::Up if turned => tracing::info!(detail, "redis is up"),
             Health::Down | Health::InUse if turned => tracing::warn!(detail, "redis cannot be used"),
-            _ => {}
+            _ => tracing::debug!(?health, detail, "redis"),
         }
     }
 

@@ -104,6 +104,7 @@ impl Page {
             Some(Metric::Gauge(gauge)) => gauge.get_metric_with_label_values(labels).map(|gauge| gauge.add(value)),
             None => Err(prometheus::Error::Msg("it is not in the table".to_owned())),
         };
+        debug_assert!(added.is_ok(), "{name} {labels:?}: {added:?}");
         if let Err(error) = added {
             tracing::error!(name, ?labels, %error, "metrics");
         }
@@ -381,3 +382,37 @@ impl Page {
 }
 
 const _: () = assert!(Priority::ALL.len() == 3, "classes have one label each");
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_has_what_is_written_and_the_page_of_the_documentation_has_the_table() {
+        let page = Page::new().unwrap();
+        for name in include_str!("metrics.rs").split('"').filter(|text| {
+            text.starts_with("blaze_flow_") && text.chars().all(|letter| letter.is_ascii_lowercase() || letter == '_')
+        }) {
+            assert!(name == "blaze_flow_" || page.metrics.contains_key(name), "{name}");
+        }
+        let documentation = include_str!("../../../docs/metrics.md");
+        for line in METRICS.lines().filter(|line| line.contains(" blaze_flow_")) {
+            let words: Vec<&str> = line.splitn(4, ' ').collect();
+            let head = format!("| `{}` | {} | ", words[1], words[0]);
+            let row = documentation.lines().find_map(|row| row.strip_prefix(&head));
+            let documented = row.and_then(|row| row.split(" | ").next());
+            let labels = match words[2] {
+                "-" => "–".to_owned(),
+                labels => labels
+                    .split(',')
+                    .map(|label| format!("`{label}`"))
+                    .collect::<Vec<_>>()
+                    .join(" "),
+            };
+            assert!(
+                documented.is_some_and(|documented| documented == labels || documented == "same"),
+                "{head}{documented:?}"
+            );
+        }
+    }
+}

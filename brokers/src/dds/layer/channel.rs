@@ -188,7 +188,10 @@ impl Channel {
             match reader.try_take_one() {
                 Ok(Some(sample)) => deliver(shared, self, kind, progress, sample),
                 Ok(None) => return false,
-                Err(error) => tracing::debug!(topic = &*self.topic, %error, "a sample is no sequence of octets"),
+                Err(error) => {
+                    shared.counts.lock().malformed += 1;
+                    tracing::debug!(topic = &*self.topic, %error, "a sample is no sequence of octets");
+                }
             }
         }
         true

@@ -66,9 +66,12 @@ impl Generation {
         let presence = Arc::new(parking_lot::Mutex::new(Presence::new(near)));
         let (told, found) = (Arc::clone(shared), Arc::clone(&presence));
         Ok(Self {
-            watch: participant.watch_endpoints(Box::new(move |endpoints| {
-                note_endpoints(&told, &found, &endpoints);
-            }))?,
+            watch: participant.watch_endpoints(
+                "",
+                Box::new(move |endpoints| {
+                    note_endpoints(&told, &found, &endpoints);
+                }),
+            )?,
             pulse,
             signs: participant.raw_reader(ALIVE, profile)?,
             sign: participant.writer(ALIVE, profile)?,

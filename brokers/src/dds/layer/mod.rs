@@ -66,6 +66,8 @@ const LOOK: Duration = Duration::from_millis(5);
 /// What a broker has counted since it was opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct DdsCounts {
+    /// Samples that were not a sequence of octets.
+    pub malformed: u64,
     /// How often RustDDS died and was built anew.
     pub rebuilds: u64,
     /// Participants to whom good-bye was said in their absence.

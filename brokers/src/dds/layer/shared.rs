@@ -108,7 +108,7 @@ impl Shared {
     }
 
     pub(super) fn set_status(&self, health: Health, detail: &str) {
-        if self.status.set(health, detail) && health == Health::Up {
+        if self.status.set(health, detail) == Some(true) && health == Health::Up {
             self.was_up.store(true, Ordering::Relaxed);
         }
     }

@@ -14,7 +14,7 @@ use blaze_brokers::dds::{
 };
 use blaze_domain::Priority;
 
-use super::{CLASSES, MAX_HEARD, Shared, parse_topic, profile, topic};
+use super::{CLASSES, MAX_HEARD, Shared, TOPIC_PREFIX, parse_topic, profile, topic};
 use crate::link::transport::{Endpoint, TransportEvent};
 
 const TICK: Duration = Duration::from_millis(200);
@@ -251,9 +251,12 @@ impl Generation {
             .collect::<Result<_, _>>()?;
         let (watcher, own) = (Arc::clone(shared), local.clone());
         let known = parking_lot::Mutex::new(BTreeMap::new());
-        let watch = participant.watch_endpoints(Box::new(move |endpoints| {
-            note_readers(&watcher, &own, &mut known.lock(), &endpoints.readers);
-        }))?;
+        let watch = participant.watch_endpoints(
+            TOPIC_PREFIX,
+            Box::new(move |endpoints| {
+                note_readers(&watcher, &own, &mut known.lock(), &endpoints.readers);
+            }),
+        )?;
         Ok(Self {
             _watch: watch,
             readers,

@@ -12,7 +12,7 @@ use blaze_tests::servers::{
 use blaze_worker::lease::conformance::{BUSY, TIME, run_all};
 use blaze_worker::lease::{KafkaLease, Lease, MongoLease, RedisLease};
 use rdkafka::ClientConfig;
-use rdkafka::admin::{AdminClient, AdminOptions};
+use rdkafka::admin::{AdminClient, AdminOptions, NewTopic, TopicReplication};
 use serde_json::json;
 
 /// Leases on Kafka begin with the topic of all, which the first one makes.
@@ -78,6 +78,27 @@ async fn one_in_a_group_of_kafka_passes_the_suite() {
     let server = KafkaServer::start(KafkaOptions::default()).unwrap();
     let lease = |layer: &str, _: &str| on_kafka(&server, layer);
     run_all(&lease, FIRST_ON_KAFKA).await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn one_in_a_group_of_kafka_has_one_owner_though_the_topic_has_two_partitions() {
+    let server = KafkaServer::start(KafkaOptions::default()).unwrap();
+    let mut config = ClientConfig::new();
+    let admin: AdminClient<_> = config.set("bootstrap.servers", server.bootstrap()).create().unwrap();
+    let topic = NewTopic::new("x.blaze.worker.lease", 2, TopicReplication::Fixed(1));
+    let made = admin.create_topics([&topic], &AdminOptions::new()).await;
+    assert!(made.unwrap().iter().all(Result::is_ok), "the topic is not made");
+    // Each of the two gets a partition.
+    let (one, other) = (on_kafka(&server, "a"), on_kafka(&server, "a"));
+    let (start, mut is_had) = (Instant::now(), false);
+    while start.elapsed() < FIRST_ON_KAFKA {
+        let (one, other) = tokio::join!(one.hold(TIME, None), other.hold(TIME, None));
+        let (one, other) = (one.unwrap_or_default().is_held, other.unwrap_or_default().is_held);
+        assert!(!(one && other), "two have it");
+        is_had |= one || other;
+        tokio::time::sleep(TIME / 20).await;
+    }
+    assert!(is_had, "nobody has it");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
