@@ -184,6 +184,8 @@ fn text_of(worker: &RunningWorker, status: &Status) -> String {
         misunderstood,
         left_out,
         failed_rollouts,
+        forgotten_asked,
+        forgotten_ended,
     } = status.counts;
     let copies = worker.copies();
     let of = |name: &str, count: fn(&CopyCounts) -> u64| -> String {
@@ -231,6 +233,10 @@ blaze_worker_requests_total{{result="left_to_others"}} {left_to_others}
 blaze_worker_signs_total{{result="understood"}} {signs}
 blaze_worker_signs_total{{result="misunderstood"}} {misunderstood}
 blaze_worker_signs_total{{result="left_out"}} {left_out}
+# HELP blaze_worker_places_forgotten_total Places that were forgotten, because there were too many.
+# TYPE blaze_worker_places_forgotten_total counter
+blaze_worker_places_forgotten_total{{reason="asked"}} {forgotten_asked}
+blaze_worker_places_forgotten_total{{reason="ended"}} {forgotten_ended}
 # HELP blaze_worker_rollouts_failed_total Roll-outs that failed here and were undone.
 # TYPE blaze_worker_rollouts_failed_total counter
 blaze_worker_rollouts_failed_total {failed_rollouts}

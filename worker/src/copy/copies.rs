@@ -1,7 +1,7 @@
 //! Writes the newest state to every copy, each at its own pace.
 //!
 //! ```text
-//! store(update) ──▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time
+//! store(update) ──▶ slot of the file     ──▶ task ──▶ replace, at most a fifth of the time unless it is urgent
 //!               └─▶ slot of the database ──▶ task ──▶ replace, likewise
 //! could not be read at the start ─▶ task: load until it can be ──▶ Found ──▶ engine
 //! ```
@@ -27,6 +27,8 @@ const PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_
 /// costs processor time and wears out flash memory.
 const REST: u32 = 4;
 const REST_BOUNDS: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(10));
+/// A copy with at most so many documents rests no longer than this: a state within the rest is lost with the power.
+const SMALL: (usize, Duration) = (1_000, Duration::from_secs(1));
 /// Where only the time of the position moves on, a copy is written again when it is this old.
 const MAX_AGE: Duration = Duration::from_secs(300);
 
@@ -50,6 +52,8 @@ pub struct Target {
     pub copy: Arc<dyn LocalCopy>,
     /// What it holds is known, or that nobody here can read it; else it is read before anything is written.
     pub is_read: bool,
+    /// Position of its content, if all copies hold the same notes.
+    pub written: Option<Position>,
 }
 
 /// What a copy holds that was not known at the start.
@@ -165,7 +169,7 @@ impl Copies {
                 is_overtaken: false,
                 main_answers: answers.subscribe(),
                 failures: 0,
-                written: None,
+                written: target.written,
             };
             let stop = supervisor.shutdown_token();
             supervisor.spawn(format!("copy to {}", slot.place), TaskPolicy::Essential, async move {
@@ -201,14 +205,17 @@ impl Copies {
         }
     }
 
+    /// Ends the rest of every copy that is behind.
+    pub fn hurry(&self) {
+        for slot in self.slots.iter().filter(|slot| !slot.is_current()) {
+            slot.hurry.notify_one();
+        }
+    }
+
     /// Waits until every copy holds what was stored before, at most so long. Gives whether they do. Those that rest are woken.
     pub async fn flush(&self, limit: Duration) -> bool {
         let all = async {
-            for slot in &*self.slots {
-                if !slot.is_current() {
-                    slot.hurry.notify_one();
-                }
-            }
+            self.hurry();
             for slot in &*self.slots {
                 let stored = slot.stored.load(Ordering::Acquire);
                 // The sender lives as long as the slot.
@@ -322,8 +329,9 @@ impl Writer {
                 self.slot.written.fetch_add(1, Ordering::Relaxed);
                 self.recovered();
                 self.slot.done.send_replace(number);
-                self.pause((began.elapsed() * REST).clamp(REST_BOUNDS.0, REST_BOUNDS.1))
-                    .await;
+                let is_small = whole.documents.len() <= SMALL.0;
+                let most = if is_small { SMALL.1 } else { REST_BOUNDS.1 };
+                self.pause((began.elapsed() * REST).clamp(REST_BOUNDS.0, most)).await;
             }
             // Another process of this layer writes it and has newer documents; notes of this one come with its next write.
             Err(CopyError::Newer { .. }) => {
@@ -367,6 +375,10 @@ impl Writer {
     }
 
     fn failed(&mut self, error: &CopyError) -> Duration {
+        if let CopyError::Raced { .. } = error {
+            tracing::debug!(%error, "the copy is written again");
+            return rand::random_range(Duration::ZERO..=PAUSE.0);
+        }
         self.slot.failed.fetch_add(1, Ordering::Relaxed);
         if self.failures == 0 {
             tracing::warn!(%error, "a copy of the configuration is not written; it is tried again");

@@ -16,7 +16,11 @@ const LONG: Duration = Duration::from_secs(300);
 
 fn target(copy: &Arc<Fake>, is_read: bool) -> Target {
     let copy = Arc::clone(copy) as Arc<dyn LocalCopy>;
-    Target { copy, is_read }
+    Target {
+        copy,
+        is_read,
+        written: None,
+    }
 }
 
 struct Fixture {
@@ -150,6 +154,47 @@ async fn a_copy_rests_after_a_write_and_is_woken_in_the_end() {
     assert!(fixture.copies.flush(LONG).await);
     assert!(began.elapsed() < REST_BOUNDS.0);
     assert_eq!(fixture.held().position.revision, 401);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_small_copy_rests_shortly_and_an_urgent_state_does_not_wait() {
+    let slow = Fake {
+        permits: Semaphore::new(0),
+        ..Fake::new("slow")
+    };
+    let mut fixture = Fixture::read(slow);
+    fixture.put("a", 1);
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    fixture.fake.permits.add_permits(9);
+    tokio::time::sleep(Duration::from_millis(10)).await;
+    assert_eq!(fixture.writes(), 1, "it took five seconds");
+    fixture.put("a", 2);
+    tokio::time::sleep(SMALL.1).await;
+    assert_eq!(fixture.writes(), 2);
+    fixture.put("a", 3);
+    fixture.copies.hurry();
+    tokio::time::sleep(Duration::from_millis(10)).await;
+    assert_eq!(fixture.held().position.revision, 3);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_copy_that_is_current_at_the_start_is_not_written() {
+    for (written, writes) in [(position(5), 0), (position(4), 1)] {
+        let (supervisor, fake) = (Supervisor::new("test"), Arc::new(Fake::new("file")));
+        let target = Target {
+            written: Some(written),
+            ..target(&fake, true)
+        };
+        let copies = Copies::start(&supervisor, vec![target], &mpsc::channel(1).0);
+        copies.store(&Update {
+            position: position(5),
+            state: State::default(),
+            notes: Arc::default(),
+            has_changed: false,
+        });
+        assert!(copies.flush(LONG).await);
+        assert_eq!(fake.replaced.load(Ordering::Relaxed), writes);
+    }
 }
 
 #[tokio::test(start_paused = true)]

@@ -69,6 +69,12 @@ pub enum CopyError {
         /// Of what was to be written.
         offered: u64,
     },
+    /// Another worker of the same layer and node has replaced it during the write.
+    #[error("another worker of this layer and node has written {place} meanwhile")]
+    Raced {
+        /// Which copy.
+        place: String,
+    },
     /// `worker.key_file` is no key.
     #[error("worker.key_file: {detail}")]
     Key {
@@ -86,7 +92,12 @@ impl CopyError {
     pub fn is_unreadable(&self) -> bool {
         match self {
             Self::Broken { .. } | Self::OtherKey { .. } | Self::OtherLayer { .. } | Self::NewerFormat { .. } => true,
-            Self::Away { .. } | Self::Refused { .. } | Self::Newer { .. } | Self::Key { .. } | Self::Sealing => false,
+            Self::Away { .. }
+            | Self::Refused { .. }
+            | Self::Newer { .. }
+            | Self::Raced { .. }
+            | Self::Key { .. }
+            | Self::Sealing => false,
         }
     }
 }

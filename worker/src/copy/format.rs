@@ -10,7 +10,7 @@
 //! line. Without a key the texts of secrets are left out. The hash is there for copies without a key: it detects a disk that
 //! fails, not a person who changes both.
 
-use std::io::Write as _;
+use std::io::{self, Write};
 use std::sync::Arc;
 
 use aws_lc_rs::digest::{Context, SHA256};
@@ -18,8 +18,9 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use blaze_domain::LayerName;
 use serde::{Deserialize, Serialize};
+use zeroize::Zeroizing;
 
-use super::vault::{SALT_BYTES, new_salt};
+use super::vault::{SALT_BYTES, make_room, new_salt};
 use super::{CopyError, Loaded, Notes, Position, Vault, json};
 
 /// Begins every copy.
@@ -50,10 +51,10 @@ struct Encryption {
 /// # Errors
 /// [`CopyError::Sealing`].
 pub(super) fn encode(whole: &Loaded, vault: &Vault) -> Result<Vec<u8>, CopyError> {
-    let mut body = as_line(&*whole.notes);
+    let mut body = Zeroizing::new(as_line(&*whole.notes));
     for document in &whole.documents {
         // A vector takes whatever is written to it.
-        let _ = writeln!(body, "{}", vault.writable(document).to_json());
+        let _ = writeln!(Texts(&mut body), "{}", vault.writable(document).to_json());
     }
     let salt = new_salt()?;
     let header = as_line(&Header {
@@ -69,6 +70,21 @@ pub(super) fn encode(whole: &Loaded, vault: &Vault) -> Result<Vec<u8>, CopyError
     out.extend(header);
     out.append(&mut body);
     Ok(out)
+}
+
+/// Takes texts of secrets, and leaves none behind when it grows.
+struct Texts<'b>(&'b mut Vec<u8>);
+
+impl Write for Texts<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        make_room(self.0, bytes.len());
+        self.0.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 /// Nothing that is written here can fail: names of members are texts, and a vector takes everything.
@@ -105,7 +121,7 @@ pub(super) fn decode(content: &[u8], place: &str, layer: &LayerName, vault: &Vau
             wanted: layer.clone(),
         });
     }
-    let mut body = body.to_vec();
+    let mut body = Zeroizing::new(body.to_vec());
     if let Some(Encryption { key, salt }) = header.encryption {
         let salt: Option<[u8; SALT_BYTES]> = STANDARD.decode(salt).ok().and_then(|salt| salt.try_into().ok());
         let salt = salt.ok_or_else(|| broken("its encryption has another form"))?;

@@ -1,7 +1,8 @@
 //! The copy in a MongoDB, standalone or replica set: no transactions.
 //!
 //! ```text
-//! replace   chunks of a new generation ─▶ head: from the old generation to this one ─▶ delete chunks of earlier ones
+//! replace   delete what earlier tries left ─▶ chunks of a new generation ─▶ head: from the old generation to this one
+//!           ─▶ delete chunks of earlier ones
 //! load      head ─▶ chunks of its generation ─▶ head again
 //! ```
 //!
@@ -11,7 +12,7 @@
 //! that of the head.
 
 use std::sync::Arc;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use async_trait::async_trait;
 use blaze_domain::config::Timestamp;
@@ -25,8 +26,12 @@ use mongodb::options::{ReadPreference, SelectionCriteria};
 use super::mongo_client::{Server, Tables, is_duplicate};
 use super::{CopyError, Loaded, LocalCopy, Position, Vault, format};
 
-/// Bytes of a chunk; a document has at most 16 MiB.
-const CHUNK_BYTES: usize = 8 * 1024 * 1024;
+/// Bytes of a chunk: each must arrive within the time of one operation, also over a slow link.
+const CHUNK_BYTES: usize = 1024 * 1024;
+/// Limit for all chunks of a write.
+const CHUNKS_WITHIN: Duration = Duration::from_secs(300);
+/// Age of a generation without a head that is deleted; twice the time that its chunks may take.
+const LEFT_BEHIND: Duration = Duration::from_secs(600);
 /// How often the chunks are read again when the head moves meanwhile.
 const TRIES: usize = 3;
 
@@ -108,14 +113,7 @@ impl MongoCopy {
         self.server.limited(read).await
     }
 
-    async fn write(&self, content: &[u8], position: &Position) -> Result<(), CopyError> {
-        let tables = self.server.tables().await?;
-        let present = self.head(&tables, ReadPreference::Primary).await?;
-        if let Some(present) = &present {
-            self.check(present, position)?;
-        }
-        let before = present.as_ref().and_then(|present| present.get("generation"));
-        let generation = new_generation(now_ms(), before.and_then(Bson::as_str));
+    async fn put_chunks(&self, tables: &Tables, generation: &str, content: &[u8]) -> Result<(), CopyError> {
         for (number, chunk) in content.chunks(CHUNK_BYTES).enumerate() {
             let data = Binary {
                 subtype: BinarySubtype::Generic,
@@ -124,6 +122,25 @@ impl MongoCopy {
             let chunk = doc! { "_id": format!("{}/{generation}/{number:08x}", self.copy), "data": data };
             self.server.limited(tables.chunks.insert_one(chunk)).await?;
         }
+        Ok(())
+    }
+
+    async fn write(&self, content: &[u8], position: &Position) -> Result<(), CopyError> {
+        let tables = self.server.tables().await?;
+        let present = self.head(&tables, ReadPreference::Primary).await?;
+        if let Some(present) = &present {
+            self.check(present, position)?;
+        }
+        let before = present.as_ref().and_then(|present| present.get("generation"));
+        let generation = new_generation(now_ms(), before.and_then(Bson::as_str));
+        let old = now_ms().saturating_sub(u64::try_from(LEFT_BEHIND.as_millis()).unwrap_or(u64::MAX));
+        let left = of_left_behind(&self.copy, before.and_then(Bson::as_str), old);
+        self.server.limited(tables.chunks.delete_many(left)).await?;
+        let put = tokio::time::timeout(CHUNKS_WITHIN, self.put_chunks(&tables, &generation, content));
+        put.await.map_err(|_| CopyError::Away {
+            place: self.place.clone(),
+            detail: format!("not written within {} s", CHUNKS_WITHIN.as_secs()),
+        })??;
         let revision = i64::try_from(position.revision).unwrap_or(i64::MAX);
         let head = doc! {
             "format": i64::try_from(format::FORMAT).unwrap_or(i64::MAX), "generation": &generation,
@@ -135,10 +152,8 @@ impl MongoCopy {
         match self.server.within(moved).await? {
             Ok(_) => {}
             Err(error) if is_duplicate(&error) => {
-                return Err(CopyError::Away {
-                    place: self.place.clone(),
-                    detail: "another worker of this layer and node has written it meanwhile".to_owned(),
-                });
+                let place = self.place.clone();
+                return Err(CopyError::Raced { place });
             }
             Err(error) => return Err(self.server.failed(&error)),
         }
@@ -208,6 +223,16 @@ fn of_generation(copy: &str, generation: &str) -> Document {
 /// Filter for all chunks of earlier generations.
 fn of_earlier(copy: &str, generation: &str) -> Document {
     doc! { "_id": { "$gte": format!("{copy}/"), "$lt": format!("{copy}/{generation}/") } }
+}
+
+/// Filter for the chunks of generations that began before this time, but for those that the head names.
+fn of_left_behind(copy: &str, head: Option<&str>, before_ms: u64) -> Document {
+    let mut old = doc! { "_id": { "$gte": format!("{copy}/"), "$lt": format!("{copy}/{before_ms:016x}") } };
+    if let Some(head) = head {
+        let held = of_generation(copy, head);
+        old.insert("$nor", vec![held]);
+    }
+    old
 }
 
 /// In any width, as tools that copy databases do not keep it.

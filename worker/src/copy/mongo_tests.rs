@@ -50,6 +50,21 @@ fn chunks_of_one_copy_or_generation_are_apart_from_others() {
 }
 
 #[test]
+fn chunks_that_no_head_names_are_deleted_when_they_are_old() {
+    let (head, later) = (new_generation(5, None), new_generation(6, None));
+    let filter = of_left_behind("edge", Some(&head), 7);
+    let range = filter.get_document("_id").unwrap();
+    let range = range.get_str("$gte").unwrap()..range.get_str("$lt").unwrap();
+    let id = |copy: &str, generation: &str| format!("{copy}/{generation}/00000003");
+    assert!(range.contains(&id("edge", &later).as_str()));
+    for id in [id("edge", &new_generation(7, None)), id("edge.robot-1", &later)] {
+        assert!(!range.contains(&id.as_str()), "{id}");
+    }
+    let held = filter.get_array("$nor").unwrap();
+    assert_eq!(held, &[Bson::Document(of_generation("edge", &head))]);
+}
+
+#[test]
 fn a_new_generation_sorts_behind_the_present_one_whatever_the_clock_says() {
     let present = new_generation(1_000, None);
     for now in [0, 999, 1_000, 1_001] {

@@ -11,6 +11,8 @@ pub struct Notes {
     pub failed: Vec<String>,
     /// Places that are notified of changes.
     pub places: Vec<Place>,
+    /// Places whose last notice the broker still keeps.
+    pub ended: Vec<Place>,
     /// No place is notified with a lower revision.
     pub floor: u64,
 }
@@ -21,9 +23,11 @@ impl Notes {
         let more = other.failed.iter().filter(|uid| !self.failed.contains(uid));
         let more: Vec<String> = more.cloned().collect();
         self.failed.extend(more);
-        self.places.extend(other.places.iter().cloned());
-        self.places.sort_unstable();
-        self.places.dedup();
+        for (own, others) in [(&mut self.places, &other.places), (&mut self.ended, &other.ended)] {
+            own.extend(others.iter().cloned());
+            own.sort_unstable();
+            own.dedup();
+        }
         self.floor = self.floor.max(other.floor);
     }
 }

@@ -60,6 +60,7 @@ pub(super) fn notes(uid: &str, floor: u64) -> Notes {
             instance: Some("0".parse().unwrap()),
             node: None,
         }],
+        ended: Vec::new(),
         floor,
     }
 }
@@ -160,9 +161,11 @@ pub(super) fn any_notes() -> impl Strategy<Value = Notes> {
         node: node.map(|name| name.parse().unwrap()),
     });
     let failed = prop::collection::vec("[0-9a-f]{1,4}", 0..5);
-    (failed, prop::collection::vec(place, 0..6), 0..1_u64 << 53).prop_map(|(failed, places, floor)| Notes {
+    let places = move || prop::collection::vec(place.clone(), 0..6);
+    (failed, places(), places(), 0..1_u64 << 53).prop_map(|(failed, places, ended, floor)| Notes {
         failed,
         places,
+        ended,
         floor,
     })
 }

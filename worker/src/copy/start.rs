@@ -2,8 +2,11 @@
 //!
 //! A copy that could not be read in time is read before it is first written ([`Target::is_read`], [`Found`](super::Found)).
 
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
+
+use tokio::time::timeout;
 
 use super::{CopyError, Loaded, LocalCopy, Target};
 
@@ -24,19 +27,28 @@ pub struct Start {
     pub targets: Vec<Target>,
 }
 
-/// Reads both copies and takes the newer one.
+/// Reads both copies at once and takes the newer one.
 pub async fn choose(file: Option<Arc<dyn LocalCopy>>, database: Option<Arc<dyn LocalCopy>>) -> Start {
     let mut start = Start::default();
+    let load = |copy: Option<Arc<dyn LocalCopy>>| async move {
+        match copy {
+            Some(copy) => copy.load().await,
+            None => Ok(None),
+        }
+    };
+    let mut asked = pin!(load(database.clone()));
+    let (of_file, in_time) = tokio::join!(load(file.clone()), timeout(DATABASE_LIMIT, asked.as_mut()));
     if let Some(file) = file {
-        let loaded = file.load().await;
-        start.take(file, loaded);
+        start.take(file, of_file);
     }
     if let Some(database) = database {
-        let limit = match start.loaded {
-            Some(_) => DATABASE_LIMIT,
-            None => DATABASE_LIMIT * PATIENT,
+        let (loaded, limit) = match in_time {
+            Err(_) if start.loaded.is_none() => {
+                let more = DATABASE_LIMIT * (PATIENT - 1);
+                (timeout(more, asked).await, DATABASE_LIMIT * PATIENT)
+            }
+            in_time => (in_time, DATABASE_LIMIT),
         };
-        let loaded = tokio::time::timeout(limit, database.load()).await;
         let loaded = loaded.unwrap_or_else(|_| {
             Err(CopyError::Away {
                 place: database.describe(),
@@ -58,8 +70,13 @@ impl Start {
             }
         };
         let place = copy.describe();
-        self.targets.push(Target { copy, is_read });
+        let written = found.as_ref().map(|found| found.position.clone());
+        self.targets.push(Target { copy, is_read, written });
         let Some(mut found) = found else { return };
+        // Both get the notes of both.
+        if self.loaded.as_ref().is_some_and(|held| held.notes != found.notes) {
+            self.targets.iter_mut().for_each(|target| target.written = None);
+        }
         match &mut self.loaded {
             Some(held) if !found.position.is_newer_than(&held.position) => {
                 // A roll-out that failed stays so, whichever copy was written last.

@@ -35,6 +35,11 @@ async fn the_higher_revision_of_one_store_is_taken() {
         let file = Fake::with("file", at(in_file, "a"));
         let start = choose(Some(file), Some(database)).await;
         assert_eq!((start.from.as_deref(), unread(&start)), (Some(from), vec![]));
+        let written = start
+            .targets
+            .iter()
+            .map(|target| target.written.as_ref().unwrap().revision);
+        assert_eq!(written.collect::<Vec<_>>(), [in_file, in_database]);
         assert_eq!(start.loaded.unwrap().position.revision, in_database.max(in_file));
     }
 }
@@ -99,12 +104,16 @@ async fn notes_of_both_survive() {
         let database = Fake::with("database", with_notes(newer, "one"));
         let file = Fake::with("file", with_notes(5, "two"));
         let start = choose(Some(file), Some(database)).await;
-        let found = start.loaded.unwrap();
+        let found = start.loaded.as_ref().unwrap();
         assert!(
             ["one", "two"]
                 .iter()
                 .all(|uid| found.notes.failed.contains(&(*uid).to_owned()))
         );
         assert_eq!(found.notes.floor, newer.max(5));
+        assert!(
+            start.targets.iter().all(|target| target.written.is_none()),
+            "both are behind"
+        );
     }
 }

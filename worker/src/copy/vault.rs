@@ -93,11 +93,7 @@ impl Vault {
     /// [`CopyError::Sealing`].
     pub(super) fn encrypt(&self, salt: &[u8; SALT_BYTES], header: &[u8], body: &mut Vec<u8>) -> Result<(), CopyError> {
         let Some(master) = &self.master else { return Ok(()) };
-        // Room for the tag from the start: bytes that grow leave a copy of the texts behind.
-        let mut room = Vec::with_capacity(body.len() + TAG_BYTES);
-        room.extend_from_slice(body);
-        body.zeroize();
-        *body = room;
+        make_room(body, TAG_BYTES);
         master
             .derive(salt)?
             .seal_in_place_append_tag(only_nonce(), Aad::from(header), body)
@@ -125,6 +121,16 @@ impl Master {
         let purposes = [FOR_COPIES];
         let key = drawn.expand(&purposes, &AES_256_GCM).map_err(|_| CopyError::Sealing)?;
         Ok(LessSafeKey::new(UnboundKey::from(key)))
+    }
+}
+
+/// Makes room for so many more bytes: a vector that grows by itself leaves texts behind in freed memory.
+pub(super) fn make_room(body: &mut Vec<u8>, more: usize) {
+    if body.capacity() - body.len() < more {
+        let mut room = Vec::with_capacity((body.len() + more).max(body.capacity() * 2));
+        room.extend_from_slice(body);
+        body.zeroize();
+        *body = room;
     }
 }
 

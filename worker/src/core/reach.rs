@@ -24,6 +24,7 @@ use super::told::Told;
 #[derive(Default)]
 pub(super) struct Places {
     told: BTreeMap<Place, Told>,
+    by_node: BTreeMap<NodeName, BTreeSet<Place>>,
     /// How often a place came or went.
     version: u64,
 }
@@ -34,7 +35,12 @@ impl Places {
     }
 
     pub(super) fn insert(&mut self, place: Place, told: Told) {
-        self.version += u64::from(self.told.insert(place, told).is_none());
+        let is_new = !self.told.contains_key(&place);
+        if let Some(node) = place.node.as_ref().filter(|_| is_new) {
+            self.by_node.entry(node.clone()).or_default().insert(place.clone());
+        }
+        self.version += u64::from(is_new);
+        self.told.insert(place, told);
     }
 
     /// Another number whenever a place has come or gone.
@@ -46,6 +52,14 @@ impl Places {
     pub(super) fn remove(&mut self, place: &Place) -> bool {
         let was_there = self.told.remove(place).is_some();
         self.version += u64::from(was_there);
+        if let Some(node) = &place.node
+            && let Some(places) = self.by_node.get_mut(node)
+        {
+            places.remove(place);
+            if places.is_empty() {
+                self.by_node.remove(node);
+            }
+        }
         was_there
     }
 
@@ -71,8 +85,8 @@ impl Places {
             .take_while(move |place| place.service == *service && place.instance.as_ref() == Some(instance))
     }
 
-    pub(super) fn on_node<'p>(&'p self, node: &'p NodeName) -> impl Iterator<Item = &'p Place> {
-        self.told.keys().filter(move |place| place.node.as_ref() == Some(node))
+    pub(super) fn on_node(&self, node: &NodeName) -> impl Iterator<Item = &Place> {
+        self.by_node.get(node).into_iter().flatten()
     }
 }
 

@@ -56,6 +56,18 @@ fn a_layer_concerns_all_or_those_whose_overrides_differ() {
 }
 
 #[test]
+fn who_went_is_on_no_node() {
+    let mut places = places();
+    let node = "a".parse().unwrap();
+    assert_eq!(places.on_node(&node).count(), 3);
+    for text in ["blur/0@a", "slam", "slam/0@a"] {
+        assert!(places.remove(&place(text)));
+    }
+    assert_eq!(places.on_node(&node).collect::<Vec<_>>(), [&place("slam@a")]);
+    assert!(!places.remove(&place("slam")));
+}
+
+#[test]
 fn a_node_concerns_who_is_on_it() {
     let node = |spec| state(1, [document("Node/a", 1, spec)]);
     let plain = node(json!({"layer": "edge"}));

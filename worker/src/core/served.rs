@@ -57,6 +57,8 @@ pub struct Served {
     asked: Asked,
     /// Places that went since the last flush.
     untracked: Vec<Place>,
+    /// Places that asked and were forgotten for others.
+    evicted: u64,
     /// Places of another life that were not looked at yet: nobody knows what they were told.
     restored: BTreeSet<Place>,
 }
@@ -76,6 +78,7 @@ impl Served {
             places: Places::default(),
             asked: Asked::default(),
             untracked: Vec::new(),
+            evicted: 0,
             restored: BTreeSet::new(),
         }
     }
@@ -274,6 +277,12 @@ impl Served {
         self.replace(state, rank);
     }
 
+    /// Number of places that asked and were forgotten, because too many asked.
+    #[must_use]
+    pub fn evicted(&self) -> u64 {
+        self.evicted
+    }
+
     /// No place is notified with a lower revision.
     #[must_use]
     pub fn floor(&self) -> u64 {
@@ -321,9 +330,11 @@ impl Served {
 
     /// Notes that a place asked, so that it is told of changes for a while.
     fn note_asked(&mut self, place: &Place, now: Instant) {
-        if let Some(evicted) = self.asked.touch(place, now)
-            && self.drop_unless_home(&evicted)
-        {
+        let Some(evicted) = self.asked.touch(place, now) else {
+            return;
+        };
+        if self.drop_unless_home(&evicted) {
+            self.evicted += 1;
             self.untracked.push(evicted);
         }
     }

@@ -48,8 +48,14 @@ impl Served {
         let failed = Arc::make_mut(&mut self.next.failed);
         if failed.len() >= MAX_FAILED {
             let is_over = |uid: &String| found(uid).is_none_or(|(_, held)| !is_active(&held.document));
-            let oldest = failed.iter().position(is_over).unwrap_or(0);
-            failed.remove(oldest);
+            let over = failed.iter().position(is_over);
+            let forgotten = failed.remove(over.unwrap_or(0));
+            if over.is_none() {
+                tracing::warn!(
+                    uid = forgotten,
+                    "too many roll-outs failed; this one may be tried again"
+                );
+            }
         }
         failed.push(uid.to_owned());
     }

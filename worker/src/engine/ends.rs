@@ -5,7 +5,7 @@
 //! ```
 //!
 //! Meanwhile a worker that begins to notify repeats that a service was deleted: the one before may have died over it. The
-//! list is in memory alone: after a restart the broker keeps the last notices of places that ended before.
+//! places are in the notes of the copies, so that a restart begins the time anew; the notices of deletions are not.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -26,7 +26,7 @@ const STAYS: Duration = Duration::from_secs(600);
 const IN_MIND: Duration = Duration::from_secs(3_600);
 /// How long the channel stays after the last notice was taken away.
 const CHANNEL_STAYS: Duration = Duration::from_secs(60);
-/// Places that are remembered at most.
+/// Most places that are remembered; those beyond are counted.
 const MAX_ENDED: usize = 20_000;
 
 struct Ended {
@@ -41,6 +41,8 @@ pub(super) struct Ends {
     places: BTreeMap<Place, Ended>,
     /// Services may have come or gone since channels were last asked for.
     channels_differ: bool,
+    /// Places that were not remembered, because there were too many.
+    pub(super) forgotten: u64,
 }
 
 impl Default for Ends {
@@ -48,6 +50,7 @@ impl Default for Ends {
         Self {
             places: BTreeMap::new(),
             channels_differ: true,
+            forgotten: 0,
         }
     }
 }
@@ -71,7 +74,14 @@ impl Ends {
                 is_taken_away: false,
             };
             self.places.insert(place.clone(), ended);
+        } else {
+            self.forgotten += 1;
         }
+    }
+
+    /// All of them, in their order.
+    pub(super) fn places(&self) -> impl Iterator<Item = &Place> {
+        self.places.keys()
     }
 
     /// Deletions that are to be repeated; they stay for a while from now on.
@@ -108,7 +118,7 @@ impl Engine {
         let mut services: BTreeSet<ServiceName> = of_documents.map(|(key, _)| ServiceName::from(key.name())).collect();
         // Programs are there also without a document.
         services.extend(PROGRAMS.iter().filter_map(|program| program.parse().ok()));
-        services.extend(self.ends.places.keys().map(|place| place.service.clone()));
+        services.extend(self.ends.places().map(|place| place.service.clone()));
         channels.serve(services);
     }
 
@@ -118,8 +128,16 @@ impl Engine {
         let in_mind = if self.tells { Duration::ZERO } else { IN_MIND };
         let is_due = |ended: &Ended| ended.until + in_mind <= now;
         let due = self.ends.places.iter().filter(|(_, ended)| is_due(ended));
+        let count = self.ends.places.len();
         let due: Vec<(Place, bool)> = due.map(|(place, ended)| (place.clone(), ended.is_taken_away)).collect();
         for (place, is_taken_away) in due {
+            if self.outputs.speaker.is_waiting(&place.to_string()) {
+                // A record without a value would replace the deletion, and be lost with the channel.
+                if let Some(ended) = self.ends.places.get_mut(&place) {
+                    ended.until = now + STAYS;
+                }
+                continue;
+            }
             // The same instance on another node has the same key.
             let is_notified = self.served.tells(&place.service, place.instance.as_ref());
             if self.tells && self.outputs.channels.is_some() && !is_taken_away && !is_notified {
@@ -131,6 +149,10 @@ impl Engine {
                 self.ends.places.remove(&place);
                 self.ends.channels_differ = true;
             }
+        }
+        if self.ends.places.len() < count {
+            self.renew_notes();
+            self.keep(true);
         }
         self.serve_channels();
     }

@@ -93,6 +93,47 @@ async fn channels_are_there_before_anything_is_said_and_what_is_over_is_taken_aw
 }
 
 #[tokio::test(start_paused = true)]
+async fn a_deletion_waits_for_a_broker_that_is_away_for_long() {
+    let (mut w, made) = world(None);
+    w.opens(documents(30), 2).await;
+    w.rest().await;
+    w.up.send_replace(false);
+    w.says(remove(3, document("Service/nav", 3, json!({})))).await;
+    tokio::time::sleep(LONG * 3 / 2).await;
+    assert_eq!(made.last(), ["nav", "slam"], "the channel is still needed");
+    w.up.send_replace(true);
+    let seen = w.rest().await;
+    let is_end = |seen: &Seen| matches!(seen, Seen::Notice(channel, notice) if channel.ends_with("/nav") && notice["deleted"] == true);
+    assert!(seen.iter().any(is_end), "{seen:?}");
+    assert!(taken_away(&seen).is_empty());
+    tokio::time::sleep(LONG).await;
+    assert_eq!(taken_away(&w.rest().await), [("blaze/config/changed/nav", "")]);
+    assert_eq!(made.last(), ["slam"]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_new_life_takes_away_what_ended_in_the_last_one() {
+    let notes = Arc::new(Notes {
+        ended: vec![place("late@robot-1"), place("nav@robot-1")],
+        ..Notes::default()
+    });
+    let (mut w, made) = world(Some(Loaded {
+        notes,
+        ..copy_of("s", 2, documents(30))
+    }));
+    w.rest().await;
+    assert_eq!(made.last(), ["late", "nav", "slam"]);
+    tokio::time::sleep(LONG).await;
+    let gone = w.rest().await;
+    assert_eq!(
+        taken_away(&gone),
+        [("blaze/config/changed/late", "")],
+        "nav is there again"
+    );
+    assert_eq!(made.last(), ["nav", "slam"]);
+}
+
+#[tokio::test(start_paused = true)]
 async fn what_comes_back_meanwhile_is_not_taken_away() {
     let (mut w, made) = world(None);
     w.opens(documents(30), 2).await;

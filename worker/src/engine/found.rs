@@ -45,6 +45,9 @@ impl Engine {
         for uid in &notes.failed {
             self.served.fail_rollout(uid);
         }
+        for place in &notes.ended {
+            self.ends.add(place, None);
+        }
         let places = notes.places.iter().cloned();
         self.served.restore(notes.floor, places, Instant::now().into_std());
         self.renew_notes();

@@ -91,6 +91,9 @@ impl Engine {
                 // A new life must not try it again, whether it tells anybody of the former configuration or not.
                 self.renew_notes();
                 self.keep(true);
+                if let Some(copies) = &self.outputs.copies {
+                    copies.hurry();
+                }
                 self.flush_soon();
                 self.acknowledge_soon();
             }
@@ -115,11 +118,10 @@ impl Engine {
         }
     }
 
-    /// Everything up to this revision services have been told: by this worker, or, where it does not tell, by others.
+    /// Revision up to which services were notified: by this worker, since it notified all, or else by others.
     fn told_up_to(&self) -> Option<u64> {
-        let shown = self.served.state().revision();
         if self.tells {
-            return self.outputs.speaker.is_done().then_some(shown);
+            return self.delivered(false).filter(|_| self.has_announced);
         }
         let (noted, shown) = (self.noted.as_ref()?, self.shown.as_ref()?);
         (noted.store_id == shown.store_id).then_some(noted.revision)

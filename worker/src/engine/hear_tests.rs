@@ -37,6 +37,7 @@ fn copies() -> (Supervisor, Arc<Fake>, Copies) {
     let target = Target {
         copy: Arc::clone(&fake) as Arc<dyn LocalCopy>,
         is_read: true,
+        written: None,
     };
     let copies = Copies::start(&supervisor, vec![target], &mpsc::channel(1).0);
     (supervisor, fake, copies)
@@ -220,6 +221,52 @@ async fn its_window_begins_when_services_are_told_of_it_and_not_before() {
     tokio::time::sleep(Duration::from_secs(40)).await;
     w.acks("0", &json!(null), "rejected").await;
     assert_eq!(w.rates().await, [json!(30)]);
+}
+
+#[tokio::test(start_paused = true)]
+async fn its_window_does_not_begin_in_a_new_life_that_has_notified_nobody() {
+    let mut documents = canary_documents();
+    documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
+    documents.push(rollout(2, "u-1", 500));
+    let mut w = world_from(Some(copy_of("s", 2, documents.clone())), true);
+    w.rest().await;
+    assert_eq!(w.status().await.json["rollouts"][0]["phase"], "pending");
+    w.opens(documents, 2).await;
+    assert_eq!(w.rates().await, [json!(500)]);
+    assert_eq!(w.status().await.json["rollouts"][0]["phase"], "applied");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_new_leader_opens_windows_when_the_broker_has_its_first_notices() {
+    let mut w = world_from(None, false);
+    let mut documents = canary_documents();
+    documents.push(document("Instance/slam/0", 2, json!({ "node": "robot-1" })));
+    w.opens(documents, 2).await;
+    assert_eq!(w.tries(3, "u-1", 500).await, [] as [Value; 0]);
+    w.says(put(4, document("Service/nav", 4, json!({ "config": { "speed": 2 } }))))
+        .await;
+    w.rest().await;
+    w.up.send_replace(false);
+    w.leader.send_replace(Some(1));
+    w.rest().await;
+    assert_eq!(w.status().await.json["rollouts"][0]["phase"], "pending");
+    w.up.send_replace(true);
+    assert_eq!(w.rates().await, [json!(500)]);
+    assert_eq!(w.status().await.json["rollouts"][0]["phase"], "applied");
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_new_life_writes_no_copy_that_is_as_it_should_be() {
+    let (_supervisor, fake, copies) = copies();
+    let mut w = world_with(None, true, Some(copies.clone())).with_canary().await;
+    w.rest().await;
+    assert!(copies.flush(Duration::from_secs(60)).await);
+    drop(w);
+    let loaded = fake.load().await.unwrap().unwrap();
+    let written = copies.counts()[0].written;
+    let mut w = world_with(Some(loaded), true, Some(copies.clone()));
+    w.rest().await;
+    assert_eq!(copies.counts()[0].written, written);
 }
 
 #[tokio::test(start_paused = true)]

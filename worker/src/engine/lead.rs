@@ -151,18 +151,43 @@ impl Engine {
         }
         self.open_windows();
         self.keep_notes();
-        if self.tells && !self.outputs.speaker.is_done() {
+        let store_id = self.shown_store();
+        if self.tells && self.outputs.speaker.waits_since(store_id, true).is_some() {
             self.settle_soon();
         }
     }
 
+    /// Store of the state that is shown.
+    fn shown_store(&self) -> &str {
+        self.shown.as_ref().map_or("", |shown| &shown.store_id)
+    }
+
+    /// Revision up to which the broker has taken all notices. `aside`: also those whose channel cannot be made yet.
+    pub(super) fn delivered(&self, aside: bool) -> Option<u64> {
+        match self.outputs.speaker.waits_since(self.shown_store(), aside) {
+            None => Some(self.served.state().revision()),
+            Some(revision) => revision.checked_sub(1),
+        }
+    }
+
     fn leave_mark(&self) {
-        let Some(shown) = self.shown.as_ref().filter(|_| self.outputs.speaker.is_done()) else {
+        let (Some(shown), Some(revision)) = (&self.shown, self.delivered(true)) else {
             return;
         };
+        let mark = Mark {
+            revision,
+            ..shown.clone()
+        };
         self.outputs.told.send_if_modified(|left| {
-            let is_new = left.as_ref() != Some(shown);
-            *left = Some(shown.clone());
+            // A repeated notice does not set the mark back.
+            let mut known = left.iter().chain(&self.noted);
+            let is_new = match mark == *shown {
+                true => left.as_ref() != Some(shown),
+                false => !known.any(|known| known.covers(&mark)),
+            };
+            if is_new {
+                *left = Some(mark);
+            }
             is_new
         });
     }

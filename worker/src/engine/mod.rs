@@ -167,15 +167,21 @@ impl Engine {
             as_of,
             ..
         } = loaded.position;
-        let state = self.state_of(revision, loaded.documents);
+        let state = self.state_of(revision, loaded.documents.iter().cloned());
+        let is_same = |document: &Arc<Document>| {
+            let held = state.get(&document.key);
+            held.is_some_and(|held| Arc::ptr_eq(&held.document, document))
+        };
+        let is_as_kept = loaded.documents.iter().all(is_same);
         self.take_notes(&loaded.notes);
+        self.notes = loaded.notes;
         self.replica = Replica::from_copy(store_id, state.clone(), as_of);
         self.served.load(state, Source::Copy);
         self.lacks_texts = lacks_texts(self.replica.state());
         self.note_all_services();
         self.flush_at = Some(now);
-        // The one of the copies that is behind the other catches up.
-        self.keep(true);
+        // The one of the copies that is behind the other catches up; both lose the texts that nobody is told.
+        self.keep(!is_as_kept);
     }
 
     /// Documents of a copy or of a file, as they are kept here.
@@ -276,8 +282,17 @@ impl Engine {
     /// Has places that came or went kept, and roll-outs that failed.
     fn keep_notes(&mut self) {
         if self.notes_version != self.served.places_version() {
+            let before = Arc::clone(&self.notes);
             self.renew_notes();
-            self.keep(true);
+            // The revision of the documents is kept with them.
+            let revision = self.replica.state().revision();
+            let kept = |notes: &Notes| Notes {
+                floor: notes.floor.max(revision),
+                ..notes.clone()
+            };
+            if kept(&before) != kept(&self.notes) {
+                self.keep(true);
+            }
         }
         self.owe_notes();
     }
@@ -287,6 +302,7 @@ impl Engine {
         self.notes = Arc::new(Notes {
             failed: self.served.failed().to_vec(),
             places: self.places(),
+            ended: self.ends.places().cloned().collect(),
             floor: self.served.floor(),
         });
     }

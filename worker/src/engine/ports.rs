@@ -100,4 +100,8 @@ pub struct Counts {
     pub left_out: u64,
     /// Roll-outs that failed here and were undone.
     pub failed_rollouts: u64,
+    /// Places that asked and are not notified any more, because too many asked.
+    pub forgotten_asked: u64,
+    /// Places whose last notice stays with the broker, because too many ended.
+    pub forgotten_ended: u64,
 }

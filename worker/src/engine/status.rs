@@ -64,6 +64,8 @@ impl Engine {
             json,
             counts: Counts {
                 left_out: self.signs.left_out(),
+                forgotten_asked: self.served.evicted(),
+                forgotten_ended: self.ends.forgotten,
                 ..self.counts
             },
             is_ready: self.served.is_ready(),

@@ -38,6 +38,9 @@ impl Engine {
             untracked,
         } = self.served.flush(instant.into_std());
         self.shown = self.mark();
+        // Those that are announced now make up for earlier states as well.
+        let state = self.shown.clone().filter(|_| self.has_announced);
+        self.outputs.speaker.set_state(state);
         let is_first = self.served.is_ready() && !std::mem::replace(&mut self.has_swept, self.served.is_ready());
         let mut told: Vec<Told> = Vec::with_capacity(notices.len());
         // First what goes: an instance that moves has the same key there.

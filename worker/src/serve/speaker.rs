@@ -13,7 +13,7 @@ use tokio::time::{Instant, sleep_until};
 
 use super::outlet::{Outlet, OutletError};
 use super::waiting::State;
-use crate::lease::Term;
+use crate::lease::{Mark, Term};
 
 /// Places that are told of in one transaction.
 const BATCH: usize = 256;
@@ -87,10 +87,22 @@ impl Speaker {
         self.shared.more.notify_one();
     }
 
-    /// Whether the broker has taken every notice that it can take: a channel that cannot be made holds up nobody else.
+    /// Notices are from this state from now on; `None`: the broker may lack anything before them.
+    pub fn set_state(&self, state: Option<Mark>) {
+        self.shared.state.lock().from = state;
+    }
+
+    /// Whether the broker has not taken the last notice of a place.
     #[must_use]
-    pub fn is_done(&self) -> bool {
-        self.shared.state.lock().is_done()
+    pub fn is_waiting(&self, place: &str) -> bool {
+        self.shared.state.lock().is_waiting(place)
+    }
+
+    /// Lowest revision of this store among the notices that the broker has not taken; 0 if one is
+    /// of another store. `aside`: with those whose channel cannot be made yet.
+    #[must_use]
+    pub fn waits_since(&self, store_id: &str, aside: bool) -> Option<u64> {
+        self.shared.state.lock().waits_since(store_id, aside)
     }
 
     /// Has keys of before, which nobody wants any more, looked for and deleted. All that are wanted must have been told.
@@ -189,7 +201,7 @@ impl Speaker {
             match delivered {
                 Ok(()) => {
                     let mut state = self.shared.state.lock();
-                    state.is_busy = false;
+                    state.busy.clear();
                     state.counts.notices += messages.len() as u64;
                     (pause, most, trouble) = (PAUSE.0, BATCH, None);
                     if !changes.is_empty() {
@@ -223,7 +235,7 @@ impl Speaker {
                     let place = batch.waiting.first().map(|(place, _)| place.as_str());
                     tracing::error!(%error, place, keys = ?batch.keys, "a service is not told of its configuration");
                     let mut state = self.shared.state.lock();
-                    state.is_busy = false;
+                    state.busy.clear();
                     state.counts.dropped += 1;
                 }
                 Err(OutletError::NotYet { channels, reason }) => {

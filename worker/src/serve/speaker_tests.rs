@@ -245,14 +245,44 @@ fn a_batch_is_bounded_in_bytes_but_never_empty() {
 fn what_was_forgotten_does_not_come_back_and_is_not_missed() {
     let mut state = State::default();
     state.put(told("slam", "7"));
-    assert!(!state.is_done());
+    assert!(state.waits_since("", false).is_some());
     let batch = state.take(BATCH);
-    assert!(!state.is_done(), "also while it is on its way");
+    assert!(state.waits_since("", false).is_some(), "also while it is on its way");
     state.put(told("nav", "8"));
     state.clear();
     state.put_back(batch);
-    assert!(state.is_done());
+    assert!(state.waits_since("", false).is_none());
     assert!(state.take(BATCH).is_empty());
+}
+
+#[test]
+fn a_place_waits_since_its_first_notice_that_was_not_taken() {
+    let at = |revision| {
+        let store_id = "a".to_owned();
+        Some(Mark { store_id, revision })
+    };
+    let mut state = State {
+        from: at(5),
+        ..State::default()
+    };
+    state.put(told("slam", "1"));
+    state.from = at(6);
+    state.put(told("nav", "1"));
+    state.put(told("slam", "2"));
+    assert_eq!(state.waits_since("a", true), Some(5), "also after it was replaced");
+    let batch = state.take(BATCH);
+    assert!(state.is_waiting("nav"), "also while it is on its way");
+    state.from = at(7);
+    state.put(told("nav", "2"));
+    assert_eq!(state.waits_since("a", true), Some(5));
+    state.put_back(batch);
+    state.set_aside(&["blaze/config/changed/slam".parse().unwrap()].into());
+    assert_eq!(
+        (state.waits_since("a", false), state.waits_since("a", true)),
+        (Some(6), Some(5))
+    );
+    assert_eq!(state.waits_since("b", true), Some(0), "of another store");
+    assert!(state.is_waiting("slam") && !state.is_waiting("log"));
 }
 
 #[tokio::test(start_paused = true)]
@@ -275,7 +305,7 @@ async fn a_channel_that_is_not_there_yet_holds_up_no_other_one_and_waits_on() {
     assert_eq!((counts.waiting, counts.dropped), (1, 0));
     // Of all who can be told nobody waits.
     let is_all = async {
-        while !w.speaker.is_done() {
+        while w.speaker.waits_since("", false).is_some() {
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
     };
@@ -297,7 +327,7 @@ async fn notices_go_on_while_the_keys_wait_for_their_server() {
         w.delivered.is_empty(),
         "each notice was told once, and no key was written"
     );
-    assert!(w.speaker.counts().notices == 6 && w.speaker.is_done());
+    assert!(w.speaker.counts().notices == 6 && w.speaker.waits_since("", false).is_none());
     w.keys.send_replace(true);
     let written = w.delivered.recv().await.unwrap();
     let put = |place: &str| KeyChange::Put {

@@ -8,6 +8,7 @@ use blaze_domain::names::ChannelName;
 use bytes::Bytes;
 
 use super::{SpeakerCounts, Told};
+use crate::lease::Mark;
 
 /// Bytes of one transaction, unless one place alone has more (1 MiB): a large one over a slow connection would not be done in
 /// the time that a call may take, and be tried again for ever.
@@ -18,6 +19,8 @@ pub(super) struct Waiting {
     /// The key that must be written no later.
     key: Option<String>,
     pub(super) notice: KeyedMessage,
+    /// State of the first notice of the place that the broker has not taken.
+    since: Option<Mark>,
 }
 
 #[derive(Default)]
@@ -35,8 +38,10 @@ pub(super) struct State {
     pub(super) keys_wait: bool,
     /// Keys of before are to be looked for: those of this worker that are not wanted are to go.
     pub(super) sweep: bool,
-    /// Notices are being told just now.
-    pub(super) is_busy: bool,
+    /// Places with a notice on its way, and since which state they wait.
+    pub(super) busy: BTreeMap<String, Option<Mark>>,
+    /// State that notices are from; `None`: the broker may lack anything before them.
+    pub(super) from: Option<Mark>,
     /// How often everything was forgotten.
     pub(super) cleared: u64,
     pub(super) counts: SpeakerCounts,
@@ -80,13 +85,17 @@ impl State {
             name
         });
         let Some(notice) = notice else { return };
-        if let Some((at, _)) = self.waiting.remove(&place) {
+        let mut since = self.from.clone();
+        if let Some((at, before)) = self.waiting.remove(&place) {
             self.order.remove(&at);
             self.counts.replaced += 1;
+            since = before.since;
         }
         self.ends.1 += 1;
         self.order.insert(self.ends.1, place.clone());
-        self.waiting.insert(place, (self.ends.1, Waiting { key: name, notice }));
+        let key = name;
+        self.waiting
+            .insert(place, (self.ends.1, Waiting { key, notice, since }));
     }
 
     /// The first that wait, at most so many and, but for the first, so many bytes.
@@ -120,13 +129,26 @@ impl State {
             bytes += self.wanted.get(&key).map_or(0, Bytes::len);
             batch.keys.insert(key);
         }
-        self.is_busy = !batch.waiting.is_empty();
+        let places = batch.waiting.iter();
+        self.busy = places
+            .map(|(place, waiting)| (place.clone(), waiting.since.clone()))
+            .collect();
         batch
     }
 
-    /// Whether the broker has taken every notice that it can take: what is set aside may wait for ever.
-    pub(super) fn is_done(&self) -> bool {
-        self.order.is_empty() && !self.is_busy
+    /// Whether the broker has not taken the last notice of a place.
+    pub(super) fn is_waiting(&self, place: &str) -> bool {
+        self.waiting.contains_key(place) || self.busy.contains_key(place)
+    }
+
+    /// Lowest revision of this store among the notices that the broker has not taken; 0 if one is
+    /// of another store. `aside`: with those that are set aside.
+    pub(super) fn waits_since(&self, store_id: &str, aside: bool) -> Option<u64> {
+        let waiting = self.waiting.values();
+        let waiting = waiting.filter(|(at, _)| aside || self.order.contains_key(at));
+        let all = waiting.map(|(_, waiting)| &waiting.since).chain(self.busy.values());
+        let revision = |mark: &Mark| if mark.store_id == store_id { mark.revision } else { 0 };
+        all.map(|since| since.as_ref().map_or(0, revision)).min()
     }
 
     /// Everything is forgotten, also what is on its way and comes back.
@@ -152,17 +174,19 @@ impl State {
 
     /// What could not be told goes back to the front; what has come meanwhile is newer.
     pub(super) fn put_back(&mut self, batch: Batch) {
-        self.is_busy = false;
+        self.busy.clear();
         if batch.cleared != self.cleared {
             return;
         }
         self.dirty.extend(batch.keys);
         for (place, waiting) in batch.waiting.into_iter().rev() {
-            if !self.waiting.contains_key(&place) {
-                self.ends.0 -= 1;
-                self.order.insert(self.ends.0, place.clone());
-                self.waiting.insert(place, (self.ends.0, waiting));
+            if let Some((_, newer)) = self.waiting.get_mut(&place) {
+                newer.since = waiting.since;
+                continue;
             }
+            self.ends.0 -= 1;
+            self.order.insert(self.ends.0, place.clone());
+            self.waiting.insert(place, (self.ends.0, waiting));
         }
     }
 
