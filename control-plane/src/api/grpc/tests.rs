@@ -1,5 +1,7 @@
 //! The whole interface on a core with a store in memory, called without a network.
 
+mod answers;
+mod bound;
 mod fixture;
 
 use std::time::Duration;

@@ -1,6 +1,7 @@
 //! Secrets are put, changed, brought back, compared, watched, refused and backed up. Their texts are given out to who asks
 //! for them and may have them, and are nowhere else.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,11 +12,12 @@ use blaze_proto::v1;
 use serde_json::{Value, json};
 use tonic_types::StatusExt as _;
 
+use blaze_tests::servers::mongo_command;
 use blaze_tests::wait;
 
 use super::client::{Answer, Client, Rest, Via};
 use super::sse::Events;
-use super::stage::{Main, Stage, blocking, within};
+use super::stage::{Main, Stage, Store, blocking, within};
 
 /// The beginning of every secret text, and of nothing else.
 const CANARY: &str = "kanarienvogel-7d1f";
@@ -147,6 +149,43 @@ async fn a_secret_is_nowhere_but_where_it_is_asked_for() {
     }
     // The file of the store and the backup.
     assert!(plain >= 2, "{PLAIN} is in {plain} files");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_secret_is_nowhere_on_mongodb() {
+    let stage = Stage::mongo();
+    let world = World::new(&stage);
+    written(&world).await;
+    holds_no_secret(&stage, &["events"]);
+    // What is trimmed away from the log is moved to where it outlives it.
+    let head = world.read("/api/v1/nodes").await.revision.unwrap();
+    let trim = json!({ "before": head + 1 });
+    world.write("POST", "/api/v1/trim", NONE, &trim).await;
+    holds_no_secret(&stage, &["documents", "versions", "idempotency"]);
+}
+
+/// Looks into every collection; these hold what stands beside the secrets.
+fn holds_no_secret(stage: &Stage, plain: &[&str]) {
+    let Store::Mongo { server, database } = &stage.store else {
+        panic!("it is MongoDB")
+    };
+    let ask = |command: &Value| mongo_command(&server.uri(), database, command).unwrap();
+    let tables = ask(&json!({ "listCollections": 1, "cursor": { "batchSize": 1000 } }));
+    let mut found = BTreeSet::new();
+    for table in tables.get_document("cursor").unwrap().get_array("firstBatch").unwrap() {
+        let name = table.as_document().unwrap().get_str("name").unwrap();
+        let rows = ask(&json!({ "find": name, "batchSize": 100_000, "limit": 100_000 }));
+        // As bytes: whatever type a text has, it is found.
+        let bytes = rows.to_vec().unwrap();
+        let content = String::from_utf8_lossy(&bytes);
+        clean(name, &content);
+        if content.contains(PLAIN) {
+            found.insert(name);
+        }
+    }
+    for name in plain {
+        assert!(found.contains(name), "{PLAIN} is not in {name}, only in {found:?}");
+    }
 }
 
 fn read_file(path: &Path) -> String {

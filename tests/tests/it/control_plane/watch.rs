@@ -148,6 +148,65 @@ async fn trim_on(
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn each_goes_on_at_the_other_process_while_one_is_replaced() {
+    const WATCHERS: usize = 4;
+    let (_stage, mains, client) = two();
+    let (end, end_seen) = watch::channel(None);
+    let (_floor, floor_seen) = watch::channel(0);
+    let mut following: JoinSet<Watcher> = JoinSet::new();
+    for index in 0..WATCHERS {
+        let plan = Plan {
+            cuts: Vec::new(),
+            late: 1,
+            floor: floor_seen.clone(),
+            end: end_seen.clone(),
+        };
+        let clients = clients_of(&client, &mains, index);
+        following.spawn(async move { Watcher::start(clients).await.run(plan).await });
+    }
+    let mut last = 0;
+    for (leaving, staying) in [(0, 1), (1, 0)] {
+        all_open(&mains, WATCHERS).await;
+        // Commits before the process is asked to end, until it has ended, and afterwards.
+        let mut writer = writer(&client, &mains, 2 * staying, 0);
+        for _ in 0..20 {
+            last = writer.write().await;
+        }
+        let main = Arc::clone(&mains[leaving]);
+        let stopping = blocking(move || main.stop());
+        let writing = async {
+            let mut stopping = std::pin::pin!(stopping);
+            loop {
+                last = writer.write().await;
+                if let Some(code) = futures::FutureExt::now_or_never(stopping.as_mut()) {
+                    return code;
+                }
+            }
+        };
+        let code = within("the end of a process", Duration::from_secs(60), writing).await;
+        assert_eq!(code, Some(0), "it ends well");
+        for _ in 0..20 {
+            last = writer.write().await;
+        }
+        let main = Arc::clone(&mains[leaving]);
+        blocking(move || main.start_again()).await;
+    }
+    end.send_replace(Some(last));
+    let seen = within("the watchers", Duration::from_secs(60), following.join_all()).await;
+    for main in &mains {
+        let (revision, items) = client.rest.list(main.at().rest, "services").await;
+        assert_eq!(revision, last);
+        let state = state_of(&items);
+        for watcher in &seen {
+            assert_eq!(watcher.state, state, "{:?}", watcher.tally);
+        }
+    }
+    for Watcher { tally, .. } in &seen {
+        assert!(tally.left > 0 && tally.lists == 1, "it goes on where it was: {tally:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
     let (_stage, mains, client) = two();
     let long = blaze_tests::long();

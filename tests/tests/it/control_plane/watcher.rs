@@ -44,6 +44,8 @@ pub(crate) struct Tally {
     pub(crate) cuts: usize,
     /// The first list, and one after each 410.
     pub(crate) lists: usize,
+    /// How often its process ended.
+    pub(crate) left: usize,
     /// How often it was ended because it was too slow.
     pub(crate) slow: usize,
     /// From before a write was sent until it was told, in microseconds; of writes that began while the watch was open.
@@ -139,6 +141,12 @@ impl Watcher {
             Next::Ended(code) if code == "watch_too_slow" => {
                 self.tally.slow += 1;
                 self.stream = None;
+            }
+            // As the contract has it, it goes on at another process.
+            Next::Ended(code) if code == "shutting_down" => {
+                self.tally.left += 1;
+                self.stream = None;
+                self.turn = (self.turn + 1) % self.clients.len();
             }
             // While it was still reading what had been before.
             Next::Ended(code) if code == "revision_trimmed" => {

@@ -7,6 +7,7 @@ use blaze_tests::flow::{FlowProcess, FlowSpec, free_domain};
 use blaze_tests::plain::{self, RedisReader};
 use blaze_tests::servers::{RedisKind, RedisOptions, RedisServer};
 use blaze_tests::{wait, within};
+use reqwest::Method;
 use serde_json::{Value, json};
 
 use super::stage::{PATIENCE, Stage, Worker, next, rest};
@@ -181,8 +182,8 @@ async fn what_the_flow_cannot_take_changes_nothing_and_says_so() {
     let log = json!({ "flow": { "bandwidth": { "limit_mbps": 7 } }, "log": { "level": "blaze_flow[=info" } });
     let dds = json!({ "flow": { "bandwidth": { "limit_mbps": 8 } },
         "brokers": { "layer": { "dds": { "domain": domain, "interface": "127.0.0.1" } } } });
-    for (faulty, key) in [(log, "log.level"), (dds, "brokers.inter.dds.domain")] {
-        stage.put("/layers/edge", layer(&faulty)).await;
+    for (faulty, key) in [(&log, "log.level"), (&dds, "brokers.inter.dds.domain")] {
+        stage.put("/layers/edge", layer(faulty)).await;
         let ack = acks.next("rejected");
         let detail = ack["detail"].as_str().unwrap();
         assert!(detail.contains(key), "{detail}");
@@ -193,6 +194,39 @@ async fn what_the_flow_cannot_take_changes_nothing_and_says_so() {
     }
     // It is said again, for whoever was away.
     acks.next("rejected");
+
+    // A roll-out reaches the flow of its canary; one that this refuses is undone by the worker, and has failed.
+    stage.put("/layers/edge", layer(&limit(20.0))).await;
+    let canary =
+        json!([{ "kind": "Node", "name": "robot-1", "labels": { "canary": "true" }, "spec": { "layer": "edge" } }]);
+    stage.send(Method::POST, "/apply", Some(&canary)).await;
+    let rollout = |name: &str, flow: &Value| {
+        json!({ "name": name, "spec": {
+            "target": { "kind": "Layer", "name": "edge" }, "patch": { "overrides": { "blaze-flow": flow } },
+            "canary": { "node_selector": "canary=true" }, "gate": { "window_s": 600, "max_unhealthy": 0 },
+        } })
+    };
+    let slower = rollout("slower", &limit(10.0));
+    stage.send(Method::POST, "/rollouts", Some(&slower)).await;
+    has_limit(&flow, 10.0, PATIENCE);
+    let abort = Some(json!({}));
+    stage.send(Method::POST, "/rollouts/slower/abort", abort.as_ref()).await;
+    has_limit(&flow, 20.0, PATIENCE);
+    check(&flow, "nothing is refused any more", |status, _| status == "ok");
+    let worse = rollout("worse", &log);
+    stage.send(Method::POST, "/rollouts", Some(&worse)).await;
+    let start = Instant::now();
+    let reason = loop {
+        let status = stage.get("/rollouts/worse").await["status"].clone();
+        if status["phase"] == "failed" {
+            break status["canaries"][0]["reason"].to_string();
+        }
+        assert!(start.elapsed() < PATIENCE, "{status}; {}", worker.tail());
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    };
+    assert!(reason.contains("log.level"), "it is the flow that refused: {reason}");
+    check(&flow, "it is as before", |status, _| status == "ok");
+    has_limit(&flow, 20.0, Duration::ZERO);
     let status = worker.status().await;
     assert!(status["connected"].as_bool().unwrap(), "{status}");
     worker.stop();

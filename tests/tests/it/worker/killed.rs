@@ -15,8 +15,8 @@ use reqwest::Method;
 use serde_json::{Value, json};
 use tokio::time::Instant;
 
-use super::kit::{Robot, next_that};
-use super::stage::{PATIENCE, Stage, section};
+use super::kit::{Robot, content, next_that};
+use super::stage::{PATIENCE, Stage, Worker, section};
 
 /// After the broker accepts connections.
 const SERVED: Duration = Duration::from_secs(2);
@@ -185,6 +185,57 @@ async fn all_is_killed_and_comes_back(alone: bool) {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
     lived.shutdown().await;
+    if alone {
+        a_late_database_has_something_newer(&stage, &robot, &link, &mongo, worker).await;
+    }
+}
+
+/// The database answers only when the worker already serves its file, which is older: as if it had been killed before that was
+/// written.
+async fn a_late_database_has_something_newer(
+    stage: &Stage,
+    robot: &Robot,
+    link: &Proxy,
+    mongo: &MongoServer,
+    worker: Worker,
+) {
+    const NEWER: &str = "\"rate_hz\":9";
+    worker.has_kept_all(2).await;
+    let file = stage.path("robot-1").join("last-known-good");
+    let older = std::fs::read(&file).unwrap();
+    let newest = stage.put("/services/slam", rate(9)).await;
+    stage.equal(&worker, PATIENCE).await;
+    worker.has_kept_all(2).await;
+    link.stall();
+    worker.kill();
+    std::fs::write(&file, older).unwrap();
+    assert!(!content(&file).contains(NEWER));
+    mongo.freeze().unwrap();
+    let worker = robot.worker(stage);
+    let mut service = robot.service().await;
+    let mut notices = service.listen("slam").await;
+    let asks = json!({ "service": "slam", "instance": "0" });
+    let served = |answer: &Value| (answer["config"]["camera"]["rate_hz"].clone(), answer["source"].clone());
+    let answer = service.ask(asks.clone(), PATIENCE).await;
+    assert_eq!(served(&answer), (json!(8), json!("copy")));
+
+    mongo.thaw().unwrap();
+    next_that(&mut notices, |notice| notice["config"]["camera"]["rate_hz"] == 9).await;
+    let answer = service.ask(asks.clone(), PATIENCE).await;
+    assert_eq!(served(&answer), (json!(9), json!("copy")));
+    let status = worker.status().await;
+    assert_eq!(
+        (&status["connected"], status["revision"].as_u64()),
+        (&json!(false), Some(newest))
+    );
+    worker.has_kept_all(2).await;
+    assert!(content(&file).contains(NEWER), "the file has it as well");
+    // And the database still has it.
+    worker.kill();
+    std::fs::remove_file(&file).unwrap();
+    let _worker = robot.worker(stage);
+    let answer = service.ask(asks, PATIENCE).await;
+    assert_eq!(served(&answer), (json!(9), json!("copy")));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -138,13 +138,22 @@ async fn a_bad_value_is_undone_without_the_main_service_and_stays_away() {
     late.until("a new one has the former value", has(FORMER));
 
     // The main service is back and takes it over.
-    let _main = stage.main();
+    main = stage.main();
     let canary_status = ends(&stage, "faster", "failed").await;
     assert_eq!(canary_status["node"], "robot-1");
     let status = blaze(&stage, &["rollout", "status", "faster"]).unwrap();
     assert_eq!(status["status"]["phase"], "failed");
     stage.equal(&canary, PATIENCE).await;
     stage.equal(&other, PATIENCE).await;
+    // Both have noted it for a life after this one. Who asked is kept as well: else `late` hears nothing until it asks again.
+    canary.has_kept_all(1).await;
+    main.kill().unwrap();
+    canary.kill();
+    let _main = stage.main();
+    let canary = first.worker(&stage);
+    stage.equal(&canary, PATIENCE).await;
+    stage.equal(&other, PATIENCE).await;
+    ends(&stage, "faster", "failed").await;
     assert_eq!(plain.ask(asks, PATIENCE).await["config"]["rate_hz"], FORMER);
 
     // A change that everybody hears of: what had been told before has come by then.

@@ -1,7 +1,9 @@
 //! Two workers of one layer: one serves, and when it is killed, stopped or ended the other one does.
 
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
+use blaze_tests::plain::{KafkaReader, KafkaWriter};
 use blaze_tests::process::Signal;
 use blaze_tests::servers::{KafkaOptions, KafkaServer, MongoOptions, MongoServer};
 use blaze_tests::within;
@@ -54,8 +56,8 @@ async fn until_it_leads(worker: &Worker, since: Instant) -> Duration {
 
 /// The leader is killed, stopped, goes on, and is ended; each time the other one takes over within `lease` or, where it
 /// could say so, at once.
-async fn takeovers(name: &str, stage: &Stage, sections: &Value, lease: Duration) {
-    let (leader, other) = two(stage, sections).await;
+async fn takeovers(name: &str, stage: &Stage, both: (Worker, Worker), sections: &Value, lease: Duration) {
+    let (leader, other) = both;
     let since = Instant::now();
     leader.kill();
     let killed = until_it_leads(&other, since).await;
@@ -101,7 +103,19 @@ async fn stage() -> (Stage, blaze_tests::process::Process) {
 async fn with_redis_another_worker_takes_over_within_a_lease() {
     let (stage, _main) = stage().await;
     let sections = json!({ "cache": { "redis": { "url": stage.redis.url() } } });
-    takeovers("Redis", &stage, &sections, LEASE).await;
+    let both = two(&stage, &sections).await;
+    takeovers("Redis", &stage, both, &sections, LEASE).await;
+    // People look there for who leads.
+    let worker = stage.layer_worker("fog-4", &sections);
+    until_it_leads(&worker, Instant::now()).await;
+    let owner = async || stage.keys().get("blaze:lease:worker:edge").await.unwrap();
+    let status = worker.status().await;
+    assert_eq!(
+        owner().await.as_deref(),
+        Some(status["worker_id"].as_str().unwrap().as_bytes())
+    );
+    worker.stop();
+    assert_eq!(owner().await, None, "who ends gives it up");
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -109,7 +123,8 @@ async fn with_mongodb_another_worker_takes_over_within_a_lease() {
     let (stage, _main) = stage().await;
     let server = MongoServer::start(MongoOptions::default()).unwrap();
     let sections = json!({ "database": { "mongodb": { "uri": server.uri(), "database": "blaze" } } });
-    takeovers("MongoDB", &stage, &sections, LEASE).await;
+    let both = two(&stage, &sections).await;
+    takeovers("MongoDB", &stage, both, &sections, LEASE).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -117,7 +132,46 @@ async fn with_kafka_another_worker_takes_over_within_its_session_timeout() {
     let (stage, _main) = stage().await;
     let server = KafkaServer::start(KafkaOptions::default()).unwrap();
     let sections = json!({ "brokers": { "layer": { "kafka": { "bootstrap": [server.bootstrap()] } } } });
-    takeovers("Kafka", &stage, &sections, LEASE_ON_KAFKA).await;
+    let both = two(&stage, &sections).await;
+    one_answers(&server.bootstrap(), &both).await;
+    takeovers("Kafka", &stage, both, &sections, LEASE_ON_KAFKA).await;
+}
+
+/// Both hear what services ask on Kafka, and the one that leads answers, once.
+async fn one_answers(bootstrap: &str, (leader, other): &(Worker, Worker)) {
+    let replies = KafkaReader::from_end(bootstrap, "blaze.reply").unwrap();
+    let writer = KafkaWriter::new(bootstrap).unwrap();
+    let ask = |id: &str| {
+        let request =
+            json!({ "id": id, "service": "slam", "instance": "0", "node": "robot-1", "reply_to": "blaze/reply/me" });
+        writer
+            .produce("blaze.config.get", request.to_string().as_bytes())
+            .unwrap();
+    };
+    let left = async |worker: &Worker| {
+        let metrics = worker.text("/metrics").await;
+        let line = metrics.lines().find(|line| line.contains("result=\"left_to_others\""));
+        line.and_then(|line| line.rsplit(' ').next()?.parse::<f64>().ok())
+    };
+    let (start, mut asked) = (Instant::now(), 0);
+    while left(other).await.is_none_or(|heard| heard < 5.0) {
+        assert!(start.elapsed() < PATIENCE, "both hear all: {:?}", left(other).await);
+        ask(&asked.to_string());
+        asked += 1;
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert_eq!(left(leader).await, Some(0.0));
+    // Whatever else was answered is there before the answer to one more.
+    ask("last");
+    let mut answers: BTreeMap<String, usize> = BTreeMap::new();
+    while !answers.contains_key("last") {
+        let answer = replies.next(PATIENCE).expect("an answer");
+        *answers.entry(String::from_utf8(answer.key).unwrap()).or_default() += 1;
+    }
+    assert!(
+        answers.len() > 5 && answers.values().all(|count| *count == 1),
+        "{asked} were asked: {answers:?}"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

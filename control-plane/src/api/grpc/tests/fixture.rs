@@ -1,10 +1,12 @@
 //! A service without a network, and what tests say to it.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use axum::Router;
 use axum::body::Body;
+use axum::extract::ConnectInfo;
 use axum::http::{HeaderMap, Request as HttpRequest};
 use blaze_domain::config::Code;
 use blaze_domain::node_file::ControlPlaneSection;
@@ -13,11 +15,13 @@ use blaze_proto::v1::config_service_client::ConfigServiceClient;
 use blaze_runtime::{Readiness, Supervisor};
 use bytes::{BufMut as _, Bytes, BytesMut};
 use http_body_util::BodyExt as _;
+use serde_json::Value;
 use tonic::Status;
 use tower::ServiceExt as _;
 
 use super::super::{GrpcOptions, router, status};
 use crate::api::limits::ApiLimits;
+use crate::api::rest::{self, RestOptions};
 use crate::auth::{Algorithm, Authenticator, NamedKey, NewToken, Realm, Revocations, read_key};
 use crate::core::{ConfigService, CoreOptions};
 use crate::metrics::ApiMetrics;
@@ -27,6 +31,8 @@ use crate::store::SqliteStore;
 /// A service, its clients' view of it, and what signs tokens for it.
 pub(super) struct Fixture {
     pub(super) router: Router,
+    /// The other interface of the same service.
+    rest: Router,
     pub(super) readiness: Readiness,
     pub(super) metrics: Arc<ApiMetrics>,
     keys: Authenticator,
@@ -61,7 +67,7 @@ impl Fixture {
                 authenticator: Some(Arc::new(keys.clone())),
                 dev: !guarded,
                 revocations: Revocations::new(),
-                keyring: Arc::new(Keyring::empty()),
+                keyring: Arc::new(Keyring::with_keys(&[("e1", [7; 32])]).unwrap()),
                 history: section.history.clone(),
                 on_commit: Arc::new(|_| {}),
                 readiness: readiness.clone(),
@@ -71,9 +77,17 @@ impl Fixture {
         let metrics = Arc::new(ApiMetrics::new().unwrap());
         let mut limits = section.limits;
         limits.auth_failures_per_s = 0;
+        let limits = Arc::new(ApiLimits::new(&limits));
+        let options = RestOptions {
+            dev: !guarded,
+            limits: Arc::clone(&limits),
+            readiness: readiness.clone(),
+            metrics: Arc::clone(&metrics),
+        };
+        let rest = rest::router(core.clone(), options);
         let options = GrpcOptions {
             dev: !guarded,
-            limits: Arc::new(ApiLimits::new(&limits)),
+            limits,
             metrics: Arc::clone(&metrics),
             readiness: readiness.clone(),
             reflection: !guarded,
@@ -81,6 +95,7 @@ impl Fixture {
         };
         Self {
             router: router(core, options),
+            rest,
             readiness,
             metrics,
             keys,
@@ -94,17 +109,35 @@ impl Fixture {
 
     /// A token that runs out after some seconds, or did so before.
     pub(super) fn token(&self, role: &str, expires_in_s: i64) -> String {
+        self.token_for(role, None, expires_in_s)
+    }
+
+    /// A token of one layer, or of all.
+    pub(super) fn token_for(&self, role: &str, layer: Option<&str>, expires_in_s: i64) -> String {
         let now_s = now_s();
         let roles = [role.to_owned()];
         let token = NewToken {
             subject: "ops",
             roles: &roles,
-            layer: None,
+            layer,
             issued_s: now_s.min(now_s + expires_in_s - 1),
             expires_s: now_s + expires_in_s,
             id: "t1",
         };
         self.keys.sign(&token).unwrap().unwrap()
+    }
+
+    /// What REST answers, in development.
+    pub(super) async fn rest(&self, path: &str) -> Value {
+        let peer: SocketAddr = "127.0.0.1:40000".parse().unwrap();
+        let request = HttpRequest::get(path)
+            .header("host", "localhost:8080")
+            .extension(ConnectInfo(peer));
+        let response = self.rest.clone().oneshot(request.body(Body::empty()).unwrap());
+        let (parts, body) = response.await.unwrap().into_parts();
+        let body = body.collect().await.unwrap().to_bytes();
+        assert_eq!(parts.status, 200, "{path}: {body:?}");
+        serde_json::from_slice(&body).unwrap()
     }
 
     /// Sends one message by hand.
