@@ -110,10 +110,14 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         next_epoch: Arc::new(move || epoch + 1),
         sink: Arc::new(move |event| note(&log, begin, event)),
     })?;
-    println!("up after {} ms", begin.elapsed().as_millis());
     let deadline = begin + Duration::from_secs_f64(arguments.get("seconds").unwrap_or(6.0));
     let mut order: Option<String> = arguments.get("send");
+    let mut is_up = false;
     while Instant::now() < deadline {
+        if !is_up && transport.status().ready {
+            println!("up after {} ms", begin.elapsed().as_millis());
+            is_up = true;
+        }
         exchange_addresses(&transport, &seen);
         if let Some(send) = order.take() {
             let first = seen.lock().peers.first().cloned();
