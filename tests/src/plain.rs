@@ -330,6 +330,20 @@ pub fn make_topic(bootstrap: &str, topic: &str, settings: &[(&str, &str)]) -> an
     }
 }
 
+/// Deletes a topic.
+///
+/// # Errors
+/// When the broker refuses.
+pub fn delete_topic(bootstrap: &str, topic: &str) -> anyhow::Result<()> {
+    let admin: AdminClient<DefaultClientContext> = client(bootstrap).create()?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let deleted = runtime.block_on(admin.delete_topics(&[topic], &AdminOptions::new()))?;
+    match deleted.into_iter().next().context("no answer")? {
+        Ok(_) => Ok(()),
+        Err((topic, code)) => anyhow::bail!("{topic}: {code}"),
+    }
+}
+
 fn client(bootstrap: &str) -> ClientConfig {
     let mut config = ClientConfig::new();
     config

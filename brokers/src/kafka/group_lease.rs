@@ -399,3 +399,29 @@ fn committed(consumer: &BaseConsumer<Context>, topic: &str, patience: Duration) 
     let note = partition.metadata().to_owned();
     Ok(Some(note).filter(|note| !note.is_empty()))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rdkafka::ClientConfig;
+
+    /// The client gives the partition back when the callback returns.
+    #[test]
+    fn a_partition_is_given_back_only_when_the_lease_that_was_told_is_over() {
+        let until = Instant::now() + Duration::from_millis(300);
+        let context = Context {
+            last_error: Arc::default(),
+            promised: Mutex::new(Some(until)),
+        };
+        let mut config = ClientConfig::new();
+        // Nobody listens there: the client never joins.
+        config.set("bootstrap.servers", "127.0.0.1:9").set("group.id", "lease");
+        let consumer: BaseConsumer<Context> = config.create_with_context(context).unwrap();
+        let (context, partitions) = (Arc::clone(consumer.context()), TopicPartitionList::new());
+        context.pre_rebalance(&consumer, &Rebalance::Assign(&partitions));
+        assert_eq!(*context.promised.lock(), Some(until), "getting more takes nothing away");
+        context.pre_rebalance(&consumer, &Rebalance::Revoke(&partitions));
+        assert!(Instant::now() >= until);
+        assert_eq!(*context.promised.lock(), None, "waited for once");
+    }
+}

@@ -14,7 +14,17 @@ use super::tools::{
 };
 use blaze_brokers::port::{Broker, Content, PublishOutcome, Publisher, PublisherOptions};
 
-const SIZES: &[usize] = &[1, 2, 100, 1_023, 65_535, 65_536, 1_048_576, 8_000_000];
+const SIZES: &[usize] = &[
+    1,
+    2,
+    100,
+    1_023,
+    65_535,
+    65_536,
+    1_048_576,
+    8_000_000,
+    MAX_PAYLOAD_BYTES,
+];
 
 /// Four writers on two clients publish at once: everyone's messages arrive completely and in order.
 ///
@@ -85,7 +95,7 @@ pub async fn own_publications_are_seen(fixture: &dyn Fixture) -> Outcome {
     }
 }
 
-/// Payloads of 1 B to 8 MB arrive with every byte and the whole header.
+/// Payloads of 1 B to 16 MiB, the most that a message may have, arrive with every byte and the whole header.
 ///
 /// # Errors
 /// How the adapter breaks the rule.

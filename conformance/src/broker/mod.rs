@@ -18,6 +18,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
+use blaze_domain::MAX_PAYLOAD_BYTES;
 use blaze_domain::names::ChannelName;
 
 use blaze_brokers::port::Broker;
@@ -61,7 +62,7 @@ pub struct Capabilities {
 }
 
 impl Default for Capabilities {
-    /// Everything but what is special to Kafka and DDS, 500 channels, payloads up to 8,000,000 bytes, queues of 64 MiB.
+    /// Everything but what is special to Kafka and DDS, 500 channels, payloads up to the largest, queues of 64 MiB.
     fn default() -> Self {
         Self {
             bare: true,
@@ -73,7 +74,7 @@ impl Default for Capabilities {
             clocks_apart: Duration::ZERO,
             queue_bytes: 64 * 1024 * 1024,
             channels: 500,
-            largest_payload: 8_000_000,
+            largest_payload: MAX_PAYLOAD_BYTES,
         }
     }
 }

@@ -4,7 +4,7 @@
 //! blaze-testbed link-peer name=edge/a listen=10.9.0.1 domain=33 [peers=10.9.0.2] [seconds=6] [chunking=mtu] [mtu=1500]
 //!           [send=<datagram bytes>x<count>@<per second>] [class=bulk] [interface=veth0]
 //! ```
-//! It connects to all that it discovers, tells each what addresses it knows as flows do in Hello, and prints what
+//! It says when it is up, connects to all that it discovers, tells each what addresses it knows as flows do in Hello, and prints what
 //! happens. With `send` it then sends to the first, and prints the bytes on the wire as computed and as the interface
 //! counted them (Ethernet headers deducted).
 
@@ -112,7 +112,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     })?;
     let deadline = begin + Duration::from_secs_f64(arguments.get("seconds").unwrap_or(6.0));
     let mut order: Option<String> = arguments.get("send");
+    let mut is_up = false;
     while Instant::now() < deadline {
+        if !is_up && transport.status().ready {
+            println!("up after {} ms", begin.elapsed().as_millis());
+            is_up = true;
+        }
         exchange_addresses(&transport, &seen);
         if let Some(send) = order.take() {
             let first = seen.lock().peers.first().cloned();

@@ -94,7 +94,39 @@ fn answer_id(payload: &[u8]) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
+    use blaze_domain::{Origin, WriterId};
+    use blaze_proto::{Frame, Header};
+    use rdkafka::message::Headers as _;
+
     use super::*;
+    use crate::kafka::topics::Topics;
+    use crate::outbox::{Outbox, OutboxLimits};
+    use crate::port::PublishOutcome;
+
+    #[test]
+    fn the_age_of_a_record_has_what_it_waited_for_the_client() {
+        let outbox = Outbox::new(OutboxLimits {
+            lane_messages: 1,
+            lane_bytes: 10_000,
+            total_bytes: 10_000,
+        });
+        let (topic, _) = Topics::default().of(&Arc::from("imu.data"), false);
+        let keying = Keying::Writer { depth: 0 };
+        let lane = outbox.lane(Target { topic, keying }, None);
+        let header = Header::new("imu/data", Origin::default(), WriterId([1; 16]), 1, 0);
+        let frame = Frame::new(&header, Bytes::new()).unwrap().with_hops_and_age(0, 5_000);
+        assert_eq!(lane.push(Body::Frame(frame), None), PublishOutcome::Taken);
+        let mut taken = Vec::new();
+        outbox.take(Instant::now(), 1, 10_000, &mut taken);
+        let mut waiting = taken.pop().unwrap();
+        waiting.since = waiting.since.checked_sub(Duration::from_millis(300)).unwrap();
+        let headers = Ready::new(waiting, &mut String::new()).headers.unwrap();
+        let age = headers.iter().find(|header| header.key == "blaze-age-us").unwrap();
+        let age: u64 = String::from_utf8_lossy(age.value.unwrap()).parse().unwrap();
+        assert!((305_000..60_000_000).contains(&age), "{age} µs");
+    }
 
     #[test]
     fn answers_have_their_id_as_the_key() {

@@ -303,6 +303,20 @@ fn what_is_not_from_here_stays_here() {
     );
 }
 
+/// What is refused leaves no trace in the duplicate window: its high number would make the real writer's ones old.
+#[test]
+fn a_foreign_message_does_not_silence_the_writer_whose_name_it_bears() {
+    let bridges = || vec![bridge(Scope::Node, to_cloud())];
+    let mut bench = Bench::new(bridges());
+    bench.apply(bridges(), refusing(&["edge/robot-1/camera"]));
+    let foreign = frame(1, 1_000_000, "edge-2", 0, 1);
+    let denied = message(["edge", "robot-1", "camera"], 1, 1_000_000, 0, 1);
+    bench.take(Scope::Node, vec![Content::Frame(foreign), Content::Frame(denied)]);
+    assert_eq!(bench.drops(), [(DropReason::ForeignOrigin, 2)]);
+    bench.take(Scope::Node, vec![Content::Frame(frame(1, 1, "robot-1", 0, 1))]);
+    assert_eq!(bench.submitted(), [1]);
+}
+
 #[test]
 fn an_own_write_that_comes_back_is_an_echo() {
     let mut bench = Bench::new(vec![

@@ -197,6 +197,10 @@ fn another_recording_works_alike() {
 fn what_cannot_be_played_ends_with_its_code_and_reason() {
     for (arguments, code, why) in [
         (&["--listen", "192.0.2.1"][..], 2, "--listen 192.0.2.1"),
+        // What the node file refuses: a key, and values.
+        (&["--set", "nonsense=1"], 2, "nonsense"),
+        (&["--set", "flow.bandwidth.limit_mbps=-1"], 2, "limit_mbps"),
+        (&["--set", "admin.flow=127.0.0.1:80x"], 2, "admin.flow"),
         (
             &["--only", "robot-1", "--record", "/no/such/file"],
             1,

@@ -1,11 +1,13 @@
 //! What the contract says of topics on servers that others use as well: nothing happens in silence.
 
-use blaze_tests::plain::{KafkaReader, make_topic};
+use std::time::Duration;
+
+use blaze_tests::plain::{KafkaReader, KafkaWriter, delete_topic, make_topic};
 use blaze_tests::servers::{shared_kafka, shared_redis};
 use blaze_tests::wait;
 use serde_json::json;
 
-use crate::real::support::{RobotAndCloud, SOON, connect};
+use crate::real::support::{RedisReader, RobotAndCloud, SOON, connect};
 
 const TOPIC: &str = "imu/data";
 
@@ -49,6 +51,59 @@ fn a_burst_into_a_topic_with_small_batches_is_whole() -> anyhow::Result<()> {
         },
         || format!("{:?}", system.cloud.bridges()),
     )?;
+    Ok(())
+}
+
+/// The flow makes them again, its routes go on, and what a plain producer writes there is no repeat, though its offsets begin at 0
+/// again.
+#[test]
+fn deleted_kafka_topics_are_made_again_and_their_routes_go_on() -> anyhow::Result<()> {
+    const COMMANDS: &str = "fleet/commands";
+    const TURN: Duration = Duration::from_millis(50);
+    /// More records than the second topic gets: none has an offset that the first had not.
+    const BEFORE: usize = 2_000;
+    let system = RobotAndCloud::start(&shared_redis()?, &shared_kafka()?)?;
+    system.route(TOPIC, &json!({}))?;
+    system.tell_cloud(&json!({"op":"advertise","topic":COMMANDS,"service":"planner","ttl_s":0}))?;
+    system.tell_robot(&json!({"op":"request","topic":COMMANDS,"service":"driver","bare":true,"ttl_s":0}))?;
+    for flow in [&system.cloud, &system.robot] {
+        flow.wait_bridge(COMMANDS, SOON)?;
+    }
+    let mut commands = RedisReader::new(&system.redis, &system.channel(&format!("blaze/bare/{COMMANDS}")))?;
+    let writer = KafkaWriter::new(&system.kafka)?;
+    for _ in 0..BEFORE {
+        writer.produce_later(&system.topic(COMMANDS), b"before")?;
+    }
+    let tails = || format!("{}\n{}", system.cloud.tail(), system.robot.tail());
+    for life in ["first", "second"] {
+        if life == "second" {
+            for topic in [TOPIC, COMMANDS] {
+                delete_topic(&system.kafka, &system.topic(topic))?;
+            }
+        }
+        let mut command = || {
+            // While there is no topic, nothing is acknowledged.
+            let _ = writer.produce(&system.topic(COMMANDS), life.as_bytes());
+            while let Ok(Some(payload)) = commands.next(TURN) {
+                if payload == life.as_bytes() {
+                    return true;
+                }
+            }
+            false
+        };
+        wait::until(
+            &format!("commands of the {life} topic arrive"),
+            SOON,
+            &mut command,
+            tails,
+        )?;
+        let records = KafkaReader::from_end(&system.kafka, &system.topic(TOPIC))?;
+        let mut message = || {
+            let _ = system.publish(TOPIC, life.as_bytes());
+            records.next(TURN).is_some()
+        };
+        wait::until(&format!("messages reach the {life} topic"), SOON, &mut message, tails)?;
+    }
     Ok(())
 }
 

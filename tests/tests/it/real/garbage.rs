@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use blaze_domain::WriterId;
+use blaze_proto::Frame;
 use blaze_tests::flow::FlowProcess;
 use blaze_tests::plain::{KafkaReader, KafkaWriter};
 use blaze_tests::servers::{shared_kafka, shared_redis};
@@ -168,8 +170,10 @@ fn control_messages(robot: &FlowProcess, system: &RobotAndCloud, writer: &KafkaW
     Ok(())
 }
 
-/// Kafka records with headers that lie.
-fn headers(cloud: &FlowProcess, topic: &str, writer: &KafkaWriter) -> anyhow::Result<()> {
+/// Kafka records with headers that lie, and what follows on their topic.
+fn headers(system: &RobotAndCloud, channel: &str, writer: &KafkaWriter) -> anyhow::Result<()> {
+    let (cloud, topic) = (&system.cloud, &system.topic(channel));
+    let mut robot = RedisReader::new(&system.redis, &system.channel(channel))?;
     let before = dropped(cloud, "decode_error");
     let id = [b'a'; 32];
     let hostile: [&[(&str, &[u8])]; 6] = [
@@ -193,7 +197,28 @@ fn headers(cloud: &FlowProcess, topic: &str, writer: &KafkaWriter) -> anyhow::Re
         cloud,
         count,
         before + hostile.len() as f64,
-    )
+    )?;
+    // The writer of the hostile records is heard, and a record that names no writer is bare, whatever else it says.
+    let origin = b"cloud/cloud-1/planner/";
+    let good: &[(&str, &[u8])] = &[
+        ("blaze-writer", &id),
+        ("blaze-sequence", b"1"),
+        ("blaze-origin", origin),
+    ];
+    writer.produce_with(topic, b"good", good)?;
+    writer.produce_with(topic, b"bare", &[("blaze-sequence", b"-1"), ("blaze-origin", b"\xff")])?;
+    let mut found = Vec::new();
+    for _ in 0..2 {
+        let next = robot.next(SOON)?;
+        let next = next.ok_or_else(|| anyhow::anyhow!("only {found:?} came\n{}", cloud.tail()))?;
+        let frame = Frame::parse(next.into())?;
+        let is_named = frame.writer() == WriterId([0xaa; 16]);
+        found.push((String::from_utf8_lossy(frame.payload()).into_owned(), is_named));
+    }
+    // Writers do not wait for each other.
+    found.sort();
+    assert_eq!(found, [("bare".to_owned(), false), ("good".to_owned(), true)]);
+    Ok(())
 }
 
 #[test]
@@ -217,7 +242,7 @@ fn garbage_is_counted_and_does_no_harm() -> anyhow::Result<()> {
     flowing(&system, &reader)?;
     control_messages(robot, &system, &writer)?;
     flowing(&system, &reader)?;
-    headers(cloud, &system.topic(BACK), &writer)?;
+    headers(&system, BACK, &writer)?;
     flowing(&system, &reader)?;
     for (flow, memory) in [robot, cloud].into_iter().zip(memory) {
         let now = flow.rss_kib()?;

@@ -65,7 +65,18 @@ impl Peer {
 
     /// Everything arrived, in order, once, and without a long gap.
     async fn has_all(&self, source: &Source) {
-        let last = source.sequence;
+        let report = self.has_all_in_the_end(source.sequence).await;
+        let gap = Duration::from_secs_f64(report["gap_ms"].as_f64().unwrap() / 1e3);
+        let (pause, late) = (source.longest_pause, source.idler.latest());
+        assert!(
+            gap < within(LONGEST_GAP) + pause + late,
+            "{}: {report}; the source paused for {pause:?}, the machine was late by {late:?}",
+            self.name
+        );
+    }
+
+    /// Everything arrived, in order, once.
+    async fn has_all_in_the_end(&self, last: u64) -> Value {
         eventually(&format!("{} has message {last}: {}", self.name, self.report()), || {
             (self.number("last") == last).then_some(())
         })
@@ -75,13 +86,7 @@ impl Peer {
         let faults = (count("lost"), count("reordered"), count("malformed"));
         assert_eq!(faults, (0, 0, 0), "{report}");
         assert_eq!(count("received"), last + 1 - count("first"), "{report}");
-        let gap = Duration::from_secs_f64(report["gap_ms"].as_f64().unwrap() / 1e3);
-        let (pause, late) = (source.longest_pause, source.idler.latest());
-        assert!(
-            gap < within(LONGEST_GAP) + pause + late,
-            "{}: {report}; the source paused for {pause:?}, the machine was late by {late:?}",
-            self.name
-        );
+        report
     }
 }
 
@@ -228,5 +233,24 @@ async fn a_reader_that_starts_anew_receives_at_once() {
         assert!(start.elapsed() < Duration::from_secs(5), "{:?}", start.elapsed());
         peer.signal(Signal::KILL);
     }
+    assert_eq!(source.publisher.later().dropped(), 0);
+}
+
+/// Thousands of fragments each; lost ones are asked for again, which takes its time.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn large_messages_reach_a_plain_program() {
+    let domain = Domain::start();
+    let broker = domain.open().await;
+    let topic = topic("large");
+    let reader = Peer::start(&domain, "plain reader", &topic, &["--reliable"]);
+    let options = PublisherOptions {
+        large: true,
+        ..RELIABLE
+    };
+    let mut source = Source::new(&broker, &topic, 5.0, 1_000, options);
+    source.meet(&[&reader]).await;
+    source.bytes = 8_000_000;
+    source.run(Duration::from_millis(600)).await;
+    reader.has_all_in_the_end(source.sequence).await;
     assert_eq!(source.publisher.later().dropped(), 0);
 }

@@ -9,7 +9,7 @@ use blaze_tests::plain::{KafkaReader, Record};
 use blaze_tests::servers::KafkaServer;
 use bytes::Bytes;
 
-use super::plain::{delete_topic, has_topic, make_topic, topic_setting};
+use super::plain::{delete_topic, has_topic, make_topic, topic_setting, topic_uuid};
 use super::{DEADLINE, Flow, Reader, WITH_KEPT, eventually, health, open, reader, section, start_server, subscribe};
 
 struct Worker {
@@ -139,7 +139,7 @@ async fn the_last_notice_of_each_key_stays_and_plain_clients_see_it_as_it_is() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_topic_that_cannot_be_made_holds_up_nobody_and_one_that_was_there_is_taken_over() {
+async fn a_topic_that_vanishes_is_made_again_and_one_that_cannot_be_made_holds_up_nobody() {
     let server = start_server();
     make_topic(&server, "blaze_config.changed.nav", 1, &[]).await;
     make_topic(&server, "blaze.config.changed.old", 1, &[("retention.ms", "1000000")]).await;
@@ -177,6 +177,16 @@ async fn a_topic_that_cannot_be_made_holds_up_nobody_and_one_that_was_there_is_t
         matches!(refused, Err(WriteError::TooLarge { bytes: 3_145_728, .. })),
         "{refused:?}"
     );
+    let mut slam = reader(&worker.broker, &channel("slam")).await;
+    let first = topic_uuid(&server, "blaze.config.changed.slam");
+    delete_topic(&server, "blaze.config.changed.slam").await;
+    eventually("it is made again", async || {
+        let found = topic_uuid(&server, "blaze.config.changed.slam");
+        found != first && has_topic(&server.bootstrap(), "blaze.config.changed.slam")
+    })
+    .await;
+    worker.write(&[said("slam", "0", "2")]).await;
+    eventually("its readers hear", async || slam.next_bare().await.0 == "2").await;
     worker.side.release(&channel("slam"));
     delete_topic(&server, "blaze.config.changed.slam").await;
     // The broker deletes a topic some time after it has confirmed that.

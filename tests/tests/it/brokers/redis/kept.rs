@@ -1,10 +1,11 @@
 //! What is kept for late joiners.
 
-use blaze_brokers::{Broker, Health};
+use blaze_brokers::{Broker, Content, Health};
 use blaze_tests::servers::RedisKind;
 
 use super::support::{
-    Server, channel, eventually, next_number, publish, publisher, settled, subscribe_with_kept, wait_for, writer,
+    Server, channel, eventually, frame, next, next_number, publish, publisher, settled, subscribe_with_kept, wait_for,
+    writer,
 };
 
 /// Late joiners come while a writer publishes as fast as it can: each gets an unbroken row, nothing twice.
@@ -63,6 +64,16 @@ async fn a_forgotten_writer_stays_forgotten() {
     eventually("the field is gone", only_the_first).await;
     server.cli(&["FLUSHALL"]);
     eventually("what lives is written again", only_the_first).await;
+    let sink = server.service().await;
+    let mut late = subscribe_with_kept(&sink, "map").await;
+    match next(&mut late).await.content {
+        Content::Frame(found) => assert_eq!(
+            (found.sequence(), found.payload()),
+            (1, frame(1, 1, 100).payload()),
+            "with its content"
+        ),
+        other => panic!("{other:?}"),
+    }
 }
 
 /// A service whose server was restarted writes again what it kept; what its gone publishers kept is forgotten.
