@@ -412,6 +412,8 @@ mod tests {
         let context = Context {
             last_error: Arc::default(),
             promised: Mutex::new(Some(until)),
+            trouble: Mutex::default(),
+            stop: CancellationToken::new(),
         };
         let mut config = ClientConfig::new();
         // Nobody listens there: the client never joins.
