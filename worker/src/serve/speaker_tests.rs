@@ -261,10 +261,8 @@ fn a_place_waits_since_its_first_notice_that_was_not_taken() {
         let store_id = "a".to_owned();
         Some(Mark { store_id, revision })
     };
-    let mut state = State {
-        from: at(5),
-        ..State::default()
-    };
+    let mut state = State::default();
+    state.from = at(5);
     state.put(told("slam", "1"));
     state.from = at(6);
     state.put(told("nav", "1"));
