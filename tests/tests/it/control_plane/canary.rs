@@ -232,7 +232,7 @@ async fn end(stage: &Arc<Stage>, world: &World) {
     clean("the log", &log);
     let lines = |level: &str| log.lines().filter(|line| line.contains(level)).count();
     println!("{} lines of log, {} of them TRACE", log.lines().count(), lines("TRACE"));
-    assert!(lines("TRACE") > 100 && lines("DEBUG") > 20 && lines("INFO") > 0);
+    assert!(lines("TRACE") > 100 && log.lines().count() > 300);
     let main = Arc::clone(&world.main);
     blocking(move || main.kill()).await;
 }
