@@ -2,5 +2,6 @@
 //! and HTTP take is tested where it is read, and once over real servers in `real/garbage.rs`.
 
 mod node_file;
+mod random;
 mod shapes;
 mod udp;
