@@ -152,18 +152,7 @@ async fn each_goes_on_at_the_other_process_while_one_is_replaced() {
     const WATCHERS: usize = 4;
     let (_stage, mains, client) = two();
     let (end, end_seen) = watch::channel(None);
-    let (_floor, floor_seen) = watch::channel(0);
-    let mut following: JoinSet<Watcher> = JoinSet::new();
-    for index in 0..WATCHERS {
-        let plan = Plan {
-            cuts: Vec::new(),
-            late: 1,
-            floor: floor_seen.clone(),
-            end: end_seen.clone(),
-        };
-        let clients = clients_of(&client, &mains, index);
-        following.spawn(async move { Watcher::start(clients).await.run(plan).await });
-    }
+    let following = follow(&client, &mains, WATCHERS, &end_seen);
     let mut last = 0;
     for (leaving, staying) in [(0, 1), (1, 0)] {
         all_open(&mains, WATCHERS).await;
@@ -234,18 +223,7 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
         standing.push((client, stream));
     }
     let (end, end_seen) = watch::channel(None);
-    let (_floor, floor_seen) = watch::channel(0);
-    let mut following: JoinSet<Watcher> = JoinSet::new();
-    for index in 0..watchers {
-        let plan = Plan {
-            cuts: Vec::new(),
-            late: 1,
-            floor: floor_seen.clone(),
-            end: end_seen.clone(),
-        };
-        let clients = clients_of(&client, &mains, index);
-        following.spawn(async move { Watcher::start(clients).await.run(plan).await });
-    }
+    let following = follow(&client, &mains, watchers, &end_seen);
     all_open(&mains, watchers + 2).await;
 
     let before = mains[0].resident_bytes();
@@ -313,6 +291,26 @@ async fn one_that_stands_still_is_ended_and_holds_up_nobody() {
 fn narrow(client: &Client) -> Client {
     let http = reqwest::Client::builder().no_proxy().http2_prior_knowledge();
     client.over(http.http2_initial_stream_window_size(65_535).build().unwrap())
+}
+
+/// Watchers that read on until `end`, at both processes and interfaces in turn, and are never cut.
+fn follow(
+    client: &Client,
+    mains: &[Arc<Main>; 2],
+    watchers: usize,
+    end: &watch::Receiver<Option<u64>>,
+) -> JoinSet<Watcher> {
+    let following = (0..watchers).map(|index| {
+        let plan = Plan {
+            cuts: Vec::new(),
+            late: 1,
+            floor: watch::channel(0).1,
+            end: end.clone(),
+        };
+        let clients = clients_of(client, mains, index);
+        async move { Watcher::start(clients).await.run(plan).await }
+    });
+    following.collect()
 }
 
 /// Waits until so many watches are open.

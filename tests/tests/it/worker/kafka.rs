@@ -113,7 +113,9 @@ async fn after_the_broker_was_killed_the_last_state_comes_and_nothing_older_afte
     while next(&mut nav).await["deleted"] != true {}
     let asks = json!({ "service": "slam", "instance": "0", "node": "robot-1" });
     assert_eq!(service.ask(asks, PATIENCE).await["config"]["camera"]["rate_hz"], 9);
-    assert_eq!(rest(&mut slam).await, [json!(null); 0]);
+    // A worker that lost its lease with the broker takes over from itself, and says once more what holds.
+    let again = rest(&mut slam).await;
+    assert!(again.len() <= 1 && again.iter().all(|notice| notice["revision"] == last), "{again:?}");
 
     // The topic itself says the same to whoever reads it from its beginning.
     let plain = KafkaReader::from_beginning(&bootstrap, "blaze.config.changed.slam").unwrap();
